@@ -1,0 +1,563 @@
+"""The environments: a system's episodes, played as single or vectorised Gymnasium envs."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from pinnobs_gym.conditions import Condition, parse_condition
+from pinnobs_gym.figures import EpisodePicture
+from pinnobs_gym.record import Prior, Record
+from pinnobs_gym.simulate import truth
+from pinnobs_gym.system import Setup, System, vector
+from pinnobs_gym.systems import SYSTEMS
+
+NOT_FINITE_REWARD = -1e4
+"""Reward of an action that is not finite; it ends the episode."""
+
+_SAMPLES_AHEAD = 65536
+"""Samples that a single env simulates ahead, in whole episodes."""
+_DRAWS = 64
+"""Initial states drawn at a time."""
+_ATTEMPTS = 1000
+"""Such draws without an admissible state before the initial set is taken to be empty."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """All that chance decides in a batch of episodes."""
+
+    x0: np.ndarray
+    """Initial states, shape (batch, nx)."""
+    noise: np.ndarray
+    """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
+    seeds: tuple[int, ...]
+    """A seed per episode for what its condition draws."""
+
+    @staticmethod
+    def join(draws: Sequence[Draws]) -> Draws:
+        """Several batches as one."""
+        if len(draws) == 1:
+            return draws[0]
+        return Draws(
+            np.concatenate([draw.x0 for draw in draws]),
+            np.concatenate([draw.noise for draw in draws]),
+            tuple(seed for draw in draws for seed in draw.seeds),
+        )
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Simulated episodes of a system on common sample times, (time, batch, dim)."""
+
+    x: np.ndarray
+    """True states, shape (num_steps + 1, batch, nx)."""
+    y: np.ndarray
+    """Outputs as measured, shape (num_steps + 1, batch, ny)."""
+    observations: np.ndarray
+    """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
+
+
+class EpisodeSource:
+    """Makes the episodes of an env: every seed names an endless sequence of them.
+
+    What chance decides in an episode (`Draws`) depends on the seed and on how many episodes of that
+    seed came before, and the rest on these draws alone: the same seed gives the same episodes in
+    any batch.
+    """
+
+    def __init__(
+        self,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        *,
+        dt: float | None = None,
+        duration: float | None = None,
+        noise_std: Sequence[float] | float | None = None,
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        cls = SYSTEMS.resolve(system)
+        self.system, chosen = cls.configured(
+            setup, dt=dt, duration=duration, noise_std=noise_std, parameters=parameters
+        )
+        self.condition = parse_condition(condition)
+        self.condition.plant(self.system, ())  # a condition that does not fit says so now
+        self.setup = self.condition.setup(self.system, chosen)
+        self.times = self.setup.times
+        self.inputs = np.asarray(self.system.input(self.times))
+        self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
+        self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
+        self._noise_std = vector(self.setup.noise_std, self.system.ny, "noise_std")
+
+    def contains(self, x0: np.ndarray) -> bool:
+        """Whether all initial states (..., nx) belong to the setup's set."""
+        if self.setup.fixed_x0:
+            return bool((x0 == self.x0_low).all())
+        inside = (x0 >= self.x0_low) & (x0 <= self.x0_high)
+        return bool(inside.all() and np.all(self.system.admissible(x0)))
+
+    def play(self, draws: Draws, x0: np.ndarray | None = None) -> Episodes:
+        """The episodes of these draws; ``x0`` (batch, nx) replaces the initial states drawn."""
+        start = draws.x0 if x0 is None else x0
+        batch, num_samples, ny = len(start), len(self.times), self.system.ny
+        trivial = type(self.condition) is Condition
+        rngs = [] if trivial else [np.random.default_rng(seed) for seed in draws.seeds]
+        plant = self.condition.plant(self.system, rngs)
+        if plant is self.system and batch > 1 and (start == start[0]).all():
+            x = np.repeat(self._truth(plant, start[:1]), batch, axis=1)
+        else:
+            x = self._truth(plant, start)
+        y = self.system.h(x) + draws.noise.swapaxes(0, 1) * self._noise_std
+        y = self.condition.outputs(y, self.setup, rngs)
+        observations = np.empty((num_samples, batch, ny + self.system.nu + 1), np.float32)
+        observations[..., :ny] = y
+        observations[..., ny:-1] = self.inputs[:, None]
+        observations[..., -1] = (self.times / self.times[-1])[:, None]
+        return Episodes(x, y, observations)
+
+    def record(self, episodes: Episodes, xhat0: object = None) -> Record:
+        """What an estimator may see of the episodes: their samples up to the last action's."""
+        batch, last = episodes.y.shape[1], self.setup.num_steps
+        u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
+        prior = Prior.of(self.system, self.setup, batch, xhat0)
+        return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1), u, prior)
+
+    def _truth(self, plant: System, x0: np.ndarray) -> np.ndarray:
+        return truth(plant, x0, self.times, self.setup.truth_step)
+
+
+class Stream:
+    """The endless sequence of draws that one seed stands for."""
+
+    def __init__(self, seeds: np.random.SeedSequence) -> None:
+        states, noise, conditions = (np.random.default_rng(seed) for seed in seeds.spawn(3))
+        self._states, self._noise, self._conditions = states, noise, conditions
+        self._queue: list[np.ndarray] = []
+
+    def draw(self, source: EpisodeSource, count: int = 1) -> Draws:
+        """What chance decides in the next episodes."""
+        shape = (count, len(source.times), source.system.ny)
+        return Draws(
+            np.stack([self._next_x0(source) for _ in range(count)]),
+            self._noise.standard_normal(shape),
+            tuple(self._conditions.integers(2**63, size=count).tolist()),
+        )
+
+    def _next_x0(self, source: EpisodeSource) -> np.ndarray:
+        if source.setup.fixed_x0:
+            return source.x0_low
+        for _ in range(_ATTEMPTS):
+            if self._queue:
+                return self._queue.pop(0)
+            drawn = self._states.uniform(source.x0_low, source.x0_high, (_DRAWS, source.system.nx))
+            self._queue = list(drawn[source.system.admissible(drawn)])
+        name = type(source.system).__name__
+        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")
+
+
+def _spaces(system: System) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """The spaces of observations and actions."""
+    width = system.ny + system.nu
+    low, high = np.full(width + 1, -np.inf), np.full(width + 1, np.inf)
+    low[-1], high[-1] = 0, 1
+    bound = system.state_bound or tuple(10 * s for s in system.scale)
+    largest = np.asarray(bound, dtype=np.float32)
+    observations = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+    return observations, gym.spaces.Box(-largest, largest)
+
+
+def _check_states(value: object, shapes: Sequence[tuple[int, ...]], name: str) -> np.ndarray:
+    array = np.asarray(value, dtype=float)
+    if array.shape not in shapes:
+        raise ValueError(f"{name} has shape {array.shape}; expected {' or '.join(map(str, shapes))}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}={array.tolist()} is not finite")
+    return array
+
+
+def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
+    for name in options or {}:
+        if name not in known:
+            raise ValueError(f"unknown reset option {name!r}; known are {', '.join(known)}")
+    return options or {}
+
+
+def _warn_outside(source: EpisodeSource, x0: np.ndarray) -> None:
+    if not source.contains(x0):
+        gym.logger.warn(
+            f"x0={x0.tolist()} is outside the initial set of {type(source.system).__name__}"
+        )
+
+
+class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
+    """One episode at a time of estimating a plant's state from its noisy outputs.
+
+    `reset` returns the observation of y₀. The action is the estimate x̂(k|k), in physical units; it
+    is scored against the true x_k, and time advances. The reward is −mean(((x̂ − x)/scale)²). The
+    estimate never acts on the plant. Raw actions are scored, never clipped; one that is not finite
+    ends the episode with `NOT_FINITE_REWARD`; otherwise only the time limit ends it. The
+    observation after the last action is never scored.
+
+    Args:
+        system: name, ``module:Class`` or class of the system.
+        setup: ``benchmark`` or ``paper``.
+        condition: how episodes depart from the setup; see `pinnobs_gym.conditions`.
+        dt, duration, noise_std, parameters: values that replace the setup's.
+        render_mode: ``rgb_array`` or ``human``.
+
+    Reset options: ``x0``, the true initial state (nx,), and ``xhat0``, the initial estimate (nx,),
+    which is only reported in ``info``. ``info`` holds ``state``, the true state behind the
+    observation, for scoring only, and after a reset ``xhat0`` and ``P0``, the prior.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+
+    def __init__(
+        self,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        *,
+        dt: float | None = None,
+        duration: float | None = None,
+        noise_std: Sequence[float] | float | None = None,
+        parameters: Mapping[str, float] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        _check_render_mode(render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
+        self.source = EpisodeSource(
+            system,
+            setup,
+            condition,
+            dt=dt,
+            duration=duration,
+            noise_std=noise_std,
+            parameters=parameters,
+        )
+        self.observation_space, self.action_space = _spaces(self.source.system)
+        self._weight = _reward_weight(self.source.system)
+        self._num_steps = self.source.setup.num_steps
+        self._k = self._num_steps
+        self._stream: Stream | None = None
+        self._ahead: list[tuple[Draws, np.ndarray, np.ndarray]] = []
+        self._picture: EpisodePicture | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        options = _check_options(options, ("x0", "xhat0"))
+        prior = Prior.of(self.source.system, self.source.setup, 1, options.get("xhat0"))
+        x0 = _given_x0(self.source, options, 1)
+        if seed is not None or self._stream is None:
+            self._stream = Stream(_seeds_of(self.np_random))
+            self._ahead = []
+        if not self._ahead:
+            self._ahead = self._simulate_ahead(self._stream)
+        draws, self._x, self._observations = self._ahead.pop()
+        if x0 is not None:
+            episode = self.source.play(draws, x0)
+            self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]
+        self._k = 0
+        if self.render_mode is not None:
+            self._picture = self._picture or EpisodePicture(self.source.system, self.render_mode)
+            self._picture.begin(self.source.times, self._x, self._observations)
+        if self.render_mode == "human":
+            self.render()
+        info = {"state": self._x[0].copy(), "xhat0": prior.mean[0], "P0": prior.cov[0]}
+        return self._observations[0].copy(), info
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        k = self._k
+        if k >= self._num_steps:
+            raise RuntimeError("the episode is over; call reset before step")
+        estimate = np.asarray(action, dtype=float)
+        x = self._x[k]
+        if estimate.shape != x.shape:
+            raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
+        weighted = (estimate - x) * self._weight
+        reward = -float(weighted.dot(weighted))
+        terminated = False
+        if not math.isfinite(reward):
+            terminated = not np.isfinite(estimate).all()
+            reward = NOT_FINITE_REWARD if terminated else -sys.float_info.max
+        if self._picture is not None:
+            self._picture.add(k, estimate)
+        self._k = k + 1
+        truncated = self._k == self._num_steps
+        info = {"state": self._x[self._k].copy()}
+        observation = self._observations[self._k].copy()
+        if terminated:
+            self._k = self._num_steps
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The true states so far over their estimates: an image (height, width, 3), or a window."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: make the env with render_mode='rgb_array'")
+            return None
+        if self._picture is None:
+            raise RuntimeError("there is nothing to draw yet; call reset before render")
+        return self._picture.draw(self._k)
+
+    def close(self) -> None:
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def _simulate_ahead(self, stream: Stream) -> list[tuple[Draws, np.ndarray, np.ndarray]]:
+        """The next episodes, the first of them last: simulating many costs little more than one."""
+        count = max(1, _SAMPLES_AHEAD // len(self.source.times))
+        draws = stream.draw(self.source, count)
+        episodes = self.source.play(draws)
+        parts = []
+        for i in reversed(range(count)):
+            own = Draws(draws.x0[i : i + 1], draws.noise[i : i + 1], draws.seeds[i : i + 1])
+            parts.append((own, episodes.x[:, i].copy(), episodes.observations[:, i].copy()))
+        return parts
+
+
+class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many episodes at a time of what `EstimationEnv` plays one at a time.
+
+    Row i of an env seeded s is the single env seeded s + i. A row whose episode is over is reset by
+    the next step, whose action it ignores (Gymnasium's ``NEXT_STEP``). The arguments are those of
+    `EstimationEnv`; reset options ``x0`` and ``xhat0`` are (nx,) or (num_envs, nx), and
+    ``reset_mask`` (num_envs,) names the rows to reset.
+    """
+
+    metadata = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 30,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        *,
+        dt: float | None = None,
+        duration: float | None = None,
+        noise_std: Sequence[float] | float | None = None,
+        parameters: Mapping[str, float] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs}; expected at least 1")
+        _check_render_mode(render_mode, self.metadata["render_modes"])
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.source = EpisodeSource(
+            system,
+            setup,
+            condition,
+            dt=dt,
+            duration=duration,
+            noise_std=noise_std,
+            parameters=parameters,
+        )
+        self.single_observation_space, self.single_action_space = _spaces(self.source.system)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._weight = _reward_weight(self.source.system)
+        self._num_steps = self.source.setup.num_steps
+        self._rows = np.arange(num_envs)
+        self._k = np.zeros(num_envs, dtype=int)
+        self._over = np.zeros(num_envs, dtype=bool)
+        self._streams: list[Stream] = []
+        self._episodes: Episodes | None = None
+        self._xhat0: np.ndarray | None = None
+        self._pictures: list[EpisodePicture] = []
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,  # pyright: ignore
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        options = _check_options(options, ("x0", "xhat0", "reset_mask"))
+        rows = self._rows
+        if "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+            if mask.shape != (self.num_envs,) or mask.dtype != bool:
+                raise ValueError(f"reset_mask={mask.tolist()}; expected {self.num_envs} booleans")
+            rows = np.flatnonzero(mask) if self._episodes is not None else rows
+        xhat0 = options.get("xhat0")
+        prior = Prior.of(self.source.system, self.source.setup, self.num_envs, xhat0)
+        x0 = _given_x0(self.source, options, self.num_envs)
+        self._seed(seed)
+        self._xhat0 = prior.mean
+        self._begin(rows, None if x0 is None else x0[rows])
+        infos = self._infos()
+        for name, value in (("xhat0", prior.mean.copy()), ("P0", prior.cov)):
+            infos[name], infos[f"_{name}"] = value, np.ones(self.num_envs, dtype=bool)
+        return self._current(self._playing.observations), infos
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        if self._episodes is None:
+            raise RuntimeError("no episode has begun; call reset before step")
+        estimates = np.asarray(actions, dtype=float)
+        shape = (self.num_envs, self.source.system.nx)
+        if estimates.shape != shape:
+            raise ValueError(f"actions have shape {estimates.shape}; expected {shape}, estimates")
+        over = self._over
+        weighted = (estimates - self._current(self._playing.x)) * self._weight
+        rewards = -np.einsum("bi,bi->b", weighted, weighted)
+        terminated = np.zeros(self.num_envs, dtype=bool)
+        if not np.isfinite(rewards.sum()):
+            terminated = ~np.isfinite(estimates).all(axis=1)
+            rewards = np.where(terminated, NOT_FINITE_REWARD, rewards)
+            np.maximum(rewards, -sys.float_info.max, out=rewards)
+        for row, picture in enumerate(self._pictures):
+            if not over[row]:
+                picture.add(int(self._k[row]), estimates[row])
+        self._k += 1
+        if over.any():
+            self._begin(np.flatnonzero(over))
+            rewards[over] = 0.0
+            terminated &= ~over
+        truncated = self._k == self._num_steps
+        self._over = terminated | truncated
+        observations = self._current(self._playing.observations)
+        return observations, rewards, terminated, truncated, self._infos()
+
+    def record(self) -> Record:
+        """What an estimator may see of the episodes now playing, from their first sample to that
+        of the last action."""
+        return self.source.record(self._playing, self._xhat0)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """An image (height, width, 3) per row."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: make the env with render_mode='rgb_array'")
+            return None
+        drawn = [picture.draw(int(k)) for picture, k in zip(self._pictures, self._k, strict=True)]
+        return tuple(image for image in drawn if image is not None)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        for picture in self._pictures:
+            picture.close()
+        self._pictures = []
+
+    @property
+    def _playing(self) -> Episodes:
+        if self._episodes is None:
+            raise RuntimeError("no episode has begun; call reset first")
+        return self._episodes
+
+    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+        """Give every row its stream, if there is a seed or no stream yet."""
+        seeds: list[int | None]
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        elif seed is None:
+            seeds = [None] * self.num_envs
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"{len(seeds)} seeds; expected {self.num_envs}, one per row")
+        if seed is not None or not self._streams:
+            self._streams = [Stream(np.random.SeedSequence(s)) for s in seeds]
+
+    def _begin(self, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
+        """Begin the next episode of these rows."""
+        draws = Draws.join([self._streams[row].draw(self.source) for row in rows])
+        new = self.source.play(draws, x0)
+        if len(rows) == self.num_envs:
+            self._episodes = new
+        else:
+            for name in ("x", "y", "observations"):
+                getattr(self._playing, name)[:, rows] = getattr(new, name)
+        self._k[rows] = 0
+        self._over[rows] = False
+        if self.render_mode is not None:
+            if not self._pictures:
+                mode = self.render_mode
+                self._pictures = [EpisodePicture(self.source.system, mode) for _ in self._rows]
+            for row in rows:
+                x, observations = self._playing.x[:, row], self._playing.observations[:, row]
+                self._pictures[row].begin(self.source.times, x, observations)
+
+    def _current(self, values: np.ndarray) -> np.ndarray:
+        """What stands in an array (time, batch, dim) at each row's present sample, as a copy."""
+        k = self._k
+        if (k == k[0]).all():
+            return values[k[0]].copy()
+        return values[k, self._rows]
+
+    def _infos(self) -> dict[str, Any]:
+        everywhere = np.ones(self.num_envs, dtype=bool)
+        return {"state": self._current(self._playing.x), "_state": everywhere}
+
+
+def _reward_weight(system: System) -> np.ndarray:
+    """What an error is multiplied with, so that minus its squared length is the reward."""
+    return 1 / (np.asarray(system.scale, dtype=float) * math.sqrt(system.nx))
+
+
+def _spaces(system: System) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """The spaces of observations and actions."""
+    width = system.ny + system.nu
+    low, high = np.full(width + 1, -np.inf), np.full(width + 1, np.inf)
+    low[-1], high[-1] = 0, 1
+    bound = system.state_bound or tuple(10 * s for s in system.scale)
+    largest = np.asarray(bound, dtype=np.float32)
+    observations = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+    return observations, gym.spaces.Box(-largest, largest)
+
+
+def _seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
+    """The seeds that Gymnasium made an env's generator from."""
+    seeds = rng.bit_generator.seed_seq
+    if not isinstance(seeds, np.random.SeedSequence):
+        raise TypeError(f"np_random was made from {type(seeds).__name__}; expected SeedSequence")
+    return seeds
+
+
+def _check_render_mode(mode: str | None, known: Sequence[str]) -> None:
+    if mode is not None and mode not in known:
+        raise ValueError(f"render_mode={mode!r}; expected {' or '.join(known)}")
+
+
+def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
+    for name in options or {}:
+        if name not in known:
+            raise ValueError(f"unknown reset option {name!r}; known are {', '.join(known)}")
+    return options or {}
+
+
+def _given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.ndarray | None:
+    """The initial states (batch, nx) among the reset options, if there; a warning if they are
+    outside the setup's set."""
+    if "x0" not in options:
+        return None
+    nx = source.system.nx
+    x0 = np.asarray(options["x0"], dtype=float)
+    if x0.shape not in ((nx,), (batch, nx)):
+        raise ValueError(f"x0 has shape {x0.shape}; expected ({nx},)")
+    if not np.isfinite(x0).all():
+        raise ValueError(f"x0={x0.tolist()} is not finite")
+    if not source.contains(x0):
+        name = type(source.system).__name__
+        gym.logger.warn(f"x0={x0.tolist()} is outside the initial set of {name}")
+    return np.broadcast_to(x0, (batch, nx)).copy()

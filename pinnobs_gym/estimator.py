@@ -1,0 +1,192 @@
+"""The interface that every estimator has, and how one is run over records."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Protocol, Self
+
+import numpy as np
+
+from pinnobs_gym.record import Prior, Record
+from pinnobs_gym.system import Setup, System, vector
+
+
+@dataclass(frozen=True)
+class State:
+    """The running state of an estimator, for a batch of episodes. A row that has diverged carries
+    values that are not finite."""
+
+    xhat: np.ndarray
+    """Estimates x̂(k|k), shape (batch, nx)."""
+    t: float | None = None
+    """Time of the last sample in s; None before the first."""
+    u: np.ndarray | None = None
+    """Inputs at the last sample, shape (batch, nu); None before the first."""
+    P: np.ndarray | None = None
+    """Covariances of the estimates, shape (batch, nx, nx), where the estimator has them."""
+    innovation: np.ndarray | None = None
+    """y − h(x̂(k|k−1)), shape (batch, ny), zero where y was missing."""
+    S: np.ndarray | None = None
+    """Covariances of the innovations, shape (batch, ny, ny)."""
+    memory: Any = None
+    """Whatever else the estimator must remember."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What an estimator makes of a batch of records: x̂(k|k) at every sample, and the covariances
+    and innovations where it has them."""
+
+    xhat: np.ndarray
+    """Shape (batch, num_samples, nx)."""
+    P: np.ndarray | None = None
+    """Shape (batch, num_samples, nx, nx)."""
+    innovation: np.ndarray | None = None
+    """Shape (batch, num_samples, ny)."""
+    S: np.ndarray | None = None
+    """Shape (batch, num_samples, ny, ny)."""
+
+
+@dataclass(frozen=True)
+class Estimator(ABC):
+    """An online estimator: x̂(k|k) from y₀..y_k, for a batch of episodes at once.
+
+    It is immutable, and its running state is explicit: `reset` makes one from the prior, and each
+    `update` makes the next from one sample, the first of which is y₀. An estimator sees outputs,
+    inputs and the model alone: the model may differ from the true plant, and the state, the
+    reward and an env's ``info`` are not shown to it.
+    """
+
+    system: System
+    """The model of the plant."""
+    noise_std: Sequence[float] | float | None = None
+    """The standard deviation of the output noise that the estimator is told, in output units; the
+    benchmark's if None."""
+
+    track: ClassVar[str] = "online"
+    """``online`` (causal) or ``offline`` (sees the whole record first); ranked apart."""
+    knows: ClassVar[tuple[str, ...]] = ("model", "prior", "noise")
+    """What it is told besides the outputs and inputs."""
+
+    @classmethod
+    def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
+        """The estimator with default tuning for a model and what a setup says of the noise."""
+        return cls(system, noise_std=setup.noise_std, **options)
+
+    @abstractmethod
+    def reset(self, prior: Prior) -> State:
+        """The state before the first sample."""
+
+    @abstractmethod
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """The state after the sample at time t (s).
+
+        Args:
+            state: the state after the sample before, at an earlier time; steps may be irregular.
+            t: the time of this sample.
+            y: outputs, shape (batch, ny); NaN is a missing one.
+            u: inputs, shape (batch, nu).
+        """
+
+    def run(self, record: Record) -> Estimates:
+        """The estimates over whole records: `update` in a loop."""
+        state = self.reset(record.prior)
+        columns: dict[str, np.ndarray] = {}
+        y, u = np.moveaxis(record.y, 1, 0).copy(), np.moveaxis(record.u, 1, 0).copy()
+        with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
+            for k, t in enumerate(record.t):
+                state = self.update(state, float(t), y[k], u[k])
+                if k == 0:
+                    columns = _empty_columns(state, record.num_samples)
+                for name, column in columns.items():
+                    column[k] = getattr(state, name)
+        return Estimates(**{name: np.moveaxis(c, 0, 1) for name, c in columns.items()})
+
+    @property
+    def output_variance(self) -> np.ndarray:
+        """Diagonal of R, shape (ny,), in squared output units.
+
+        Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; the
+        scale of an output is that of the state with the largest influence on it.
+        """
+        benchmark = self.system.setups["benchmark"].noise_std
+        told = benchmark if self.noise_std is None else self.noise_std
+        std = vector(told, self.system.ny, "noise_std")
+        scale = vector(self.system.scale, self.system.nx, "scale")
+        H = self.system.h_jacobian(vector(self.system.setups["benchmark"].xhat0, len(scale), ""))
+        return np.maximum(std, NOISE_FLOOR * abs(H * scale).max(axis=-1)) ** 2
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Its own settings by name, beyond the model and the noise."""
+        own = {f.name for f in fields(Estimator)}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in own and f.repr}
+
+
+NOISE_FLOOR = 1e-3
+"""Least standard deviation of output noise in R, over the output's scale."""
+
+
+@dataclass(frozen=True)
+class OfflineEstimator(Estimator):
+    """An estimator that sees an episode's whole record before it estimates any of it."""
+
+    track = "offline"
+
+    @abstractmethod
+    def estimate(self, record: Record) -> np.ndarray:
+        """x̂ at every sample, shape (batch, num_samples, nx)."""
+
+    def run(self, record: Record) -> Estimates:
+        return Estimates(self.estimate(record))
+
+    def reset(self, prior: Prior) -> State:
+        raise TypeError(f"{type(self).__name__} is offline: it takes whole records; call run")
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        raise TypeError(f"{type(self).__name__} is offline: it takes whole records; call run")
+
+
+class SingleEpisode(Protocol):
+    """What `PerEpisode` adapts: an object that estimates one episode."""
+
+    def reset(self, xhat0: np.ndarray, P0: np.ndarray) -> None:
+        """Begin an episode from a prior, (nx,) and (nx, nx)."""
+
+    def update(self, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Take the sample y (ny,), u (nu,) at time t (s) and return x̂ (nx,)."""
+
+
+@dataclass(frozen=True)
+class PerEpisode(Estimator):
+    """An adapter for objects that estimate one episode: each row of a batch gets its own.
+
+    Such objects keep their state inside, so a state of this estimator can only be used once.
+    """
+
+    make: Callable[[], SingleEpisode] = field(kw_only=True)
+    """Makes the object of one row."""
+    label: str = field(default="per_episode", kw_only=True)
+    """Its name in tables."""
+
+    def reset(self, prior: Prior) -> State:
+        rows = [self.make() for _ in prior.mean]
+        for row, mean, cov in zip(rows, prior.mean, prior.cov, strict=True):
+            row.reset(mean.copy(), cov.copy())
+        return State(prior.mean.copy(), memory=rows)
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        rows = copy.copy(state.memory)
+        xhat = [row.update(t, y_row, u_row) for row, y_row, u_row in zip(rows, y, u, strict=True)]
+        return State(np.array(xhat, dtype=float), t=t, u=u, memory=rows)
+
+
+def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:
+    return {
+        name: np.empty((num_samples, *getattr(state, name).shape))
+        for name in (f.name for f in fields(Estimates))
+        if getattr(state, name) is not None
+    }

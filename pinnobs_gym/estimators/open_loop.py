@@ -1,0 +1,28 @@
+"""The model alone, from the initial estimate: the row that everything must beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step
+
+
+@dataclass(frozen=True)
+class OpenLoop(Estimator):
+    """The model integrated from x̂₀ without looking at the output."""
+
+    name = "open_loop"
+    knows = ("model", "prior")
+
+    def reset(self, prior: Prior) -> State:
+        return State(prior.mean)
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        xhat = state.xhat
+        if state.t is not None:
+            xhat = model_step(self.system, state.t, t, xhat, state.u, u)
+        return State(xhat, t=t, u=u)

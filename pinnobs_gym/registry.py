@@ -1,0 +1,92 @@
+"""Finding systems, estimators and trainers by name: files of a package, entry points, plug-ins."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import warnings
+from importlib.metadata import entry_points
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T]):
+    """The classes of one kind that can be named.
+
+    Found are: every concrete subclass of ``base`` defined in a module of ``package``, those that
+    installed packages announce in the entry-point group ``package``, and those given to `register`.
+    A class is named by its class attribute ``name``, or else by its own name.
+    """
+
+    def __init__(self, kind: str, base: type[T], package: str) -> None:
+        self._kind = kind
+        self._base = base
+        self._package = package
+        self._classes: dict[str, type[T]] | None = None
+
+    def classes(self) -> dict[str, type[T]]:
+        """All classes by name, sorted; imports their modules on the first call."""
+        if self._classes is None:
+            self._classes = {}
+            package = importlib.import_module(self._package)
+            for module in pkgutil.iter_modules(package.__path__, f"{self._package}."):
+                for cls in vars(importlib.import_module(module.name)).values():
+                    if self._is_one(cls) and cls.__module__ == module.name:
+                        self.register(cls)
+            for point in entry_points(group=self._package):
+                try:
+                    self.register(point.load())
+                except Exception as error:
+                    warnings.warn(
+                        f"{self._kind} plug-in {point.name!r} is left out: {error}", stacklevel=2
+                    )
+        return dict(sorted(self._classes.items()))
+
+    def register(self, cls: type[T]) -> type[T]:
+        """Add a class; usable as a decorator.
+
+        Raises:
+            TypeError: if it is not a concrete class of this kind.
+            ValueError: if another class has its name.
+        """
+        if not self._is_one(cls):
+            raise TypeError(f"{cls!r} is not a concrete subclass of {self._base.__name__}")
+        classes = self._classes if self._classes is not None else self.classes()
+        assert self._classes is not None
+        name = self.name_of(cls)
+        known = classes.get(name)
+        if known is not None and known.__qualname__ != cls.__qualname__:
+            raise ValueError(f"{self._kind} {name!r} is already {known.__module__}.{name}")
+        self._classes[name] = cls
+        return cls
+
+    def resolve(self, spec: str | type[T]) -> type[T]:
+        """The class that a name, a ``module:Class`` path or the class itself means.
+
+        Raises:
+            ValueError: in one line; for an unknown name it lists the known ones.
+        """
+        if not isinstance(spec, str):
+            return self.register(spec)
+        if ":" in spec:
+            module, _, name = spec.partition(":")
+            try:
+                return self.register(getattr(importlib.import_module(module), name))
+            except (ImportError, AttributeError, TypeError) as error:
+                raise ValueError(f"cannot load {self._kind} {spec!r}: {error}") from None
+        classes = self.classes()
+        if spec not in classes:
+            raise ValueError(f"unknown {self._kind} {spec!r}; known are {', '.join(classes)}")
+        return classes[spec]
+
+    @staticmethod
+    def name_of(cls: type[T]) -> str:
+        """The name a class is found by."""
+        return getattr(cls, "name", cls.__name__)
+
+    def _is_one(self, cls: object) -> bool:
+        return (
+            isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
+        )

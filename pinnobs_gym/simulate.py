@@ -1,0 +1,312 @@
+"""The truth of an episode, from a high-order solver, and the discrete step that model-based
+estimators share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+
+import numpy as np
+from array_api_compat import array_namespace
+from numpy.polynomial import chebyshev
+from scipy.integrate import DOP853, solve_ivp
+
+from pinnobs_gym.system import Array, System, vector
+
+TOLERANCE = 1e-11
+"""Largest local error accepted in the truth, over the larger of a state and its scale."""
+
+_Weights = Callable[[np.ndarray], np.ndarray]
+_NODES = 6
+"""Solver steps that one interpolating polynomial passes through, with value and slope."""
+_HALVINGS = 7
+"""How often the step is halved before an episode is given to an adaptive solver."""
+
+
+def truth(
+    system: System, x0: np.ndarray, times: np.ndarray, max_step: float | None = None
+) -> np.ndarray:
+    """The trajectories x(t) of the plant from given initial states.
+
+    Dormand and Prince's method of order 8 with a step common to all episodes (Hairer, Nørsett &
+    Wanner, "Solving Ordinary Differential Equations I", II.5), and between its steps the Hermite
+    polynomial of degree 11 through the nearest six. The defect x' − f(t, x) of that polynomial,
+    taken midway between steps, controls the error: episodes whose local error is over `TOLERANCE`
+    are redone with half the step, and those that no step satisfies (stiff, or not smooth) by an
+    adaptive implicit method. An episode's result does not depend on those simulated with it.
+
+    Args:
+        system: the plant; its parameters may be arrays (batch,), one value per episode.
+        x0: initial states, shape (batch, nx), in state units.
+        times: sample times in s, ascending, shape (num_samples,); x0 is the state at the first.
+        max_step: the solver's step in s to begin with; a hundredth of the time if None.
+
+    Returns:
+        States, shape (num_samples, batch, nx).
+
+    Raises:
+        FloatingPointError: if a state leaves the finite numbers.
+    """
+    x = np.empty((len(times), *x0.shape))
+    x[0] = x0
+    ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
+    start, state = float(times[0]), np.asarray(x0, dtype=float)
+    longest = max_step or float(times[-1] - times[0]) / 100
+    done = 1
+    for end in ends:
+        stop = int(np.searchsorted(times, end, side="right"))
+        wanted = np.append(times[done:stop], end)  # the end may lie between samples
+        segment = _smooth(system, state, start, float(end), wanted, longest)
+        x[done:stop] = segment[:-1]
+        done, start, state = stop, float(end), segment[-1]
+    if not np.isfinite(x.sum()):
+        row = int(np.flatnonzero(~np.isfinite(x).all(axis=(0, 2)))[0])
+        raise FloatingPointError(
+            f"{type(system).__name__} leaves the finite numbers from x0={x0[row].tolist()}"
+        )
+    return x
+
+
+def _smooth(
+    system: System,
+    x0: np.ndarray,
+    start: float,
+    end: float,
+    times: np.ndarray,
+    max_step: float,
+) -> np.ndarray:
+    """`truth` over an interval on which f is smooth."""
+    steps = max(_NODES, int(np.ceil((end - start) / max_step - 1e-9)))
+    x = np.empty((len(times), *x0.shape))
+    rows = np.arange(len(x0))
+    with np.errstate(all="ignore"):
+        for _ in range(_HALVINGS):
+            part, error = _fixed_step(rows_of(system, rows), x0[rows], start, end, steps, times)
+            if len(rows) == len(x0):
+                x = part
+            else:
+                x[:, rows] = part
+            rows = rows[~(error <= TOLERANCE)]
+            if not len(rows):
+                return x
+            steps *= 2
+    for row in rows:
+        x[:, row] = _adaptive(rows_of(system, np.array([row])), x0[row], start, end, times)
+    return x
+
+
+def _fixed_step(
+    system: System, x0: np.ndarray, start: float, end: float, steps: int, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (num_samples, batch, nx) at the times, and each episode's local error (batch,)."""
+    mesh = _mesh(start, end, steps, times.tobytes())
+    last = np.nextafter(end, start)  # f may jump at the end; it is wanted from the left
+    batch, nx = x0.shape
+    path = np.empty((len(mesh.nodes), 2, batch, nx))  # the states and their slopes at the nodes
+    stages = np.empty((1 + len(DOP853.B), batch, nx))  # the state, then the slopes of the stages
+    flat = stages.reshape(len(stages), -1)
+    stages[0] = x0
+    for k, step in enumerate(mesh.steps):
+        t = np.minimum(mesh.nodes[k] + step * DOP853.C, last)
+        u = system.input(t)
+        weights = _tableau(step)
+        for i, row in enumerate(weights[:-1]):
+            stage = np.dot(row, flat[: i + 1]).reshape(batch, nx)
+            stages[i + 1] = system.f(t[i], stage, u[i])
+        path[k] = stages[:2]
+        np.dot(weights[-1], flat, out=flat[0])
+    path[-1, 0] = stages[0]
+    path[-1, 1] = system.f(last, stages[0], system.input(last))
+    flat = path.reshape(2 * len(path), -1)
+    out = np.empty((len(times), batch, nx))
+    middle, rate = np.empty((2, len(mesh.steps), batch, nx))
+    for k, (window, between, check) in enumerate(mesh.intervals):
+        if len(between):
+            inside = slice(mesh.bounds[k], mesh.bounds[k + 1])
+            np.dot(between, flat[window], out=out.reshape(len(times), -1)[inside])
+        middle[k], rate[k] = np.dot(check, flat[window]).reshape(2, batch, nx)
+    t = (mesh.nodes[:-1] + mesh.steps / 2)[:, None]
+    rate -= system.f(t, middle, system.input(t))
+    size = np.maximum(abs(middle), vector(system.scale, nx, "scale"))
+    error = (abs(rate) / size * mesh.steps[:, None, None]).max(axis=0)
+    return out, error.max(axis=-1)
+
+
+@lru_cache(maxsize=64)
+def _tableau(step: float) -> list[np.ndarray]:
+    """Weights of (state, slopes of the stages so far) in each stage, and last in the next state."""
+    rows = [np.append(1.0, step * row[:i]) for i, row in enumerate(DOP853.A[:12])]
+    return [*rows, np.append(1.0, step * DOP853.B)]
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """The solver's nodes over an interval, and the polynomials between them."""
+
+    nodes: np.ndarray
+    steps: np.ndarray
+    bounds: np.ndarray
+    """Where the samples of each interval begin."""
+    intervals: list[tuple[slice, np.ndarray, np.ndarray]]
+    """For each interval the rows of (state, slope, state, slope, ...) at the nodes that its
+    polynomial passes through, and their weights in the state at the interval's samples, and in the
+    state and the slope midway."""
+
+
+@lru_cache(maxsize=64)
+def _mesh(start: float, end: float, steps: int, times: bytes) -> _Mesh:
+    samples = np.frombuffer(times)
+    step = (end - start) / steps
+    # The polynomials of the outermost intervals are one-sided: shorter steps make up for it.
+    inner = np.arange(2, steps - 1)
+    nodes = start + step * np.concatenate(
+        [np.arange(8) / 4, inner, steps - np.arange(7, -1, -1) / 4]
+    )
+    nodes[-1] = end
+    interval = np.clip(np.searchsorted(nodes, samples, side="right") - 1, 0, len(nodes) - 2)
+    bounds = np.searchsorted(interval, np.arange(len(nodes)))
+    intervals = []
+    for k in range(len(nodes) - 1):
+        first = min(max(k - _NODES // 2 + 1, 0), len(nodes) - _NODES)
+        window = (nodes[first : first + _NODES] - nodes[first]) / step
+        inside = (samples[bounds[k] : bounds[k + 1]] - nodes[first]) / step
+        value, slope = _hermite(tuple(np.round(window, 6)))
+        middle = window[k - first : k - first + 2].mean(keepdims=True)
+        weights = np.concatenate([value(middle), slope(middle) / step, value(inside)])
+        weights[:, 1::2] *= step
+        rows = slice(2 * first, 2 * (first + _NODES))
+        intervals.append((rows, weights[2:], weights[:2]))
+    return _Mesh(nodes, np.round(np.diff(nodes), 15), bounds, intervals)
+
+
+@lru_cache(maxsize=64)
+def _hermite(nodes: tuple[float, ...]) -> tuple[_Weights, _Weights]:
+    """Functions of times (num_times,) that return the weights (num_times, 2·num_nodes) of
+    (value, slope, value, slope, ...) at the nodes in the value, and in the slope, of the polynomial
+    of least degree through them."""
+    size = 2 * len(nodes)
+    centre, half = (nodes[0] + nodes[-1]) / 2, (nodes[-1] - nodes[0]) / 2
+    derivative = chebyshev.chebder(np.eye(size)) / half
+
+    def values(t: np.ndarray) -> np.ndarray:
+        return chebyshev.chebvander((t - centre) / half, size - 1)
+
+    def slopes(t: np.ndarray) -> np.ndarray:
+        return chebyshev.chebvander((t - centre) / half, size - 2) @ derivative
+
+    at = np.asarray(nodes)
+    conditions = np.stack([values(at), slopes(at)], axis=1).reshape(size, size)
+    inverse = np.linalg.inv(conditions)
+    return lambda t: values(t) @ inverse, lambda t: slopes(t) @ inverse
+
+
+def _adaptive(
+    system: System, x0: np.ndarray, start: float, end: float, times: np.ndarray
+) -> np.ndarray:
+    """One episode by an adaptive method that also takes stiff and kinked plants."""
+    last = np.nextafter(end, start)
+
+    def rate(t: float, x: np.ndarray) -> np.ndarray:
+        now = np.asarray(min(t, last))
+        return system.f(now, x[None], system.input(now))[0]
+
+    atol = 1e-12 * vector(system.scale, system.nx, "scale")
+    solution = solve_ivp(rate, (start, end), x0, "LSODA", times, rtol=1e-11, atol=atol)
+    x = np.full((len(times), len(x0)), np.nan)
+    if solution.success:
+        x[:] = solution.y.T
+    return x
+
+
+def rows_of(system: System, rows: np.ndarray) -> System:
+    """The system with those of its parameters that are arrays (batch,) reduced to some rows."""
+    changes = {
+        f.name: getattr(system, f.name)[rows]
+        for f in fields(system)
+        if getattr(getattr(system, f.name), "ndim", 0)
+    }
+    return replace(system, **changes) if changes else system
+
+
+def model_step(
+    system: System, t0: float, t1: float, x: Array, u0: Array | None = None, u1: Array | None = None
+) -> Array:
+    """The state (..., nx) at t1 of the model that is in x at t0 (s), by the classical Runge-Kutta
+    method in equal steps of at most the system's `System.model_step`.
+
+    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1; they are used, joined by a
+    straight line, only if the system's input is a measured one.
+    """
+    for t, step, u in _substeps(system, t0, t1, x, u0, u1):
+        k1 = system.f(t[0], x, u[0])
+        k2 = system.f(t[1], x + step / 2 * k1, u[1])
+        k3 = system.f(t[1], x + step / 2 * k2, u[1])
+        k4 = system.f(t[2], x + step * k3, u[2])
+        x = x + step / 6 * (k1 + 2 * (k2 + k3) + k4)
+    return x
+
+
+def model_step_jacobian(
+    system: System,
+    t0: float,
+    t1: float,
+    x: np.ndarray,
+    u0: np.ndarray | None = None,
+    u1: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `model_step` returns for x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape
+    (batch, nx, nx), with the batch innermost in memory."""
+    batch, nx = x.shape
+    F = None
+    for t, step, u in _substeps(system, t0, t1, x, u0, u1):
+        points = np.empty((4, batch, nx))
+        points[0] = x
+        k1 = system.f(t[0], x, u[0])
+        points[1] = x + (step / 2) * k1
+        k2 = system.f(t[1], points[1], u[1])
+        points[2] = x + (step / 2) * k2
+        k3 = system.f(t[1], points[2], u[1])
+        points[3] = x + step * k3
+        k4 = system.f(t[2], points[3], u[2])
+        x = x + (step / 6) * (k1 + 2 * (k2 + k3) + k4)
+        # The variational equation Φ' = A(t)Φ, by the same method along the same stages.
+        stage_times = t[[0, 1, 1, 2], None]
+        A = system.f_jacobian(stage_times, points, u[[0, 1, 1, 2], None])
+        A = A.transpose(2, 3, 0, 1)  # (nx, nx, 4, batch)
+        K1, A2, A3, A4 = A[:, :, 0], A[:, :, 1], A[:, :, 2], A[:, :, 3]
+        K2 = A2 + (step / 2) * product(A2, K1)
+        K3 = A3 + (step / 2) * product(A3, K2)
+        K4 = A4 + step * product(A4, K3)
+        flow = (step / 6) * (K1 + 2 * (K2 + K3) + K4)
+        for i in range(nx):
+            flow[i, i] += 1
+        F = flow if F is None else product(flow, F)
+    assert F is not None  # there is at least one substep
+    return x, F.transpose(2, 0, 1)
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The matrix products (n, m, batch) of (n, k, batch) and (k, m, batch): several times faster
+    than the same with the batch first where the matrices are small."""
+    return np.einsum("ijb,jkb->ikb", a, b)
+
+
+def _substeps(system: System, t0: float, t1: float, x: Array, u0: Array | None, u1: Array | None):
+    """Yield, for each Runge-Kutta step from t0 to t1, the three times at which f is evaluated, the
+    step, and the inputs at these times (3, ..., nu)."""
+    xp = array_namespace(x)
+    longest = system.model_step or system.setups["benchmark"].dt
+    count = max(1, int(np.ceil((t1 - t0) / longest - 1e-6)))
+    step = (t1 - t0) / count
+    for k in range(count):
+        start = t0 + k * step
+        t = xp.asarray([start, start + step / 2, start + step], dtype=x.dtype)
+        if system.measured_input:
+            if u0 is None or u1 is None:
+                raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
+            weight = ((t - t0) / (t1 - t0)).reshape(3, *([1] * u0.ndim))
+            u = (1 - weight) * u0 + weight * u1
+        else:
+            u = system.input(t)
+        yield t, step, u

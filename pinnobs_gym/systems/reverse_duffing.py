@@ -1,0 +1,68 @@
+"""The reverse Duffing oscillator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pinnobs_gym.system import Array, Setup, System, matrix, stack
+
+
+@dataclass(frozen=True)
+class ReverseDuffing(System):
+    """A conservative oscillator whose velocity enters the position cubed.
+
+    Equations (Farkane et al., PINN-Obs, "Ablation studies"): ẋ₁ = x₂³, ẋ₂ = −x₁, y = x₁.
+
+    Invariant: H = x₁²/2 + x₂⁴/4; every orbit is periodic, with period 5.2441·H^(−1/4) s.
+
+    Observability: no two states give the same output, but the map from the state to (y, ẏ, ÿ)
+    loses rank on x₂ = 0, twice in every period: differentiating the output does not give x₂ there.
+    """
+
+    state_names = ("x1", "x2")
+    output_names = ("y1",)
+    scale = (1.3, 1.0)
+    state_bound = (2.3, 1.9)
+    setups = {
+        "benchmark": Setup(
+            x0_low=(-2.2, -1.8),
+            x0_high=(2.2, 1.8),
+            xhat0=(1.0, 1.0),
+            P0_std=(1.5, 1.2),
+            duration=20.0,
+            dt=0.02,
+            noise_std=0.02,
+            truth_step=1 / 12,
+        ),
+        "paper": Setup(
+            x0_low=(2.0, -1.0),
+            x0_high=(2.0, -1.0),
+            xhat0=(1.0, 1.0),
+            P0_std=(1.5, 1.2),
+            duration=20.0,
+            dt=2e-3,
+            truth_step=1 / 12,
+        ),
+    }
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        x1, x2 = x[..., 0], x[..., 1]
+        return stack(x, x2 * x2 * x2, -x1)
+
+    def h(self, x: Array) -> Array:
+        return x[..., :1]
+
+    def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
+        x2 = x[..., 1]
+        return matrix(x, [[0.0, 3 * x2 * x2], [-1.0, 0.0]])
+
+    def h_jacobian(self, x: Array) -> Array:
+        return matrix(x, [[1.0, 0.0]])
+
+    def admissible(self, x0: Array) -> Array:
+        """Neither at rest nor of more energy than was checked: 0.25 ≤ H ≤ 2.5."""
+        energy = self.invariants(x0)[..., 0]
+        return (energy >= 0.25) & (energy <= 2.5)
+
+    def invariants(self, x: Array) -> Array:
+        return (x[..., :1] ** 2) / 2 + (x[..., 1:] ** 4) / 4

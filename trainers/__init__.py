@@ -1,0 +1,1 @@
+"""Trainers of learned estimators, one file each: a Config and `train`."""
