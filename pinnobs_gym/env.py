@@ -40,18 +40,11 @@ class Draws:
     noise: np.ndarray
     """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
     seeds: tuple[int, ...]
-    """A seed per episode for what its condition draws."""
+    """A seed per episode for what its condition draws; none if that draws nothing."""
 
-    @staticmethod
-    def join(draws: Sequence[Draws]) -> Draws:
-        """Several batches as one."""
-        if len(draws) == 1:
-            return draws[0]
-        return Draws(
-            np.concatenate([draw.x0 for draw in draws]),
-            np.concatenate([draw.noise for draw in draws]),
-            tuple(seed for draw in draws for seed in draw.seeds),
-        )
+    def row(self, i: int) -> Draws:
+        """Those of one episode."""
+        return Draws(self.x0[i : i + 1], self.noise[i : i + 1], self.seeds[i : i + 1])
 
 
 @dataclass(frozen=True)
@@ -92,6 +85,8 @@ class EpisodeSource:
         self.condition = parse_condition(condition)
         self.condition.plant(self.system, ())  # a condition that does not fit says so now
         self.setup = self.condition.setup(self.system, chosen)
+        self.fixed_x0 = self.setup.fixed_x0
+        self.trivial = type(self.condition) is Condition
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
@@ -100,60 +95,81 @@ class EpisodeSource:
 
     def contains(self, x0: np.ndarray) -> bool:
         """Whether all initial states (..., nx) belong to the setup's set."""
-        if self.setup.fixed_x0:
+        if self.fixed_x0:
             return bool((x0 == self.x0_low).all())
         inside = (x0 >= self.x0_low) & (x0 <= self.x0_high)
         return bool(inside.all() and np.all(self.system.admissible(x0)))
 
-    def play(self, draws: Draws, x0: np.ndarray | None = None) -> Episodes:
-        """The episodes of these draws; ``x0`` (batch, nx) replaces the initial states drawn."""
+    def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
+        """What chance decides in the next episode of each stream; a stream may stand there several
+        times. The array ``noise``, of the right size, is written anew if given."""
+        x0 = np.empty((len(streams), self.system.nx))
+        if noise is None:
+            noise = np.empty((len(streams), len(self.times), self.system.ny))
+        for i, stream in enumerate(streams):
+            x0[i] = stream.next_x0(self)
+            stream.noise.standard_normal(out=noise[i])
+        seeds = () if self.trivial else tuple(int(s.conditions.integers(2**63)) for s in streams)
+        return Draws(x0, noise, seeds)
+
+    def play(
+        self, draws: Draws, x0: np.ndarray | None = None, into: Episodes | None = None
+    ) -> Episodes:
+        """The episodes of these draws.
+
+        Args:
+            draws: what chance decided.
+            x0: initial states (batch, nx) that replace those drawn.
+            into: episodes of the same size that are over, whose arrays are written anew.
+        """
         start = draws.x0 if x0 is None else x0
-        batch, num_samples, ny = len(start), len(self.times), self.system.ny
-        trivial = type(self.condition) is Condition
-        rngs = [] if trivial else [np.random.default_rng(seed) for seed in draws.seeds]
+        episodes = self._empty(len(start)) if into is None else into
+        x, y, observations = episodes.x, episodes.y, episodes.observations
+        rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
-        if plant is self.system and batch > 1 and (start == start[0]).all():
-            x = np.repeat(self._truth(plant, start[:1]), batch, axis=1)
+        if plant is self.system and len(start) > 1 and (start == start[0]).all():
+            x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
         else:
-            x = self._truth(plant, start)
-        y = self.system.h(x) + draws.noise.swapaxes(0, 1) * self._noise_std
-        y = self.condition.outputs(y, self.setup, rngs)
-        observations = np.empty((num_samples, batch, ny + self.system.nu + 1), np.float32)
+            truth(plant, start, self.times, self.setup.truth_step, out=x)
+        np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
+        y += self.system.h(x)
+        if not self.trivial:
+            y[:] = self.condition.outputs(y, self.setup, rngs)
+        ny = self.system.ny
         observations[..., :ny] = y
         observations[..., ny:-1] = self.inputs[:, None]
         observations[..., -1] = (self.times / self.times[-1])[:, None]
-        return Episodes(x, y, observations)
+        return episodes
+
+    def _empty(self, batch: int) -> Episodes:
+        shape, system = (len(self.times), batch), self.system
+        return Episodes(
+            np.empty((*shape, system.nx)),
+            np.empty((*shape, system.ny)),
+            np.empty((*shape, system.ny + system.nu + 1), np.float32),
+        )
 
     def record(self, episodes: Episodes, xhat0: object = None) -> Record:
         """What an estimator may see of the episodes: their samples up to the last action's."""
         batch, last = episodes.y.shape[1], self.setup.num_steps
         u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
         prior = Prior.of(self.system, self.setup, batch, xhat0)
-        return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1), u, prior)
-
-    def _truth(self, plant: System, x0: np.ndarray) -> np.ndarray:
-        return truth(plant, x0, self.times, self.setup.truth_step)
+        return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
 
 
 class Stream:
-    """The endless sequence of draws that one seed stands for."""
+    """The random numbers that one seed stands for, and its queue of initial states."""
 
     def __init__(self, seeds: np.random.SeedSequence) -> None:
         states, noise, conditions = (np.random.default_rng(seed) for seed in seeds.spawn(3))
-        self._states, self._noise, self._conditions = states, noise, conditions
+        self._states = states
         self._queue: list[np.ndarray] = []
+        self.noise = noise
+        self.conditions = conditions
 
-    def draw(self, source: EpisodeSource, count: int = 1) -> Draws:
-        """What chance decides in the next episodes."""
-        shape = (count, len(source.times), source.system.ny)
-        return Draws(
-            np.stack([self._next_x0(source) for _ in range(count)]),
-            self._noise.standard_normal(shape),
-            tuple(self._conditions.integers(2**63, size=count).tolist()),
-        )
-
-    def _next_x0(self, source: EpisodeSource) -> np.ndarray:
-        if source.setup.fixed_x0:
+    def next_x0(self, source: EpisodeSource) -> np.ndarray:
+        """The next initial state (nx,) from the setup's set."""
+        if source.fixed_x0:
             return source.x0_low
         for _ in range(_ATTEMPTS):
             if self._queue:
@@ -162,40 +178,6 @@ class Stream:
             self._queue = list(drawn[source.system.admissible(drawn)])
         name = type(source.system).__name__
         raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")
-
-
-def _spaces(system: System) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """The spaces of observations and actions."""
-    width = system.ny + system.nu
-    low, high = np.full(width + 1, -np.inf), np.full(width + 1, np.inf)
-    low[-1], high[-1] = 0, 1
-    bound = system.state_bound or tuple(10 * s for s in system.scale)
-    largest = np.asarray(bound, dtype=np.float32)
-    observations = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
-    return observations, gym.spaces.Box(-largest, largest)
-
-
-def _check_states(value: object, shapes: Sequence[tuple[int, ...]], name: str) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
-    if array.shape not in shapes:
-        raise ValueError(f"{name} has shape {array.shape}; expected {' or '.join(map(str, shapes))}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}={array.tolist()} is not finite")
-    return array
-
-
-def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
-    for name in options or {}:
-        if name not in known:
-            raise ValueError(f"unknown reset option {name!r}; known are {', '.join(known)}")
-    return options or {}
-
-
-def _warn_outside(source: EpisodeSource, x0: np.ndarray) -> None:
-    if not source.contains(x0):
-        gym.logger.warn(
-            f"x0={x0.tolist()} is outside the initial set of {type(source.system).__name__}"
-        )
 
 
 class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -245,7 +227,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
             parameters=parameters,
         )
         self.observation_space, self.action_space = _spaces(self.source.system)
-        self._weight = _reward_weight(self.source.system)
+        self._weights = _reward_weights(self.source.system)
         self._num_steps = self.source.setup.num_steps
         self._k = self._num_steps
         self._stream: Stream | None = None
@@ -287,8 +269,8 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         x = self._x[k]
         if estimate.shape != x.shape:
             raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
-        weighted = (estimate - x) * self._weight
-        reward = -float(weighted.dot(weighted))
+        error = estimate - x
+        reward = -float((error * error).dot(self._weights))
         terminated = False
         if not math.isfinite(reward):
             terminated = not np.isfinite(estimate).all()
@@ -322,13 +304,12 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
     def _simulate_ahead(self, stream: Stream) -> list[tuple[Draws, np.ndarray, np.ndarray]]:
         """The next episodes, the first of them last: simulating many costs little more than one."""
         count = max(1, _SAMPLES_AHEAD // len(self.source.times))
-        draws = stream.draw(self.source, count)
+        draws = self.source.draw([stream] * count)
         episodes = self.source.play(draws)
-        parts = []
-        for i in reversed(range(count)):
-            own = Draws(draws.x0[i : i + 1], draws.noise[i : i + 1], draws.seeds[i : i + 1])
-            parts.append((own, episodes.x[:, i].copy(), episodes.observations[:, i].copy()))
-        return parts
+        return [
+            (draws.row(i), episodes.x[:, i].copy(), episodes.observations[:, i].copy())
+            for i in reversed(range(count))
+        ]
 
 
 class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -376,13 +357,16 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self.single_observation_space, self.single_action_space = _spaces(self.source.system)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._weight = _reward_weight(self.source.system)
+        self._weights = _reward_weights(self.source.system)
         self._num_steps = self.source.setup.num_steps
         self._rows = np.arange(num_envs)
         self._k = np.zeros(num_envs, dtype=int)
         self._over = np.zeros(num_envs, dtype=bool)
+        self._any_over = False
+        self._together = True
         self._streams: list[Stream] = []
         self._episodes: Episodes | None = None
+        self._noise: np.ndarray | None = None
         self._xhat0: np.ndarray | None = None
         self._pictures: list[EpisodePicture] = []
 
@@ -405,10 +389,10 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._seed(seed)
         self._xhat0 = prior.mean
         self._begin(rows, None if x0 is None else x0[rows])
-        infos = self._infos()
+        observations, infos = self._look()
         for name, value in (("xhat0", prior.mean.copy()), ("P0", prior.cov)):
             infos[name], infos[f"_{name}"] = value, np.ones(self.num_envs, dtype=bool)
-        return self._current(self._playing.observations), infos
+        return observations, infos
 
     def step(
         self, actions: np.ndarray
@@ -420,10 +404,10 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if estimates.shape != shape:
             raise ValueError(f"actions have shape {estimates.shape}; expected {shape}, estimates")
         over = self._over
-        weighted = (estimates - self._current(self._playing.x)) * self._weight
-        rewards = -np.einsum("bi,bi->b", weighted, weighted)
+        error = estimates - self._state
+        rewards = -((error * error) @ self._weights)
         terminated = np.zeros(self.num_envs, dtype=bool)
-        if not np.isfinite(rewards.sum()):
+        if not math.isfinite(rewards.sum()):
             terminated = ~np.isfinite(estimates).all(axis=1)
             rewards = np.where(terminated, NOT_FINITE_REWARD, rewards)
             np.maximum(rewards, -sys.float_info.max, out=rewards)
@@ -431,14 +415,15 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             if not over[row]:
                 picture.add(int(self._k[row]), estimates[row])
         self._k += 1
-        if over.any():
+        if self._any_over:
             self._begin(np.flatnonzero(over))
             rewards[over] = 0.0
             terminated &= ~over
         truncated = self._k == self._num_steps
         self._over = terminated | truncated
-        observations = self._current(self._playing.observations)
-        return observations, rewards, terminated, truncated, self._infos()
+        self._any_over = bool(self._over.any())
+        observations, infos = self._look()
+        return observations, rewards, terminated, truncated, infos
 
     def record(self) -> Record:
         """What an estimator may see of the episodes now playing, from their first sample to that
@@ -481,15 +466,22 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def _begin(self, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
         """Begin the next episode of these rows."""
-        draws = Draws.join([self._streams[row].draw(self.source) for row in rows])
-        new = self.source.play(draws, x0)
-        if len(rows) == self.num_envs:
+        # Arrays of this size are slow to allocate: those of the episodes that are over serve again.
+        everything = len(rows) == self.num_envs
+        draws = self.source.draw(
+            [self._streams[row] for row in rows], self._noise if everything else None
+        )
+        self._noise = draws.noise if everything else self._noise
+        new = self.source.play(draws, x0, self._episodes if everything else None)
+        if everything:
             self._episodes = new
         else:
             for name in ("x", "y", "observations"):
                 getattr(self._playing, name)[:, rows] = getattr(new, name)
         self._k[rows] = 0
         self._over[rows] = False
+        self._any_over = bool(self._over.any())
+        self._together = bool((self._k == self._k[0]).all())
         if self.render_mode is not None:
             if not self._pictures:
                 mode = self.render_mode
@@ -498,21 +490,21 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
                 x, observations = self._playing.x[:, row], self._playing.observations[:, row]
                 self._pictures[row].begin(self.source.times, x, observations)
 
-    def _current(self, values: np.ndarray) -> np.ndarray:
-        """What stands in an array (time, batch, dim) at each row's present sample, as a copy."""
-        k = self._k
-        if (k == k[0]).all():
-            return values[k[0]].copy()
-        return values[k, self._rows]
-
-    def _infos(self) -> dict[str, Any]:
+    def _look(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """The observations and infos of each row's present sample."""
+        episodes, k = self._playing, self._k
+        if self._together:
+            self._state, observations = episodes.x[k[0]], episodes.observations[k[0]].copy()
+        else:
+            self._state = episodes.x[k, self._rows]
+            observations = episodes.observations[k, self._rows]
         everywhere = np.ones(self.num_envs, dtype=bool)
-        return {"state": self._current(self._playing.x), "_state": everywhere}
+        return observations, {"state": self._state.copy(), "_state": everywhere}
 
 
-def _reward_weight(system: System) -> np.ndarray:
-    """What an error is multiplied with, so that minus its squared length is the reward."""
-    return 1 / (np.asarray(system.scale, dtype=float) * math.sqrt(system.nx))
+def _reward_weights(system: System) -> np.ndarray:
+    """What each squared error counts in minus the reward."""
+    return 1 / (np.asarray(system.scale, dtype=float) ** 2 * system.nx)
 
 
 def _spaces(system: System) -> tuple[gym.spaces.Box, gym.spaces.Box]:

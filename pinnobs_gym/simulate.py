@@ -14,7 +14,7 @@ from scipy.integrate import DOP853, solve_ivp
 
 from pinnobs_gym.system import Array, System, vector
 
-TOLERANCE = 1e-11
+TOLERANCE = 3e-11
 """Largest local error accepted in the truth, over the larger of a state and its scale."""
 
 _Weights = Callable[[np.ndarray], np.ndarray]
@@ -25,7 +25,11 @@ _HALVINGS = 7
 
 
 def truth(
-    system: System, x0: np.ndarray, times: np.ndarray, max_step: float | None = None
+    system: System,
+    x0: np.ndarray,
+    times: np.ndarray,
+    max_step: float | None = None,
+    out: np.ndarray | None = None,
 ) -> np.ndarray:
     """The trajectories x(t) of the plant from given initial states.
 
@@ -41,6 +45,7 @@ def truth(
         x0: initial states, shape (batch, nx), in state units.
         times: sample times in s, ascending, shape (num_samples,); x0 is the state at the first.
         max_step: the solver's step in s to begin with; a hundredth of the time if None.
+        out: an array to write the result into.
 
     Returns:
         States, shape (num_samples, batch, nx).
@@ -48,7 +53,7 @@ def truth(
     Raises:
         FloatingPointError: if a state leaves the finite numbers.
     """
-    x = np.empty((len(times), *x0.shape))
+    x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
     ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
     start, state = float(times[0]), np.asarray(x0, dtype=float)
@@ -56,10 +61,8 @@ def truth(
     done = 1
     for end in ends:
         stop = int(np.searchsorted(times, end, side="right"))
-        wanted = np.append(times[done:stop], end)  # the end may lie between samples
-        segment = _smooth(system, state, start, float(end), wanted, longest)
-        x[done:stop] = segment[:-1]
-        done, start, state = stop, float(end), segment[-1]
+        last = _smooth(system, state, start, float(end), times[done:stop], longest, x[done:stop])
+        done, start, state = stop, float(end), last
     if not np.isfinite(x.sum()):
         row = int(np.flatnonzero(~np.isfinite(x).all(axis=(0, 2)))[0])
         raise FloatingPointError(
@@ -75,31 +78,42 @@ def _smooth(
     end: float,
     times: np.ndarray,
     max_step: float,
+    out: np.ndarray,
 ) -> np.ndarray:
-    """`truth` over an interval on which f is smooth."""
+    """`truth` over an interval on which f is smooth, written to ``out``; returns the last state."""
     steps = max(_NODES, int(np.ceil((end - start) / max_step - 1e-9)))
-    x = np.empty((len(times), *x0.shape))
+    last = np.empty_like(x0)
     rows = np.arange(len(x0))
     with np.errstate(all="ignore"):
         for _ in range(_HALVINGS):
-            part, error = _fixed_step(rows_of(system, rows), x0[rows], start, end, steps, times)
-            if len(rows) == len(x0):
-                x = part
-            else:
-                x[:, rows] = part
+            plant = rows_of(system, rows)
+            everything = len(rows) == len(x0)
+            part = out if everything else np.empty((len(times), len(rows), x0.shape[1]))
+            last[rows], error = _fixed_step(plant, x0[rows], start, end, steps, times, part)
+            if not everything:
+                out[:, rows] = part
             rows = rows[~(error <= TOLERANCE)]
             if not len(rows):
-                return x
+                return last
             steps *= 2
     for row in rows:
-        x[:, row] = _adaptive(rows_of(system, np.array([row])), x0[row], start, end, times)
-    return x
+        plant = rows_of(system, np.array([row]))
+        x = _adaptive(plant, x0[row], start, end, np.append(times, end))
+        out[:, row], last[row] = x[:-1], x[-1]
+    return last
 
 
 def _fixed_step(
-    system: System, x0: np.ndarray, start: float, end: float, steps: int, times: np.ndarray
+    system: System,
+    x0: np.ndarray,
+    start: float,
+    end: float,
+    steps: int,
+    times: np.ndarray,
+    out: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States (num_samples, batch, nx) at the times, and each episode's local error (batch,)."""
+    """Write the states at the times to ``out`` (num_samples, batch, nx); return those at the end,
+    and each episode's local error (batch,)."""
     mesh = _mesh(start, end, steps, times.tobytes())
     last = np.nextafter(end, start)  # f may jump at the end; it is wanted from the left
     batch, nx = x0.shape
@@ -119,18 +133,26 @@ def _fixed_step(
     path[-1, 0] = stages[0]
     path[-1, 1] = system.f(last, stages[0], system.input(last))
     flat = path.reshape(2 * len(path), -1)
-    out = np.empty((len(times), batch, nx))
-    middle, rate = np.empty((2, len(mesh.steps), batch, nx))
-    for k, (window, between, check) in enumerate(mesh.intervals):
-        if len(between):
+    for k, (window, weights) in enumerate(mesh.intervals):
+        if len(weights):
             inside = slice(mesh.bounds[k], mesh.bounds[k + 1])
-            np.dot(between, flat[window], out=out.reshape(len(times), -1)[inside])
-        middle[k], rate[k] = np.dot(check, flat[window]).reshape(2, batch, nx)
-    t = (mesh.nodes[:-1] + mesh.steps / 2)[:, None]
+            np.dot(weights, flat[window], out=out.reshape(len(times), -1)[inside])
+    return path[-1, 0], _local_error(system, mesh, flat, path[0, 0].shape)
+
+
+def _local_error(
+    system: System, mesh: _Mesh, flat: np.ndarray, shape: tuple[int, int]
+) -> np.ndarray:
+    """The defect of the polynomials midway between nodes, times the step, over the larger of state
+    and scale: the largest of each episode, (batch,)."""
+    middle, rate = np.empty((2, len(mesh.checked), *shape))
+    for i, (window, weights) in enumerate(mesh.checks):
+        middle[i], rate[i] = np.dot(weights, flat[window]).reshape(2, *shape)
+    k = mesh.checked
+    t = (mesh.nodes[k] + mesh.steps[k] / 2)[:, None]
     rate -= system.f(t, middle, system.input(t))
-    size = np.maximum(abs(middle), vector(system.scale, nx, "scale"))
-    error = (abs(rate) / size * mesh.steps[:, None, None]).max(axis=0)
-    return out, error.max(axis=-1)
+    size = np.maximum(abs(middle), vector(system.scale, system.nx, "scale"))
+    return (abs(rate) / size * mesh.steps[k, None, None]).max(axis=0).max(axis=-1)
 
 
 @lru_cache(maxsize=64)
@@ -148,10 +170,13 @@ class _Mesh:
     steps: np.ndarray
     bounds: np.ndarray
     """Where the samples of each interval begin."""
-    intervals: list[tuple[slice, np.ndarray, np.ndarray]]
+    intervals: list[tuple[slice, np.ndarray]]
     """For each interval the rows of (state, slope, state, slope, ...) at the nodes that its
-    polynomial passes through, and their weights in the state at the interval's samples, and in the
-    state and the slope midway."""
+    polynomial passes through, and their weights in the state at the interval's samples."""
+    checked: np.ndarray
+    """The intervals whose defect is looked at: the outermost, and every third."""
+    checks: list[tuple[slice, np.ndarray]]
+    """For each of these the same rows, and their weights in the state and the slope midway."""
 
 
 @lru_cache(maxsize=64)
@@ -159,25 +184,25 @@ def _mesh(start: float, end: float, steps: int, times: bytes) -> _Mesh:
     samples = np.frombuffer(times)
     step = (end - start) / steps
     # The polynomials of the outermost intervals are one-sided: shorter steps make up for it.
-    inner = np.arange(2, steps - 1)
-    nodes = start + step * np.concatenate(
-        [np.arange(8) / 4, inner, steps - np.arange(7, -1, -1) / 4]
-    )
+    short = np.arange(6) / 2
+    nodes = start + step * np.concatenate([short, np.arange(3, steps - 2), steps - short[::-1]])
     nodes[-1] = end
     interval = np.clip(np.searchsorted(nodes, samples, side="right") - 1, 0, len(nodes) - 2)
     bounds = np.searchsorted(interval, np.arange(len(nodes)))
-    intervals = []
+    checked = np.unique(np.append(np.arange(0, len(nodes) - 1, 3), len(nodes) - 2))
+    intervals, checks = [], []
     for k in range(len(nodes) - 1):
         first = min(max(k - _NODES // 2 + 1, 0), len(nodes) - _NODES)
+        rows = slice(2 * first, 2 * (first + _NODES))
         window = (nodes[first : first + _NODES] - nodes[first]) / step
         inside = (samples[bounds[k] : bounds[k + 1]] - nodes[first]) / step
         value, slope = _hermite(tuple(np.round(window, 6)))
-        middle = window[k - first : k - first + 2].mean(keepdims=True)
-        weights = np.concatenate([value(middle), slope(middle) / step, value(inside)])
-        weights[:, 1::2] *= step
-        rows = slice(2 * first, 2 * (first + _NODES))
-        intervals.append((rows, weights[2:], weights[:2]))
-    return _Mesh(nodes, np.round(np.diff(nodes), 15), bounds, intervals)
+        units = np.tile([1.0, step], _NODES)  # the polynomials' time is in steps
+        intervals.append((rows, value(inside) * units))
+        if k in checked:
+            middle = window[k - first : k - first + 2].mean(keepdims=True)
+            checks.append((rows, np.concatenate([value(middle), slope(middle) / step]) * units))
+    return _Mesh(nodes, np.round(np.diff(nodes), 15), bounds, intervals, checked, checks)
 
 
 @lru_cache(maxsize=64)

@@ -32,7 +32,7 @@ class ReverseDuffing(System):
             duration=20.0,
             dt=0.02,
             noise_std=0.02,
-            truth_step=1 / 12,
+            truth_step=0.095,
         ),
         "paper": Setup(
             x0_low=(2.0, -1.0),
@@ -41,7 +41,7 @@ class ReverseDuffing(System):
             P0_std=(1.5, 1.2),
             duration=20.0,
             dt=2e-3,
-            truth_step=1 / 12,
+            truth_step=0.095,
         ),
     }
 
