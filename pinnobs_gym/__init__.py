@@ -20,9 +20,19 @@ if TYPE_CHECKING:
 __all__ = ["Estimator", "Setup", "System", "env_id", "evaluate", "register"]
 
 
-def env_id(system: type[System]) -> str:
-    """The env id of a system."""
-    return f"pinnobs/{system.__name__}-v{system.version}"
+def env_id(system: str | type[System]) -> str:
+    """The env id of a system, given by class, name or ``module:Class``, which is then registered.
+
+    Raises:
+        ValueError: listing the known systems, if it is unknown.
+    """
+    cls = SYSTEMS.resolve(system)
+    register(cls)
+    return _id(cls)
+
+
+def _id(cls: type[System]) -> str:
+    return f"pinnobs/{cls.__name__}-v{cls.version}"
 
 
 def register(cls: type) -> type:
@@ -49,7 +59,7 @@ def register(cls: type) -> type:
 
 
 def _register_env(cls: type[System]) -> None:
-    name = env_id(cls)
+    name = _id(cls)
     if name not in gymnasium.registry:
         gymnasium.register(
             name,

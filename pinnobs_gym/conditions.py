@@ -141,5 +141,3 @@ def parse_condition(name: str) -> Condition:
     if len(parts) == 1:
         return CONDITIONS[name]
     return Combined(tuple(CONDITIONS[part] for part in parts))
-
-

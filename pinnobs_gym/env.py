@@ -17,7 +17,7 @@ from pinnobs_gym.conditions import Condition, parse_condition
 from pinnobs_gym.figures import EpisodePicture
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import truth
-from pinnobs_gym.system import Setup, System, vector
+from pinnobs_gym.system import System, vector
 from pinnobs_gym.systems import SYSTEMS
 
 NOT_FINITE_REWARD = -1e4
@@ -259,9 +259,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         info = {"state": self._x[0].copy(), "xhat0": prior.mean[0], "P0": prior.cov[0]}
         return self._observations[0].copy(), info
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         k = self._k
         if k >= self._num_steps:
             raise RuntimeError("the episode is over; call reset before step")
@@ -269,8 +267,9 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         x = self._x[k]
         if estimate.shape != x.shape:
             raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
-        error = estimate - x
-        reward = -float((error * error).dot(self._weights))
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = estimate - x
+            reward = -float((error * error).dot(self._weights))
         terminated = False
         if not math.isfinite(reward):
             terminated = not np.isfinite(estimate).all()
@@ -404,8 +403,9 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if estimates.shape != shape:
             raise ValueError(f"actions have shape {estimates.shape}; expected {shape}, estimates")
         over = self._over
-        error = estimates - self._state
-        rewards = -((error * error) @ self._weights)
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = estimates - self._state
+            rewards = -((error * error) @ self._weights)
         terminated = np.zeros(self.num_envs, dtype=bool)
         if not math.isfinite(rewards.sum()):
             terminated = ~np.isfinite(estimates).all(axis=1)

@@ -68,8 +68,12 @@ class Estimator(ABC):
 
     track: ClassVar[str] = "online"
     """``online`` (causal) or ``offline`` (sees the whole record first); ranked apart."""
+    trains_on_record: ClassVar[str | None] = None
+    """The name of the trainer that it runs on every record it is given, if it does."""
     knows: ClassVar[tuple[str, ...]] = ("model", "prior", "noise")
     """What it is told besides the outputs and inputs."""
+    needs_training: ClassVar[str | None] = None
+    """Name of the trainer that must make it, if `for_setup` alone cannot."""
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
@@ -118,6 +122,16 @@ class Estimator(ABC):
         scale = vector(self.system.scale, self.system.nx, "scale")
         H = self.system.h_jacobian(vector(self.system.setups["benchmark"].xhat0, len(scale), ""))
         return np.maximum(std, NOISE_FLOOR * abs(H * scale).max(axis=-1)) ** 2
+
+    @property
+    def label(self) -> str:
+        """Its name in tables: the class attribute ``name``, or else the class's own."""
+        return getattr(type(self), "name", type(self).__name__)
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How it was trained, in plain numbers and strings; empty for those that are not."""
+        return {}
 
     @property
     def options(self) -> dict[str, Any]:

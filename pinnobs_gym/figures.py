@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pinnobs_gym.system import System
+from pinnobs_gym.system import System, vector
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def state_figure(
 
 def _measured_states(system: System) -> dict[int, int]:
     """The states that are measured alone, each with the index of the output that does so."""
-    H = np.asarray(system.h_jacobian(np.asarray(system.setups["benchmark"].xhat0, dtype=float)))
+    H = system.h_jacobian(vector(system.setups["benchmark"].xhat0, system.nx, "xhat0"))
     return {
         int(np.argmax(row != 0)): output
         for output, row in enumerate(H)
@@ -171,5 +171,3 @@ class EpisodePicture:
         shown.set_data(image)
         window.canvas.draw_idle()
         pyplot.pause(1e-3)
-
-

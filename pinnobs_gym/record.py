@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,8 @@ class Prior:
     @staticmethod
     def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
         """The prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
-        mean = np.asarray(setup.xhat0 if xhat0 is None else xhat0, dtype=float)
+        own = vector(setup.xhat0, system.nx, "xhat0")
+        mean = own if xhat0 is None else np.asarray(xhat0, dtype=float)
         if mean.shape not in ((system.nx,), (batch, system.nx)):
             raise ValueError(f"xhat0 has shape {mean.shape}; expected ({system.nx},)")
         if not np.isfinite(mean).all():
@@ -53,7 +54,9 @@ class Record:
             raise ValueError(f"t has shape {self.t.shape}; expected (num_samples,)")
         if not np.isfinite(self.t).all() or (steps <= 0).any():
             row = int(np.flatnonzero(~(steps > 0))[0]) + 1
-            raise ValueError(f"t must increase; sample {row} has t={self.t[row]} after {self.t[row - 1]}")
+            raise ValueError(
+                f"t must increase; sample {row} has t={self.t[row]} after {self.t[row - 1]}"
+            )
         batch = len(self.prior.mean)
         for name in ("y", "u"):
             array = getattr(self, name)
@@ -78,11 +81,13 @@ class Record:
         return Record(self.t, self.y[rows], self.u[rows], prior)
 
 
-def read_log(path: str | Path, system: System, prior: Prior) -> Record:
+def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:
     """The record in a CSV file with columns t (s), y1, y2, ... and, if its system has inputs,
     u1, u2, ...; sample times may be irregular, and an empty cell or ``nan`` is a missing output.
+    Columns of other names are ignored.
 
-    Columns of other names are ignored. Without columns u the system's own input is taken.
+    Also returns the system, which takes its input from the record if that has columns u. A record
+    without them is of the input that the system's own class defines, if it does.
 
     Raises:
         ValueError: in one line that names the file, the row and what was expected.
@@ -99,7 +104,7 @@ def read_log(path: str | Path, system: System, prior: Prior) -> Record:
     header = [name.strip() for name in rows[0][1]]
     outputs = [f"y{i + 1}" for i in range(system.ny)]
     inputs = [f"u{i + 1}" for i in range(system.nu)]
-    if system.nu and not system.measured_input and not set(inputs) & set(header):
+    if type(system).input is not System.input and not set(inputs) & set(header):
         inputs = []
     missing = [name for name in ["t", *outputs, *inputs] if name not in header]
     if missing:
@@ -123,7 +128,7 @@ def read_log(path: str | Path, system: System, prior: Prior) -> Record:
         raise ValueError(f"log {path}, line {number}: t={later} after {earlier}; t must increase")
     y = np.stack([table[name] for name in outputs], axis=-1)[None]
     u = np.stack([table[n] for n in inputs], axis=-1) if inputs else system.input(t)
-    return Record(t, y, u[None], prior)
+    return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior)
 
 
 def _number(cell: str, name: str, where: str) -> float:

@@ -15,27 +15,28 @@ T = TypeVar("T")
 class Registry(Generic[T]):
     """The classes of one kind that can be named.
 
-    Found are: every concrete subclass of ``base`` defined in a module of ``package``, those that
-    installed packages announce in the entry-point group ``package``, and those given to `register`.
+    Found are: every concrete subclass of ``base`` defined in a module of the ``packages``, those
+    that installed packages announce in the entry-point group named like the first of these, and
+    those given to `register`.
     A class is named by its class attribute ``name``, or else by its own name.
     """
 
-    def __init__(self, kind: str, base: type[T], package: str) -> None:
+    def __init__(self, kind: str, base: type[T], *packages: str) -> None:
         self._kind = kind
         self._base = base
-        self._package = package
+        self._packages = packages
         self._classes: dict[str, type[T]] | None = None
 
     def classes(self) -> dict[str, type[T]]:
         """All classes by name, sorted; imports their modules on the first call."""
         if self._classes is None:
             self._classes = {}
-            package = importlib.import_module(self._package)
-            for module in pkgutil.iter_modules(package.__path__, f"{self._package}."):
-                for cls in vars(importlib.import_module(module.name)).values():
-                    if self._is_one(cls) and cls.__module__ == module.name:
-                        self.register(cls)
-            for point in entry_points(group=self._package):
+            for package in map(importlib.import_module, self._packages):
+                for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+                    for cls in vars(importlib.import_module(module.name)).values():
+                        if self._is_one(cls) and cls.__module__ == module.name:
+                            self.register(cls)
+            for point in entry_points(group=self._packages[0]):
                 try:
                     self.register(point.load())
                 except Exception as error:
@@ -57,7 +58,11 @@ class Registry(Generic[T]):
         assert self._classes is not None
         name = self.name_of(cls)
         known = classes.get(name)
-        if known is not None and known.__qualname__ != cls.__qualname__:
+        same = known is not None and (known.__module__, known.__qualname__) == (
+            cls.__module__,
+            cls.__qualname__,
+        )  # a class that was imported anew replaces what it was
+        if known is not None and not same:
             raise ValueError(f"{self._kind} {name!r} is already {known.__module__}.{name}")
         self._classes[name] = cls
         return cls
@@ -87,6 +92,4 @@ class Registry(Generic[T]):
         return getattr(cls, "name", cls.__name__)
 
     def _is_one(self, cls: object) -> bool:
-        return (
-            isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
-        )
+        return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)

@@ -3,7 +3,7 @@ estimators share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
@@ -263,7 +263,7 @@ def model_step(
     ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1; they are used, joined by a
     straight line, only if the system's input is a measured one.
     """
-    for t, step, u in _substeps(system, t0, t1, x, u0, u1):
+    for t, step, u in substeps(system, t0, t1, x, u0, u1):
         k1 = system.f(t[0], x, u[0])
         k2 = system.f(t[1], x + step / 2 * k1, u[1])
         k3 = system.f(t[1], x + step / 2 * k2, u[1])
@@ -284,7 +284,7 @@ def model_step_jacobian(
     (batch, nx, nx), with the batch innermost in memory."""
     batch, nx = x.shape
     F = None
-    for t, step, u in _substeps(system, t0, t1, x, u0, u1):
+    for t, step, u in substeps(system, t0, t1, x, u0, u1):
         points = np.empty((4, batch, nx))
         points[0] = x
         k1 = system.f(t[0], x, u[0])
@@ -317,9 +317,11 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("ijb,jkb->ikb", a, b)
 
 
-def _substeps(system: System, t0: float, t1: float, x: Array, u0: Array | None, u1: Array | None):
-    """Yield, for each Runge-Kutta step from t0 to t1, the three times at which f is evaluated, the
-    step, and the inputs at these times (3, ..., nu)."""
+def substeps(
+    system: System, t0: float, t1: float, x: Array, u0: Array | None, u1: Array | None
+) -> Iterator[tuple[Array, float, Array]]:
+    """Yield, for each Runge-Kutta step of `model_step` from t0 to t1, the three times (s) at which
+    f is evaluated, the step, and the inputs at these times, (3, ..., nu)."""
     xp = array_namespace(x)
     longest = system.model_step or system.setups["benchmark"].dt
     count = max(1, int(np.ceil((t1 - t0) / longest - 1e-6)))

@@ -191,9 +191,7 @@ class System(ABC):
                 f"unknown setup {setup!r} of {cls.__name__}; it has {', '.join(cls.setups)}"
             )
         changes = {"dt": dt, "duration": duration, "noise_std": noise_std}
-        chosen = replace(
-            cls.setups[setup], **{k: v for k, v in changes.items() if v is not None}
-        )
+        chosen = replace(cls.setups[setup], **{k: v for k, v in changes.items() if v is not None})
         system = cls()
         wanted = {**chosen.parameters, **(parameters or {})}
         for name in wanted:
@@ -250,8 +248,13 @@ def stack(like: Array, *components: Array | float) -> Array:
         return out
     xp = array_namespace(like)
     batch = tuple(like.shape[:-1])
-    arrays = [xp.asarray(component, dtype=like.dtype) for component in components]
-    return xp.stack([xp.broadcast_to(array, batch) for array in arrays], axis=-1)
+    columns = [
+        xp.full(batch, component, dtype=like.dtype)
+        if isinstance(component, int | float)
+        else xp.broadcast_to(component, batch)
+        for component in components
+    ]
+    return xp.stack(columns, axis=-1)
 
 
 def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:

@@ -1,0 +1,462 @@
+"""The command `pinnobs`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+import numpy as np
+import tyro
+from rich import box
+from rich.console import Console
+from rich.markdown import Markdown
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table as RichTable
+
+from pinnobs_gym import env_id, leaderboard, rows, suite
+from pinnobs_gym.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.evaluation import evaluate, make_vector_env, score_batch
+from pinnobs_gym.figures import state_figure
+from pinnobs_gym.log import Log
+from pinnobs_gym.record import Prior, read_log
+from pinnobs_gym.report import page, write_estimates, write_figure
+from pinnobs_gym.systems import SYSTEMS
+
+console = Console() if Console().is_terminal else Console(width=150)
+
+
+@dataclass(frozen=True)
+class Systems:
+    """List the systems, or print the page of one."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Name or module:Class of a system."""
+
+    def run(self) -> int:
+        """Print."""
+        if self.name is not None:
+            name = env_id(self.name)
+            text = page(SYSTEMS.resolve(self.name), name)
+            console.print(Markdown(text) if console.is_terminal else text)
+            return 0
+        table = RichTable("env id", "states", "measured", "inputs", "setups")
+        for cls in SYSTEMS.classes().values():
+            system = cls()
+            states, outputs = ", ".join(cls.state_names), ", ".join(system.output_names)
+            inputs = ", ".join(cls.input_names)
+            table.add_row(env_id(cls), states, outputs, inputs, ", ".join(cls.setups))
+        console.print(table)
+        return 0
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """List the estimators, or print what one is."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Name or module:Class of an estimator."""
+
+    def run(self) -> int:
+        """Print."""
+        import inspect
+
+        if self.name is not None:
+            console.print(inspect.getdoc(ESTIMATORS.resolve(self.name)), markup=False)
+            return 0
+        table = RichTable("name", "track", "is told", "what it is")
+        for name, cls in ESTIMATORS.classes().items():
+            first = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
+            table.add_row(name, cls.track, ", ".join(cls.knows), first)
+        console.print(table)
+        return 0
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score one estimator on one system, episode by episode."""
+
+    system: str
+    """Name or module:Class of the system."""
+    estimator: str = "ekf"
+    """Name or module:Class of the estimator."""
+    checkpoint: Path | None = None
+    """Trained estimator to load."""
+    set: tuple[str, ...] = ()
+    """Settings of the estimator, such as process_noise=1e-3."""
+    setup: str = "benchmark"
+    """Setup that is played."""
+    condition: str = "nominal"
+    """Condition, such as load_step, or noise5+dropout10."""
+    episodes: int = 100
+    """Number of episodes."""
+    seed: int = 0
+    """Seed of the first."""
+    out: Path = Path("runs/evaluate")
+    """Folder of rows and TensorBoard log."""
+
+    def run(self) -> int:
+        """Evaluate and print."""
+        name = env_id(self.system)
+        cls = ESTIMATORS.resolve(self.estimator)
+        estimator: Estimator | type[Estimator] = cls
+        options = parse_settings(cls, self.set)
+        if self.checkpoint is not None:
+            if cls.needs_training is None:
+                raise ValueError(f"estimator {self.estimator!r} is not trained; leave --checkpoint")
+            model = make_vector_env(name, 1, self.setup, self.condition).source.system
+            estimator = cls.load(self.checkpoint, model)
+        folder = self.out / "tensorboard" / name.removeprefix("pinnobs/") / self.setup
+        with Log(folder / self.condition / ESTIMATORS.name_of(cls)) as log, _progress() as bar:
+            task = bar.add_task("episodes", total=self.episodes)
+            scored = evaluate(
+                estimator,
+                name,
+                episodes=self.episodes,
+                seed=self.seed,
+                setup=self.setup,
+                condition=self.condition,
+                options=options,
+                results=self.out / "rows.jsonl",
+                log=log,
+                progress=lambda done: bar.advance(task, done),
+            )
+            bar.update(task, completed=self.episodes)
+        for table in leaderboard.tables(scored):
+            print_table(table)
+        console.print(f"rows: {self.out / 'rows.jsonl'}; TensorBoard: {self.out / 'tensorboard'}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """Run every estimator on every system and print the tables; what is already there is kept."""
+
+    systems: tuple[str, ...] = ()
+    """Names or module:Class of systems; all that are known if empty."""
+    estimators: tuple[str, ...] = ()
+    """Names or module:Class of estimators; all that are known if empty."""
+    setup: str = "benchmark"
+    """Setup that is played."""
+    condition: str | None = None
+    """Condition; nominal, and the one that a system is ranked under, if none is given."""
+    episodes: int = 100
+    """Episodes of each estimator and system."""
+    trained_episodes: int = 2
+    """Episodes of those that train on every record."""
+    budget: float = 25.0
+    """CPU seconds of each training."""
+    seed: int = 0
+    """Seed of the first episode."""
+    jobs: int = 2
+    """Processes at a time, one thread each."""
+    out: Path = Path("runs/leaderboard")
+    """Folder of rows, tables, TensorBoard log and trained files."""
+
+    def run(self) -> int:
+        """Run what is missing, then print and write the tables."""
+        if self.jobs < 1 or self.trained_episodes < 1:
+            raise ValueError(
+                f"jobs={self.jobs}, trained_episodes={self.trained_episodes}; expected at least 1"
+            )
+        check_writable(self.out)
+        rows.read(self.out / "rows.jsonl")  # a damaged file is refused before anything is run
+        jobs = suite.jobs_of(
+            self.systems or tuple(SYSTEMS.classes()),
+            self.estimators or default_estimators(),
+            setup=self.setup,
+            condition=self.condition,
+            episodes=self.episodes,
+            trained_episodes=self.trained_episodes,
+            seed=self.seed,
+            folder=self.out,
+            training={"budget": self.budget},
+        )
+        failures = []
+        with _progress() as bar:
+            task = bar.add_task("jobs", total=len(jobs))
+            for job, failure in suite.run_jobs(jobs, self.jobs):
+                bar.advance(task)
+                if failure is not None:
+                    failures.append(f"failed: {job.name}: {failure}")
+                    bar.console.print(failures[-1], markup=False)
+        tables = leaderboard.tables(rows.read(self.out / "rows.jsonl"))
+        for table in tables:
+            print_table(table)
+        console.print(leaderboard.NOTE)
+        path = self.out / "leaderboard.md"
+        path.write_text(leaderboard.markdown(tables), encoding="utf-8")
+        for what, where in (
+            ("tables", path),
+            ("rows", self.out / "rows.jsonl"),
+            ("TensorBoard", self.out / "tensorboard"),
+            ("trained files", self.out / "trained"),
+        ):
+            console.print(f"{what + ':':14} {where}", soft_wrap=True)
+        return 1 if failures else 0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate the states behind a sensor log: a CSV file with columns t, y1, ... and u1, ..."""
+
+    system: str
+    """Name or module:Class of the model."""
+    log: Path
+    """The CSV file; sample times may be irregular, empty cells are missing outputs."""
+    estimator: str = "ekf"
+    """Name or module:Class of the estimator."""
+    set: tuple[str, ...] = ()
+    """Settings of the estimator, such as process_noise=1e-3."""
+    xhat0: tuple[float, ...] | None = None
+    """Initial estimate; the benchmark's if not given."""
+    P0_std: tuple[float, ...] | None = None
+    """Its standard deviations; the benchmark's if not given."""
+    noise_std: tuple[float, ...] | None = None
+    """Standard deviations of the output noise; the benchmark's if not given."""
+    out: Path = Path("estimates.csv")
+    """Where the estimates go; a picture of the same name and the ending .png lies beside it."""
+
+    def run(self) -> int:
+        """Estimate and write."""
+        env_id(self.system)  # checks and registers a system of the user's
+        cls = SYSTEMS.resolve(self.system)
+        system, setup = cls.configured(noise_std=self.noise_std)
+        given = {"xhat0": self.xhat0, "P0_std": self.P0_std}
+        setup = replace(setup, **{name: value for name, value in given.items() if value})
+        prior = Prior.of(system, setup, 1)
+        system, record = read_log(self.log, system, prior)
+        kind = ESTIMATORS.resolve(self.estimator)
+        if kind.needs_training is not None:
+            raise ValueError(
+                f"estimator {self.estimator!r} is trained beforehand; for a log take one that is "
+                f"not, or trains on the record"
+            )
+        check_writable(self.out.parent)
+        estimator = kind.for_setup(system, setup, **parse_settings(kind, self.set))
+        estimates = estimator.run(record)
+        if not np.isfinite(estimates.xhat).all():
+            console.print("warning: the estimates leave the finite numbers", style="yellow")
+        write_estimates(self.out, system, record, estimates)
+        P = None if estimates.P is None else estimates.P[0]
+        title = f"{self.log.name}: {type(system).__name__}, {estimator.label}"
+        figure = state_figure(system, record.t, estimates.xhat[0], y=record.y[0], P=P, title=title)
+        picture = self.out.with_suffix(".png")
+        write_figure(picture, figure)
+        last = ", ".join(
+            f"{name} = {value:.6g}"
+            for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
+        )
+        console.print(f"{record.num_samples} samples; at t = {record.t[-1]:g} s: {last}")
+        console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
+        return 0
+
+
+ConfigType = TypeVar("ConfigType")
+
+
+@dataclass(frozen=True)
+class Train(Generic[ConfigType]):
+    """Train an estimator on one episode of a system."""
+
+    system: str
+    """Name or module:Class of the system."""
+    config: ConfigType
+    """The trainer's choices."""
+    setup: str = "benchmark"
+    """Setup that is played."""
+    condition: str = "nominal"
+    """Condition, such as load_step."""
+    episode: int = suite.TRAINING_SEED
+    """Seed of the episode whose record is learned from."""
+    out: Path = Path("runs/train")
+    """Folder of checkpoints, trained files, pictures and TensorBoard log."""
+    resume: bool = False
+    """Go on from the checkpoint that is there."""
+
+
+def train(name: str, arguments: Sequence[str]) -> int:
+    """Train an estimator with the trainer of that name."""
+    module = suite.trainer(name)
+    default = tyro.conf.OmitArgPrefixes
+    kind = Train[module.Config]
+    chosen = tyro.cli(kind, prog=f"pinnobs train {name}", args=arguments, config=(default,))
+    check_writable(chosen.out)
+    env = env_id(chosen.system)
+    system, record = suite.record_of(env, chosen.setup, chosen.condition, chosen.episode)
+    played = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
+    stem = chosen.out / f"{played}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
+    checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
+    with Log(chosen.out / "tensorboard" / stem.name) as log:
+        result = module.train(
+            system,
+            chosen.config,
+            record=record,
+            log=log,
+            checkpoint=checkpoint,
+            resume=chosen.resume,
+            progress=True,
+        )
+    path = stem.with_name(stem.name + ".pt")
+    result.save(path)
+    console.print(
+        f"loss {result.loss:.3g} after {result.iterations} iterations, {result.seconds:.1f} CPU s"
+    )
+    for label, cls in ESTIMATORS.classes().items():
+        if cls.needs_training == name:
+            estimator = cls.load(path, system)
+            own, example = score_batch(
+                estimator, env, chosen.setup, chosen.condition, [chosen.episode]
+            )
+            console.print(
+                f"{label} on its own record: RMSE {own[0]['rmse']:.4g}, NRMSE "
+                f"{own[0]['nrmse']:.4g}, last 25 % {own[0]['nrmse_tail']:.4g}"
+            )
+            picture = stem.with_name(f"{stem.name}-{label}.png")
+            write_figure(picture, state_figure(system, title=f"{label}: {played}", **example))
+            console.print(f"picture: {picture}", soft_wrap=True)
+    console.print(f"trained file: {path}", soft_wrap=True)
+    console.print(f"checkpoint: {checkpoint} (go on with --resume)", soft_wrap=True)
+    console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
+    return 0
+
+
+def default_estimators() -> tuple[str, ...]:
+    """All that can be scored on episodes they have not seen."""
+    return tuple(
+        name
+        for name, cls in ESTIMATORS.classes().items()
+        if cls.needs_training is None or cls.track == "online"
+    )
+
+
+def parse_settings(cls: type[Estimator], settings: Sequence[str]) -> dict[str, Any]:
+    """The values of ``name=number`` settings of an estimator.
+
+    Raises:
+        ValueError: in one line, naming what is unknown and what is known.
+    """
+    base = {f.name for f in fields(Estimator)}
+    known = {f.name for f in fields(cls) if f.name not in base}
+    values: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals or name not in known:
+            listed = ", ".join(sorted(known)) or "none"
+            raise ValueError(f"setting {setting!r}; expected name=value with a name of: {listed}")
+        try:
+            values[name] = float(text)
+        except ValueError:
+            values[name] = text
+    return values
+
+
+def check_writable(folder: Path) -> None:
+    """Make a folder.
+
+    Raises:
+        ValueError: in one line, if nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".write-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"cannot write to folder {folder}: {error}") from None
+
+
+def print_table(table: leaderboard.Table) -> None:
+    """Print a leaderboard's table; a narrow terminal is spared the intervals."""
+    wide = console.width >= 145
+    shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
+    skipped = () if wide else ("90th pct.", "µs/step")
+    columns = [i for i, name in enumerate(leaderboard.HEADER) if name not in (*skipped, "training")]
+    for i in columns:
+        name = leaderboard.HEADER[i]
+        text = name in ("estimator", "track")
+        shown.add_column(name, justify="left" if text else "right", no_wrap=True)
+    for line in leaderboard.cells(table, intervals=wide):
+        shown.add_row(*(line[i] for i in columns))
+    console.print(shown)
+    for standing in table.standings:
+        if standing.training:
+            console.print(f"  {standing.estimator}: {standing.training}")
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+COMMANDS: Mapping[str, Any] = {
+    "systems": Systems,
+    "estimators": Estimators,
+    "train": train,
+    "evaluate": Evaluate,
+    "leaderboard": Leaderboard,
+    "estimate": Estimate,
+}
+"""What the command can do."""
+
+USAGE = """usage: pinnobs COMMAND ...
+
+  systems [NAME]        list the systems, or print the page of one
+  estimators [NAME]     list the estimators, or print what one is
+  train TRAINER ...     train an estimator on one episode
+  evaluate ...          score one estimator on one system
+  leaderboard ...       run every estimator on every system
+  estimate ...          estimate the states behind a sensor log
+
+pinnobs COMMAND --help says more. A system or estimator of your own is given as module:Class."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status: 0, 1 if a job failed, 2 for bad input."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0 if arguments else 2
+    sys.path.insert(0, os.getcwd())  # so that module:Class finds the user's own files
+    name, rest = arguments[0], list(arguments[1:])
+    try:
+        if name not in COMMANDS:
+            raise ValueError(f"unknown command {name!r}; known are {', '.join(COMMANDS)}")
+        if name == "train":
+            return _train(rest)
+        return tyro.cli(COMMANDS[name], prog=f"pinnobs {name}", args=rest).run()
+    except (ValueError, TypeError, FloatingPointError) as error:
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        print(f"pinnobs: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("pinnobs: stopped; what was written is kept", file=sys.stderr)
+        return 130
+
+
+def _train(arguments: list[str]) -> int:
+    if not arguments or arguments[0].startswith("-"):
+        raise ValueError(f"name a trainer first: pinnobs train {' | '.join(suite.trainers())}")
+    return train(arguments[0], arguments[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,284 @@
+"""PINN-Obs once trained: the network's own estimates, and the observer with its learned gain."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from pinnobs_gym.estimator import Estimator, OfflineEstimator, State
+from pinnobs_gym.network import Architecture, Network
+from pinnobs_gym.record import Prior, Record
+from pinnobs_gym.simulate import substeps
+from pinnobs_gym.system import System
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A network trained on one record, and how that went."""
+
+    network: Network
+    """Its weights are those of the least loss."""
+    t: np.ndarray
+    """Sample times in s of the record it was trained on, shape (num_samples,)."""
+    y: np.ndarray
+    """Outputs of that record, shape (num_samples, ny)."""
+    system: str
+    """Class name of the system."""
+    parameters: Mapping[str, Any]
+    """The system's physical parameters, as JSON holds them."""
+    config: Mapping[str, Any]
+    """The trainer's settings."""
+    seed: int
+    """What the weights were drawn from; it is not the config's if training had to restart."""
+    loss: float
+    """The least training loss."""
+    iterations: int
+    """Iterations made, of which the best is one."""
+    seconds: float
+    """CPU time in s that they took."""
+
+    def xhat(self, t: np.ndarray) -> np.ndarray:
+        """The network's estimates, (..., nx) in state units, at times t (...) in s."""
+        return self._evaluate(t)[0]
+
+    def gain(self, t: np.ndarray) -> np.ndarray:
+        """The learned gains L, (..., nx, ny) in state units per s and output unit, at times t (...)
+        in s. Outside the record's times they are extrapolated."""
+        return self._evaluate(t)[1]
+
+    def _evaluate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        with torch.inference_mode():
+            xhat, L = self.network(torch.as_tensor(t, dtype=self.network.architecture.torch_dtype))
+            return xhat.double().numpy(), L.double().numpy()
+
+    def save(self, path: str | Path) -> None:
+        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
+
+        Raises:
+            ValueError: in one line, if the file cannot be written.
+        """
+        facts = {f.name: getattr(self, f.name) for f in fields(self)}
+        network, t, y = (facts.pop(name) for name in ("network", "t", "y"))
+        facts["architecture"] = asdict(network.architecture)
+        weights, record = network.state_dict(), {"t": torch.tensor(t), "y": torch.tensor(y)}
+        write(path, {"facts": json.dumps(facts), "weights": weights, "record": record})
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """Read what `save` wrote, for the system it was trained on.
+
+        Raises:
+            ValueError: in one line, if there is no such file, if it is something else or damaged,
+                or if it belongs to another system, other parameters or other sizes.
+        """
+        saved = read(path)
+        try:
+            facts = json.loads(saved["facts"])
+            architecture = Architecture(**facts.pop("architecture"))
+            record = {name: saved["record"][name].numpy() for name in ("t", "y")}
+            network = Network(architecture)
+            network.load_state_dict(saved["weights"])
+            trained = cls(network=network, **record, **facts)
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path} is not a saved PINN-Obs network: {reason}") from None
+        found = {"system": trained.system, "parameters": trained.parameters}
+        check_same(path, {**found, "nx": architecture.nx, "ny": architecture.ny}, identity(system))
+        return trained
+
+
+class _Learned(ABC):
+    """What the estimators that need a trained network share."""
+
+    trained: Trained
+
+    @classmethod
+    @abstractmethod
+    def of(cls, system: System, trained: Trained) -> Self:
+        """The estimator with this network."""
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """The estimator with the network in a file; see `Trained.load`."""
+        return cls.of(system, Trained.load(path, system))
+
+    def save(self, path: str | Path) -> None:
+        """Write the trained network to a file; see `Trained.save`."""
+        self.trained.save(path)
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How the network was trained."""
+        names = ("seed", "loss", "iterations", "seconds", "config")
+        return {"trainer": "pinn_obs", **{name: getattr(self.trained, name) for name in names}}
+
+
+@dataclass(frozen=True)
+class PinnObsReplay(_Learned, Estimator):
+    """The observer x̂' = f(t, x̂, u) + L(t)(y − h(x̂)) with a learned gain L(t) (Farkane et al.,
+    PINN-Obs, the time-varying observer of "Nonlinear State Observer", run as in "Neural Network
+    Training and Testing").
+
+    Between samples by the classical Runge-Kutta method in equal steps of at most the system's
+    `System.model_step`. Outputs and measured inputs are joined by straight lines from one sample to
+    the next, so that x̂ at a sample uses that sample and none after it. An output that is missing
+    at either end of a line corrects nothing along it. At the first sample x̂ is the prior's mean.
+
+    The gain was learned along one trajectory from one initial estimate; nothing in its training
+    makes the observer stable elsewhere, or even there.
+    """
+
+    trained: Trained = field(kw_only=True, repr=False)
+    """The trained network."""
+
+    name = "pinn_obs_replay"
+    knows = ("model", "prior")
+    needs_training = "pinn_obs"
+
+    def reset(self, prior: Prior) -> State:
+        return State(prior.mean)
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        xhat = state.xhat
+        if state.t is not None:
+            with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
+                xhat = self._step(state, t, y, u)
+        return State(xhat, t, u, memory=y)
+
+    def _step(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """x̂ (batch, nx) at time t, from that at the sample before."""
+        assert state.t is not None
+        start, duration, y0 = state.t, t - state.t, state.memory
+        missing = np.isnan(y0) | np.isnan(y)
+        y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, (y - y0) / duration)
+
+        def rate(t: float, x: np.ndarray, u: np.ndarray, L: np.ndarray) -> np.ndarray:
+            innovation = np.where(missing, 0.0, y0 + (t - start) * slope - self.system.h(x))
+            return self.system.f(t, x, u) + innovation @ L.T
+
+        x = state.xhat
+        for times, step, u_at in substeps(self.system, start, t, x, state.u, u):
+            L = self.trained.gain(times)
+            k1 = rate(times[0], x, u_at[0], L[0])
+            k2 = rate(times[1], x + step / 2 * k1, u_at[1], L[1])
+            k3 = rate(times[1], x + step / 2 * k2, u_at[1], L[1])
+            k4 = rate(times[2], x + step * k3, u_at[2], L[2])
+            x = x + step / 6 * (k1 + 2 * (k2 + k3) + k4)
+        return x
+
+    @classmethod
+    def of(cls, system: System, trained: Trained) -> Self:
+        return cls(system, trained=trained)
+
+
+@dataclass(frozen=True)
+class PinnObsDirect(_Learned, OfflineEstimator):
+    """The network's own estimates x̂(t) (Farkane et al., PINN-Obs, "Proposed Adaptive PINN-Based
+    Model"), which mean something for the record that it was trained on alone."""
+
+    trained: Trained = field(kw_only=True, repr=False)
+    """The trained network."""
+
+    name = "pinn_obs_direct"
+    knows = ("model", "prior")
+    needs_training = "pinn_obs"
+
+    def estimate(self, record: Record) -> np.ndarray:
+        """x̂ at every sample, shape (1, num_samples, nx).
+
+        Raises:
+            ValueError: if the record is not the one that the network was trained on.
+        """
+        known, given = (1, *self.trained.y.shape), record.y.shape
+        if given != known:
+            raise ValueError(f"y has shape {given}; this PINN-Obs was trained on one of {known}")
+        for name, known, given in (
+            ("t", self.trained.t, record.t),
+            ("y", self.trained.y, record.y),
+        ):
+            if not np.array_equal(given, known.reshape(given.shape), equal_nan=True):
+                raise ValueError(
+                    f"the record's {name} is not that of the record this PINN-Obs was trained on;"
+                    " train on this record, or use pinn_obs_replay"
+                )
+        return self.trained.xhat(record.t)[None]
+
+    @classmethod
+    def of(cls, system: System, trained: Trained) -> Self:
+        return cls(system, trained=trained)
+
+
+def identity(system: System) -> dict[str, Any]:
+    """What a file of weights must agree with: the system's class name, parameters (as JSON holds
+    them) and sizes."""
+    parameters = json.loads(json.dumps(system.parameters, default=_plain))
+    name = type(system).__name__
+    return {"system": name, "parameters": parameters, "nx": system.nx, "ny": system.ny}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
+
+
+def check_same(path: str | Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Compare what a file holds with what was expected of it, entry by entry.
+
+    Raises:
+        ValueError: in one line, naming the first entry that differs, what was found and expected.
+    """
+    for name, value in expected.items():
+        other = found.get(name)
+        if isinstance(value, Mapping) and isinstance(other, Mapping):
+            names = {**value, **other}
+            check_same(path, {n: other.get(n) for n in names}, {n: value.get(n) for n in names})
+        elif other != value and json.dumps(other) != json.dumps(value):  # there NaN equals itself
+            raise ValueError(f"{path} was trained with {name}={other!r}; expected {value!r}")
+
+
+def write(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Write tensors and plain values to a file: all of it or, if interrupted, nothing.
+
+    Raises:
+        ValueError: in one line, if the file cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    buffer = io.BytesIO()
+    torch.save(dict(content), buffer)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(buffer.getbuffer())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ValueError(f"cannot write {path}: {error.strerror or error}") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Read what `write` wrote, without ever running code from the file.
+
+    Raises:
+        ValueError: in one line, if there is no such file or it is something else or damaged.
+    """
+    try:
+        content = torch.load(Path(path), map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from None
+    except Exception as error:  # torch raises many kinds for a file it does not understand
+        kind = type(error).__name__
+        raise ValueError(f"{path} is damaged or no file of saved weights ({kind})") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds a {type(content).__name__}; expected a dict of weights")
+    return content

@@ -1,0 +1,274 @@
+"""Scoring an estimator episode by episode."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from pinnobs_gym import rows as rows_module
+from pinnobs_gym.env import EstimationVectorEnv
+from pinnobs_gym.estimator import Estimates, Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.figures import state_figure
+from pinnobs_gym.log import Log
+from pinnobs_gym.metrics import score
+from pinnobs_gym.rows import SCHEMA, Row
+from pinnobs_gym.system import System
+
+BATCH = 256
+"""Episodes that are run at a time."""
+
+
+def evaluate(
+    estimator: Estimator | type[Estimator] | str,
+    env_id: str,
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    setup: str = "benchmark",
+    condition: str = "nominal",
+    options: Mapping[str, Any] | None = None,
+    results: Path | str | None = None,
+    log: Log | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[Row]:
+    """Score an estimator on an env's episodes.
+
+    All estimators see the same episodes: that of seed s is the first of the single env reset with
+    seed s. The env is stepped with the estimates, x̂(k|k) against x_k, and its states are scored
+    (`pinnobs_gym.metrics.score`).
+
+    Args:
+        estimator: an instance, whose own model is then used; or a class, a name or
+            ``module:Class``, which is then made for the env's model and noise.
+        env_id: such as ``pinnobs/ReverseDuffing-v0``.
+        episodes: how many, of seeds seed, seed + 1, ...
+        seed: of the first episode.
+        setup: ``benchmark`` or ``paper``.
+        condition: how episodes depart from the setup, such as ``load_step`` or
+            ``noise5+dropout10``.
+        options: settings of an estimator that is made here.
+        results: a rows file to append to, in whole batches; episodes already in it are not run
+            again, and their rows are taken from it.
+        log: where scalars, figures and hyperparameters go for TensorBoard.
+        progress: called with the number of episodes done.
+
+    Returns:
+        The rows, in the order of seeds.
+
+    Raises:
+        ValueError: in one line, for an unknown id, setup, condition or option, or an estimator
+            whose model does not fit the env.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes={episodes}; expected at least 1")
+    if seed < 0:
+        raise ValueError(f"seed={seed}; expected at least 0")
+    env = make_vector_env(env_id, 1, setup, condition)
+    made = _make(estimator, env, options or {})
+    common = _common(made, env, env_id, setup, condition)
+    path = None if results is None else Path(results)
+    stored = {} if path is None else {rows_module.key(row): row for row in rows_module.read(path)}
+    wanted = [{**common, "episode_seed": seed + i} for i in range(episodes)]
+    missing = [row for row in wanted if rows_module.key(row) not in stored]
+    example = None
+    for first in range(0, len(missing), BATCH):
+        batch = missing[first : first + BATCH]
+        seeds = [row["episode_seed"] for row in batch]
+        scored, example = score_batch(made, env_id, setup, condition, seeds)
+        done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
+        if path is not None:
+            rows_module.append(path, done)
+        stored.update({rows_module.key(row): row for row in done})
+        if progress is not None:
+            progress(len(done))
+    result = [stored[rows_module.key(row)] for row in wanted]
+    if log is not None:
+        _write_log(log, result, made, example)
+    return result
+
+
+def make_vector_env(env_id: str, num_envs: int, setup: str, condition: str) -> EstimationVectorEnv:
+    """The vectorised env of that id.
+
+    Raises:
+        ValueError: listing the valid ids, if it is unknown.
+    """
+    known = [name for name in gym.registry if name.startswith("pinnobs/")]
+    if env_id not in known:
+        raise ValueError(f"unknown env id {env_id!r}; known are {', '.join(sorted(known))}")
+    env = gym.make_vec(
+        env_id,
+        num_envs,
+        vectorization_mode="vector_entry_point",
+        setup=setup,
+        condition=condition,
+    ).unwrapped
+    assert isinstance(env, EstimationVectorEnv)
+    return env
+
+
+def _make(
+    estimator: Estimator | type[Estimator] | str,
+    env: EstimationVectorEnv,
+    options: Mapping[str, Any],
+) -> Estimator:
+    system, setup = env.source.system, env.source.setup
+    if isinstance(estimator, Estimator):
+        if options:
+            raise ValueError(f"options {dict(options)} go with a name or a class, not an instance")
+        model = estimator.system
+        if (type(model).__name__, model.nx, model.ny) != (
+            type(system).__name__,
+            system.nx,
+            system.ny,
+        ):
+            raise ValueError(
+                f"the estimator's model is {type(model).__name__} (nx={model.nx}, ny={model.ny}); "
+                f"the env plays {type(system).__name__} (nx={system.nx}, ny={system.ny})"
+            )
+        return estimator
+    cls = ESTIMATORS.resolve(estimator)
+    if cls.needs_training is not None:
+        name = ESTIMATORS.name_of(cls)
+        raise ValueError(
+            f"estimator {name!r} has to be trained first: pinnobs train {cls.needs_training}"
+        )
+    try:
+        return cls.for_setup(system, setup, **options)
+    except TypeError as error:
+        raise ValueError(f"estimator {ESTIMATORS.name_of(cls)!r}: {error}") from None
+
+
+def score_batch(
+    estimator: Estimator, env_id: str, setup: str, condition: str, seeds: list[int]
+) -> tuple[list[Row], dict[str, Any]]:
+    """The scores of the episodes of these seeds, and the first of them for a picture."""
+    env = make_vector_env(env_id, len(seeds), setup, condition)
+    _, infos = env.reset(seed=seeds)
+    record = env.record()
+    start = time.process_time()
+    estimates = estimator.run(record)
+    cost = (time.process_time() - start) / (record.num_samples * record.batch) * 1e6
+    xhat = _checked(estimates, estimator, (record.batch, record.num_samples, env.source.system.nx))
+    x = np.empty_like(xhat)
+    bounded = np.where(np.isfinite(xhat), xhat, 0.0)  # a row that is not finite is scored as such
+    for k in range(record.num_samples):
+        x[:, k] = infos["state"]
+        *_, infos = env.step(bounded[:, k])
+    system = env.source.system
+    scores = score(
+        record.t,
+        x,
+        xhat,
+        system.scale,
+        scored=system.observable(x),
+        alternatives=system.indistinguishable(x),
+    )
+    cost_now = {"us_per_step": cost, "batch": record.batch, "date": _now()}
+    rows = [
+        {**{name: values[i].item() for name, values in scores.items()}, **cost_now}
+        for i in range(record.batch)
+    ]
+    P = None if estimates.P is None else estimates.P[0]
+    example = {"t": record.t, "xhat": xhat[0], "x": x[0], "y": record.y[0], "P": P}
+    return rows, example
+
+
+def _checked(estimates: Estimates, estimator: Estimator, shape: tuple[int, ...]) -> np.ndarray:
+    xhat = np.asarray(estimates.xhat, dtype=float)
+    if xhat.shape != shape:
+        raise ValueError(
+            f"{type(estimator).__name__} returned estimates of shape {xhat.shape}; expected {shape}"
+        )
+    return xhat
+
+
+def _common(
+    estimator: Estimator, env: EstimationVectorEnv, env_id: str, setup: str, condition: str
+) -> Row:
+    """What all rows of an evaluation share."""
+    identity = {
+        "class": f"{type(estimator).__module__}.{type(estimator).__qualname__}",
+        "model": canonical(estimator.system),
+        "noise_std": canonical(estimator.noise_std),
+        "options": canonical(estimator.options),
+        "training": canonical(estimator.training),
+        "played": canonical(env.source.setup),
+    }
+    text = json.dumps(identity, sort_keys=True)
+    return {
+        "schema": SCHEMA,
+        "env_id": env_id,
+        "setup": setup,
+        "condition": condition,
+        "estimator": estimator.label,
+        "track": estimator.track,
+        "knows": list(estimator.knows),
+        "options": canonical(estimator.options),
+        "config_hash": hashlib.sha256(text.encode()).hexdigest()[:12],
+        "training": canonical(estimator.training),
+        "training_seed": estimator.training.get("seed"),
+        "versions": versions(),
+    }
+
+
+def canonical(value: Any) -> Any:
+    """The value in JSON's types, the same for equal values; large things by a hash."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray):
+        return canonical(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(name): canonical(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [canonical(part) for part in value]
+    if isinstance(value, System):
+        return {"system": type(value).__name__, **canonical(value.parameters)}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: canonical(getattr(value, f.name)) for f in fields(value) if f.repr}
+    if isinstance(value, np.generic):
+        return value.item()
+    return getattr(value, "__qualname__", type(value).__qualname__)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a score depends on."""
+    packages = ("pinnobs-gym", "numpy", "scipy", "torch", "gymnasium")
+    found = {name: importlib.metadata.version(name) for name in packages}
+    return {"python": platform.python_version(), **found}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _write_log(
+    log: Log, rows: list[Row], estimator: Estimator, example: dict[str, Any] | None
+) -> None:
+    names = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
+    for row in rows:
+        for name in names:
+            if np.isfinite(row[name]):
+                log.scalar(f"episode/{name}", row[name], row["episode_seed"])
+    first = rows[0]
+    if example is not None:
+        title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
+        figure = state_figure(estimator.system, title=title, **example)
+        log.figure("states", figure, first["episode_seed"])
+    parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
+    parameters |= {name: str(value) for name, value in first["options"].items()}
+    summary = {f"median/{name}": float(np.median([row[name] for row in rows])) for name in names}
+    summary["diverged"] = float(np.mean([row["diverged"] for row in rows]))
+    log.hparams(parameters, {n: v for n, v in summary.items() if np.isfinite(v)})

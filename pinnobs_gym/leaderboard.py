@@ -1,0 +1,226 @@
+"""Tables of stored scores. Nothing here runs an estimator."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binom, binomtest
+
+from pinnobs_gym.metrics import DIVERGED
+from pinnobs_gym.rows import Row
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def percent(self) -> Interval:
+        """The same in percent, rounded."""
+        return Interval(*(float(round(100 * part)) for part in (self.value, self.low, self.high)))
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How one estimator did on the episodes of one env, setup and condition."""
+
+    estimator: str
+    track: str
+    episodes: int
+    diverged: Interval
+    """Rate, with Wilson's interval."""
+    settling: Interval
+    """Median in s."""
+    nrmse: Interval
+    """Median over the whole episode."""
+    tail: Interval
+    """Median over the last quarter."""
+    tail_modulo: float | None
+    """Median of the same modulo indistinguishable states; None where that changes nothing."""
+    tail_90: float
+    """90th percentile over the last quarter."""
+    us_per_step: float
+    knows: str
+    training: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """The standings on one env, setup and condition, best first, online before offline."""
+
+    env_id: str
+    setup: str
+    condition: str
+    standings: tuple[Standing, ...]
+
+    @property
+    def title(self) -> str:
+        """What is played."""
+        return f"{self.env_id}, {self.setup}, {self.condition}"
+
+
+def tables(rows: Iterable[Row]) -> list[Table]:
+    """A table per env, setup and condition. Within a track estimators stand in the order of their
+    median NRMSE over the whole episode, diverged episodes counting as infinite."""
+    played: dict[tuple[str, str, str], dict[tuple[str, str], list[Row]]]
+    played = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        game = (row["env_id"], row["setup"], row["condition"])
+        played[game][row["estimator"], row["config_hash"]].append(row)
+    result = []
+    for game, groups in sorted(played.items()):
+        standings = [standing(group) for group in groups.values()]
+        standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
+        result.append(Table(*game, tuple(standings)))
+    return result
+
+
+def standing(rows: Sequence[Row]) -> Standing:
+    """The summary of one estimator's rows; episodes that diverged score infinity."""
+    diverged = np.array([row["diverged"] for row in rows])
+
+    def values(name: str) -> np.ndarray:
+        return np.where(diverged, np.inf, [row[name] for row in rows])
+
+    first = rows[0]
+    return Standing(
+        estimator=first["estimator"],
+        track=first["track"],
+        episodes=len(rows),
+        diverged=rate(int(diverged.sum()), len(rows)),
+        settling=median(values("settling")),
+        nrmse=median(values("nrmse")),
+        tail=median(values("nrmse_tail")),
+        tail_modulo=_modulo(rows),
+        tail_90=float(np.quantile(values("nrmse_tail"), 0.9, method="higher")),
+        us_per_step=float(np.median([row["us_per_step"] for row in rows])),
+        knows=", ".join(first["knows"]),
+        training=training_of(rows),
+    )
+
+
+def _modulo(rows: Sequence[Row]) -> float | None:
+    tail = np.array([row["nrmse_tail"] for row in rows])
+    modulo = np.array([row["nrmse_tail_modulo"] for row in rows])
+    if not (modulo < tail).any():
+        return None
+    return float(np.median(np.where(modulo <= DIVERGED, modulo, np.inf)))
+
+
+def median(values: np.ndarray) -> Interval:
+    """The median with its distribution-free interval from order statistics, which takes infinite
+    values as well (Conover, "Practical Nonparametric Statistics", section 3.2); the whole range
+    where there are too few values for it."""
+    ordered = np.sort(values)
+    low = max(int(binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)) - 1, 0)
+    return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[-1 - low]))
+
+
+def rate(hits: int, count: int) -> Interval:
+    """A proportion with Wilson's interval."""
+    interval = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(hits / count, float(interval.low), float(interval.high))
+
+
+def training_of(rows: Sequence[Row]) -> str:
+    """How the estimator was trained, in a few words: budget or iterations, and CPU seconds."""
+    facts = [row["training"] for row in rows if row["training"]]
+    if not facts:
+        return ""
+    budget = facts[0].get("config", {}).get("budget")
+    parts = [] if budget is None else [f"budget {budget:g} s"]
+    for name, unit in (("iterations", "iterations"), ("seconds", "CPU s")):
+        known = [fact[name] for fact in facts if fact.get(name) is not None]
+        if known:
+            parts.append(f"{np.median(known):.4g} {unit}")
+    if facts[0].get("per_record"):
+        parts.append("on each record")
+    return ", ".join(parts)
+
+
+HEADER = (
+    "",
+    "estimator",
+    "track",
+    "episodes",
+    "diverged %",
+    "settled s",
+    "NRMSE",
+    "tail NRMSE",
+    "90th pct.",
+    "µs/step",
+    "training",
+)
+"""The columns of a table."""
+
+
+def cells(table: Table, intervals: bool = True) -> list[list[str]]:
+    """The table's rows as text, a cell per column of `HEADER`, with or without the intervals."""
+    shown = _interval if intervals else lambda interval: number(interval.value)
+    lines, ranks = [], defaultdict(int)
+    for s in table.standings:
+        ranks[s.track] += 1
+        tail = shown(s.tail)
+        if s.tail_modulo is not None:
+            tail += f" [{number(s.tail_modulo)}]"
+        lines.append(
+            [
+                str(ranks[s.track]),
+                s.estimator,
+                s.track,
+                str(s.episodes),
+                shown(s.diverged.percent),
+                number(s.settling.value),
+                shown(s.nrmse),
+                tail,
+                number(s.tail_90),
+                number(s.us_per_step),
+                s.training,
+            ]
+        )
+    return lines
+
+
+def markdown(tables: Iterable[Table]) -> str:
+    """The tables in Markdown."""
+    parts = ["# Leaderboard\n", NOTE + "\n"]
+    for table in tables:
+        parts.append(f"\n## {table.title}\n")
+        parts.append("| " + " | ".join(HEADER) + " |")
+        parts.append("|" + "|".join(["---"] * len(HEADER)) + "|")
+        parts += ["| " + " | ".join(line) + " |" for line in cells(table)]
+    return "\n".join(parts) + "\n"
+
+
+NOTE = (
+    "Medians over episodes with 95 % intervals; NRMSE is the root mean squared error over the "
+    "system's fixed scale, transient included, and tail NRMSE that over the last 25 %; an episode "
+    "diverged if its tail NRMSE is above 0.2 or anything is not finite, and then scores infinity. "
+    "Online estimators are causal; offline ones see the whole record first and are ranked apart. "
+    "In brackets: modulo states that no output tells apart."
+)
+"""How to read the tables."""
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A score in so many significant digits."""
+    if not np.isfinite(value):
+        return "∞"
+    if abs(value) >= 10**digits:
+        return f"{value:.0f}" if abs(value) < 1e5 else f"{value:.1e}"
+    return f"{value:.{digits}g}"
+
+
+def _interval(interval: Interval) -> str:
+    if interval.low == interval.high:
+        return number(interval.value)
+    return f"{number(interval.value)} ({number(interval.low, 2)}-{number(interval.high, 2)})"

@@ -1,0 +1,122 @@
+"""Stored scores: one JSON object per line and episode, appended whole, read back and resumed."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from pinnobs_gym.metrics import SCORES
+
+SCHEMA = 1
+"""Version of the row format."""
+
+Row: TypeAlias = dict[str, Any]
+"""One scored episode. Its keys:
+
+- ``schema``: version of this format.
+- ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
+- ``estimator``, ``track``, ``knows``, ``options``, ``config_hash``: the estimator, its track, what
+  it is told, its settings, and a hash of these and of its model and training.
+- ``training``, ``training_seed``: how it was trained, for learned ones: seconds, config, ...
+- the scores of `pinnobs_gym.metrics.score` by name, ``null`` standing for infinity.
+- ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
+- ``batch``: the size of that batch.
+- ``versions``, ``date``: of the packages, and when it was run (UTC).
+"""
+
+KEY = (
+    "env_id",
+    "setup",
+    "condition",
+    "estimator",
+    "config_hash",
+    "training_seed",
+    "episode_seed",
+)
+"""The fields that name a row; no two rows of a file share them."""
+
+
+def key(row: Row) -> tuple[Any, ...]:
+    """What names a row."""
+    return tuple(row[name] for name in KEY)
+
+
+def append(path: Path, rows: Iterable[Row]) -> None:
+    """Append rows to a file in one write, so that processes may share it and a kill leaves no half
+    line.
+
+    Raises:
+        ValueError: in one line, if the file cannot be written; what it held is untouched.
+    """
+    lines = "".join(json.dumps(_encoded(row)) + "\n" for row in rows)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            data = lines.encode()
+            written = os.write(descriptor, data)
+            if written < len(data):
+                raise OSError(f"only {written} of {len(data)} bytes fitted")
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise ValueError(f"cannot write rows to {path}: {error}") from None
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a file, in its order; none if there is no such file.
+
+    Raises:
+        ValueError: in one line that names the file and the line, if one is not a whole row of this
+            schema, or contradicts an earlier one.
+    """
+    if not path.exists():
+        return []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read rows from {path}: {error}") from None
+    rows: dict[tuple[Any, ...], tuple[int, Row]] = {}
+    for number, line in enumerate(lines, 1):
+        row = _decoded(path, number, line)
+        name = key(row)
+        if name in rows and any(rows[name][1][s] != row[s] for s in (*SCORES, "diverged")):
+            raise ValueError(
+                f"{path}, lines {rows[name][0]} and {number}, give different scores of the same "
+                f"episode: {dict(zip(KEY, name, strict=True))}"
+            )
+        rows.setdefault(name, (number, row))
+    return [row for _, row in rows.values()]
+
+
+def _encoded(row: Row) -> Row:
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in row.items()
+    }
+
+
+def _decoded(path: Path, number: int, line: str) -> Row:
+    try:
+        row = json.loads(line)
+    except json.JSONDecodeError:
+        row = None
+    if not isinstance(row, dict):
+        raise ValueError(
+            f"{path}, line {number}, is cut off or is not a row: {line[:40]!r}...; delete that "
+            f"line and run again, and only what it held is run anew"
+        )
+    if row.get("schema") != SCHEMA:
+        raise ValueError(
+            f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}"
+        )
+    missing = [name for name in (*KEY, *SCORES, "diverged") if name not in row]
+    if missing:
+        raise ValueError(f"{path}, line {number}: a row without {', '.join(missing)}")
+    for name in SCORES:
+        row[name] = math.inf if row[name] is None else row[name]
+    return row

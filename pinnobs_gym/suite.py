@@ -1,0 +1,181 @@
+"""Running many evaluations: jobs, each a pure function that appends its own rows."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import joblib
+
+from pinnobs_gym import env_id
+from pinnobs_gym.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.evaluation import evaluate, make_vector_env
+from pinnobs_gym.log import Log
+from pinnobs_gym.record import Record
+from pinnobs_gym.system import System
+from pinnobs_gym.systems import SYSTEMS
+
+TRAINING_SEED = 10**6
+"""Seed of the episode that an estimator trained beforehand learns from; none is scored on it."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One evaluation, to be run in any process."""
+
+    system: str
+    """Name or ``module:Class`` of the system."""
+    estimator: str
+    """Name or ``module:Class`` of the estimator."""
+    setup: str
+    condition: str
+    episodes: int
+    seed: int
+    folder: Path
+    """Where rows, TensorBoard's log and trained files go."""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """Choices in the trainer's Config, for estimators that learn."""
+
+    @property
+    def rows(self) -> Path:
+        """The rows file."""
+        return self.folder / "rows.jsonl"
+
+    @property
+    def name(self) -> str:
+        """What the job does, in a few words."""
+        return f"{self.estimator} on {self.system}, {self.condition}"
+
+
+def trainers() -> dict[str, ModuleType]:
+    """The trainers' modules by name."""
+    package = importlib.import_module("trainers")
+    names = [module.name for module in pkgutil.iter_modules(package.__path__)]
+    return {name: importlib.import_module(f"trainers.{name}") for name in sorted(names)}
+
+
+def trainer(name: str) -> ModuleType:
+    """The trainer of that name.
+
+    Raises:
+        ValueError: listing the known ones, if it is unknown.
+    """
+    known = trainers()
+    if name not in known:
+        raise ValueError(f"unknown trainer {name!r}; known are {', '.join(known)}")
+    return known[name]
+
+
+def jobs_of(
+    systems: Sequence[str],
+    estimators: Sequence[str],
+    *,
+    setup: str,
+    condition: str | None,
+    episodes: int,
+    trained_episodes: int,
+    seed: int,
+    folder: Path,
+    training: Mapping[str, Any],
+) -> list[Job]:
+    """The jobs of a cross of systems and estimators, the longest first.
+
+    Under a condition of None every system is played under nominal ones, and under those it is
+    ranked under if these are others. Estimators that train on each record get their own, smaller
+    number of episodes, a job each.
+    """
+    quick, long = [], []
+    for estimator in estimators:
+        cls = ESTIMATORS.resolve(estimator)
+        for system in systems:
+            name, ranked = env_id(system), SYSTEMS.resolve(system).ranked_condition
+            played = list(dict.fromkeys(["nominal", ranked])) if condition is None else [condition]
+            for each in played:
+                make_vector_env(name, 1, setup, each)  # a bad combination is refused before any run
+                job = Job(system, estimator, setup, each, episodes, seed, folder, dict(training))
+                if cls.trains_on_record is None:
+                    (quick if cls.needs_training is None else long).append(job)
+                else:
+                    for i in range(trained_episodes):
+                        long.append(replace(job, episodes=1, seed=seed + i))
+    return long + quick
+
+
+def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, str | None]]:
+    """Run jobs, one thread each, and yield each as it ends, with what went wrong if it failed."""
+    if processes == 1:
+        yield from map(_attempt, jobs)
+        return
+    with joblib.parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
+        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+        yield from parallel(joblib.delayed(_attempt)(job) for job in jobs)
+
+
+def _attempt(job: Job) -> tuple[Job, str | None]:
+    try:
+        run_job(job)
+    except Exception as error:
+        return job, f"{type(error).__name__}: {error}"
+    return job, None
+
+
+def run_job(job: Job) -> None:
+    """Train if the estimator needs it, evaluate, and append the rows that are missing."""
+    import torch
+
+    torch.set_num_threads(1)
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())  # for module:Class of the user's folder, in workers too
+    name = env_id(job.system)
+    cls = ESTIMATORS.resolve(job.estimator)
+    label = ESTIMATORS.name_of(cls)
+    options: dict[str, Any] = {}
+    estimator: Estimator | type[Estimator] = cls
+    if cls.trains_on_record is not None:
+        options = {"config": trainer(cls.trains_on_record).Config(**job.training)}
+    elif cls.needs_training is not None:
+        estimator = trained(cls, job)
+    system = name.removeprefix("pinnobs/")
+    folder = job.folder / "tensorboard" / system / job.setup / job.condition / label
+    with Log(folder) as log, warnings.catch_warnings():
+        evaluate(
+            estimator,
+            name,
+            episodes=job.episodes,
+            seed=job.seed,
+            setup=job.setup,
+            condition=job.condition,
+            options=options,
+            results=job.rows,
+            log=log,
+        )
+
+
+def trained(cls: type[Estimator], job: Job) -> Estimator:
+    """The estimator trained on one episode that is never scored, loaded if that was done before."""
+    module = trainer(str(cls.needs_training))
+    name = env_id(job.system)
+    system, record = record_of(name, job.setup, job.condition, TRAINING_SEED)
+    label = f"{name.removeprefix('pinnobs/')}-{job.setup}-{job.condition}-{cls.needs_training}"
+    path = job.folder / "trained" / f"{label}.pt"
+    if not path.exists():
+        with Log(job.folder / "tensorboard" / "training" / label) as log:
+            result = module.train(system, module.Config(**job.training), record=record, log=log)
+        result.save(path)
+    return cls.load(path, system)
+
+
+def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Record]:
+    """An env's model, and the record of its episode of that seed."""
+    env = make_vector_env(name, 1, setup, condition)
+    env.reset(seed=seed)
+    return env.source.system, env.record()

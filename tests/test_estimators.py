@@ -1,0 +1,191 @@
+"""The filters against closed forms and other implementations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from scipy.linalg import block_diag
+
+from pinnobs_gym.env import EpisodeSource, Stream
+from pinnobs_gym.estimator import PerEpisode
+from pinnobs_gym.estimators.ekf import EKF, joseph_update
+from pinnobs_gym.estimators.open_loop import OpenLoop
+from pinnobs_gym.record import Prior, Record
+from pinnobs_gym.simulate import model_step
+from pinnobs_gym.system import Setup, System, stack
+from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+
+
+@dataclass(frozen=True)
+class Linear(System):
+    """A damped oscillator of which both states are measured, the second in double."""
+
+    state_names = ("x1", "x2")
+    output_names = ("y1", "y2")
+    scale = (1.0, 1.0)
+    setups = {
+        "benchmark": Setup(
+            (-1.0, -1.0), (1.0, 1.0), (0.3, -0.2), (0.8, 0.5), duration=2.0, dt=0.1, noise_std=0.1
+        )
+    }
+
+    def f(self, t, x, u):
+        return stack(x, x[..., 1], -2.0 * x[..., 0] - 0.3 * x[..., 1])
+
+    def h(self, x):
+        return stack(x, x[..., 0], 2 * x[..., 1])
+
+
+A = np.array([[0.0, 1.0], [-2.0, -0.3]])
+H = np.array([[1.0, 0.0], [0.0, 2.0]])
+
+
+def runge_kutta_matrix(dt):
+    """What the classical Runge-Kutta method does to a linear system."""
+    h = dt * A
+    return np.eye(2) + h + h @ h / 2 + h @ h @ h / 6 + h @ h @ h @ h / 24
+
+
+def record_of(source, batch):
+    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(batch)]
+    return source.record(source.play(source.draw(streams)))
+
+
+def linear_record(batch=3):
+    from pinnobs_gym.systems import SYSTEMS
+
+    try:
+        return record_of(EpisodeSource(Linear), batch)
+    finally:
+        SYSTEMS.classes()
+        SYSTEMS._classes.pop("Linear", None)
+
+
+def test_on_a_linear_system_the_ekf_is_the_kalman_filter():
+    record = linear_record()
+    ekf = EKF(Linear(), noise_std=(0.1, 0.2), process_noise=0.05)
+    estimates = ekf.run(record)
+    for i in range(record.batch):
+        peer = KalmanFilter(dim_x=2, dim_z=2)
+        peer.x, peer.P = record.prior.mean[i].copy(), record.prior.cov[i].copy()
+        peer.F, peer.H = runge_kutta_matrix(0.1), H
+        peer.Q, peer.R = np.eye(2) * 0.05**2, np.diag([0.01, 0.04])
+        for k in range(record.num_samples):
+            if k:
+                peer.predict()
+            peer.update(record.y[i, k])
+            np.testing.assert_allclose(estimates.xhat[i, k], peer.x, atol=1e-12)
+            np.testing.assert_allclose(estimates.P[i, k], peer.P, atol=1e-12)
+            np.testing.assert_allclose(estimates.S[i, k], peer.S, atol=1e-12)
+            np.testing.assert_allclose(estimates.innovation[i, k], peer.y, atol=1e-12)
+
+
+def test_without_process_noise_it_is_weighted_least_squares():
+    record = linear_record(1)
+    ekf = EKF(Linear(), noise_std=0.1, process_noise=0.0)
+    estimates = ekf.run(record)
+    P0_inverse = np.linalg.inv(record.prior.cov[0])
+    F, Phi, rows = runge_kutta_matrix(0.1), np.eye(2), []
+    for _ in range(record.num_samples):
+        rows.append(H @ Phi)
+        Phi = F @ Phi
+    Phi = np.linalg.solve(F, Phi)  # to the last sample
+    G = np.concatenate(rows)
+    information = P0_inverse + G.T @ G / 0.01
+    x0 = np.linalg.solve(
+        information, P0_inverse @ record.prior.mean[0] + G.T @ record.y[0].ravel() / 0.01
+    )
+    np.testing.assert_allclose(estimates.xhat[0, -1], Phi @ x0, rtol=1e-10)
+    np.testing.assert_allclose(
+        estimates.P[0, -1], Phi @ np.linalg.inv(information) @ Phi.T, rtol=1e-9
+    )
+
+
+def test_a_missing_output_is_as_if_it_had_no_weight():
+    record = linear_record(1)
+    y = record.y.copy()
+    y[0, 3, 0], y[0, 5] = np.nan, np.nan
+    ekf = EKF(Linear(), noise_std=0.1)
+    estimates = ekf.run(Record(record.t, y, record.u, record.prior))
+    x, P = record.prior.mean[0], record.prior.cov[0]
+    for k in range(record.num_samples):
+        if k:
+            F = runge_kutta_matrix(0.1)
+            x, P = F @ x, F @ P @ F.T + np.eye(2) * 1e-8
+        R = np.diag(np.where(np.isnan(y[0, k]), 1e12, 0.01))
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+        x = x + K @ (np.nan_to_num(y[0, k]) - H @ x)
+        P = P - K @ H @ P
+        np.testing.assert_allclose(estimates.xhat[0, k], x, atol=1e-8)
+    assert (estimates.innovation[0, 5] == 0).all()
+
+
+def test_josephs_form_keeps_P_symmetric_and_semidefinite():
+    rng = np.random.default_rng(0)
+    P = np.diag([1e8, 1e-8, 1.0])[..., None]
+    x, H1, R = np.zeros((1, 3)), rng.standard_normal((1, 3, 1)), np.full((1, 1, 1), 1e-10)
+    for _ in range(200):
+        x, P, _ = joseph_update(x, P, np.zeros((1, 1)), H1, R)
+    np.testing.assert_allclose(P[..., 0], P[..., 0].T, atol=1e-20)
+    assert np.linalg.eigvalsh((P + P.swapaxes(0, 1))[..., 0] / 2).min() > -1e-12
+
+
+def test_open_loop_is_the_model_alone():
+    record = record_of(EpisodeSource("ReverseDuffing"), 2)
+    estimates = OpenLoop(ReverseDuffing()).run(record)
+    x = record.prior.mean
+    for k in range(1, 50):
+        x = model_step(ReverseDuffing(), record.t[k - 1], record.t[k], x)
+    np.testing.assert_array_equal(estimates.xhat[:, 49], x)
+
+
+class FilterpyRow:
+    """A filterpy filter as the adapter wants it."""
+
+    def reset(self, xhat0, P0):
+        self.filter = KalmanFilter(dim_x=2, dim_z=2)
+        self.filter.x, self.filter.P = xhat0, P0
+        self.filter.F, self.filter.H = runge_kutta_matrix(0.1), H
+        self.filter.Q, self.filter.R = np.eye(2) * 1e-8, np.eye(2) * 0.01
+        self.first = True
+
+    def update(self, t, y, u):
+        if not self.first:
+            self.filter.predict()
+        self.first = False
+        self.filter.update(y)
+        return self.filter.x
+
+
+def test_the_adapter_runs_single_episode_objects_row_by_row():
+    record = linear_record()
+    adapted = PerEpisode(Linear(), make=FilterpyRow, label="filterpy").run(record)
+    own = EKF(Linear(), noise_std=0.1).run(record)
+    np.testing.assert_allclose(adapted.xhat, own.xhat, atol=1e-12)
+
+
+def test_noise_is_told_and_never_zero():
+    assert EKF(ReverseDuffing(), noise_std=0.3).output_variance == pytest.approx([0.09])
+    assert EKF(ReverseDuffing()).output_variance == pytest.approx([0.02**2])
+    assert EKF(ReverseDuffing(), noise_std=0.0).output_variance == pytest.approx([(1.3e-3) ** 2])
+    with pytest.raises(ValueError, match="noise_std has shape"):
+        EKF(ReverseDuffing(), noise_std=(0.1, 0.1)).output_variance  # noqa: B018
+
+
+def test_a_singular_innovation_covariance_marks_its_row_alone():
+    P = np.stack([np.eye(2), np.zeros((2, 2))], axis=-1)
+    H2 = np.repeat(np.eye(2)[..., None], 2, axis=-1)
+    x, _, _ = joseph_update(np.zeros((2, 2)), P, np.ones((2, 2)), H2, np.zeros((2, 2, 1)))
+    np.testing.assert_allclose(x[0], [1, 1])
+    assert np.isnan(x[1]).all()
+
+
+def test_block_diagonal_covariances_stay_apart():
+    """Two copies of a system side by side are estimated as each alone."""
+    prior = Prior(np.ones((1, 2)), np.diag([2.0, 3.0])[None])
+    K = prior.cov[0] / (prior.cov[0] + 1)
+    P = block_diag(2.0, 3.0)[..., None]
+    identity = np.eye(2)[..., None]
+    x, _, _ = joseph_update(prior.mean, P, np.ones((1, 2)), identity, identity)
+    np.testing.assert_allclose(x[0], 1 + np.diag(K))

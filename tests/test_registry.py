@@ -1,0 +1,120 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import pinnobs_gym
+from pinnobs_gym import Setup, System
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.registry import Registry
+from pinnobs_gym.systems import SYSTEMS
+
+PLUG_IN = '''
+from pinnobs_gym import Estimator, Setup, System
+from pinnobs_gym.estimator import State
+from pinnobs_gym.system import stack
+
+
+class Decay(System):
+    """x' = -x."""
+
+    state_names = ("x",)
+    output_names = ("y",)
+    scale = (1.0,)
+    setups = {"benchmark": Setup((-1.0,), (1.0,), (0.0,), (1.0,), duration=1.0, dt=0.1)}
+
+    def f(self, t, x, u):
+        return stack(x, -x[..., 0])
+
+    def h(self, x):
+        return x
+
+
+class Mirror(Estimator):
+    """Takes the output for the state."""
+
+    name = "mirror"
+
+    def reset(self, prior):
+        return State(prior.mean)
+
+    def update(self, state, t, y, u):
+        return State(y, t=t)
+'''
+
+
+@pytest.fixture
+def plug_in(tmp_path, monkeypatch):
+    (tmp_path / "plug_in_module.py").write_text(PLUG_IN)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "plug_in_module"
+    for registry, name in ((SYSTEMS, "Decay"), (ESTIMATORS, "mirror")):
+        registry.classes()
+        registry._classes.pop(name, None)
+    gym.registry.pop("pinnobs/Decay-v0", None)
+
+
+def test_a_system_and_an_estimator_by_path(plug_in):
+    env_id = pinnobs_gym.env_id(f"{plug_in}:Decay")
+    assert env_id == "pinnobs/Decay-v0"
+    rows = pinnobs_gym.evaluate(f"{plug_in}:Mirror", env_id, episodes=2)
+    assert [row["rmse"] for row in rows] == [0, 0]  # measured without noise
+    ekf = pinnobs_gym.evaluate("ekf", env_id, episodes=2)
+    assert max(row["nrmse_tail"] for row in ekf) < 1e-3
+
+
+def test_entry_points_are_found_and_broken_ones_left_out(plug_in, tmp_path, monkeypatch):
+    info = tmp_path / "plug_in-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plug-in\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(
+        f"[pinnobs_gym.systems]\nDecay = {plug_in}:Decay\nbroken = {plug_in}:Nothing\n"
+    )
+    fresh: Registry[System] = Registry("system", System, "pinnobs_gym.systems")
+    with pytest.warns(UserWarning, match="system plug-in 'broken' is left out"):
+        classes = fresh.classes()
+    assert "Decay" in classes
+    assert "ReverseDuffing" in classes
+
+
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(ValueError, match="unknown system 'Duffing'; known are Academic, Harm"):
+        SYSTEMS.resolve("Duffing")
+    with pytest.raises(ValueError, match="unknown estimator 'kf'; known are ekf, open_loop"):
+        ESTIMATORS.resolve("kf")
+    with pytest.raises(ValueError, match="cannot load system 'nowhere:X': No module named"):
+        SYSTEMS.resolve("nowhere:X")
+
+
+def test_register_refuses_what_is_incomplete_or_taken():
+    class NoSetups(System):
+        state_names = ("x",)
+        output_names = ("y",)
+        scale = (1.0,)
+
+        def f(self, t, x, u):
+            return -x
+
+        def h(self, x):
+            return x
+
+    with pytest.raises(TypeError, match="NoSetups has no class attribute 'setups'"):
+        pinnobs_gym.register(NoSetups)
+
+    class WrongSize(NoSetups):
+        setups = {"benchmark": Setup((0, 0), (1, 1), (0, 0), (1, 1), duration=1, dt=0.1)}
+
+    with pytest.raises(TypeError, match=r"WrongSize: x0_low .* shape \(2,\); expected 1"):
+        pinnobs_gym.register(WrongSize)
+    with pytest.raises(TypeError, match="neither a System nor an Estimator"):
+        pinnobs_gym.register(int)
+    ReverseDuffing = type("ReverseDuffing", (NoSetups,), {"setups": WrongSize.setups})
+    with pytest.raises(ValueError, match="'ReverseDuffing' is already"):
+        SYSTEMS.register(ReverseDuffing)
+
+
+def test_registering_twice_is_harmless():
+    cls = SYSTEMS.resolve("Academic")
+    assert pinnobs_gym.register(cls) is cls
+    env = gym.make("pinnobs/Academic-v0")
+    observation, _ = env.reset(seed=0)
+    assert np.isfinite(observation).all()
