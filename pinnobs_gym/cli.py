@@ -49,7 +49,10 @@ class Systems:
         if self.name is not None:
             name = env_id(self.name)
             text = page(SYSTEMS.resolve(self.name), name)
-            console.print(Markdown(text) if console.is_terminal else text)
+            if console.is_terminal:
+                console.print(Markdown(text))
+            else:
+                print(text)
             return 0
         table = RichTable("env id", "states", "measured", "inputs", "setups")
         for cls in SYSTEMS.classes().values():
@@ -113,10 +116,8 @@ class Evaluate:
         estimator: Estimator | type[Estimator] = cls
         options = parse_settings(cls, self.set)
         if self.checkpoint is not None:
-            if cls.needs_training is None:
-                raise ValueError(f"estimator {self.estimator!r} is not trained; leave --checkpoint")
             model = make_vector_env(name, 1, self.setup, self.condition).source.system
-            estimator = cls.load(self.checkpoint, model)
+            estimator = suite.load(cls, self.checkpoint, model)
         folder = self.out / "tensorboard" / name.removeprefix("pinnobs/") / self.setup
         with Log(folder / self.condition / ESTIMATORS.name_of(cls)) as log, _progress() as bar:
             task = bar.add_task("episodes", total=self.episodes)
@@ -191,7 +192,9 @@ class Leaderboard:
                 if failure is not None:
                     failures.append(f"failed: {job.name}: {failure}")
                     bar.console.print(failures[-1], markup=False)
-        tables = leaderboard.tables(rows.read(self.out / "rows.jsonl"))
+        scored = rows.read(self.out / "rows.jsonl")
+        suite.log_summaries(self.out, scored)
+        tables = leaderboard.tables(scored)
         for table in tables:
             print_table(table)
         console.print(leaderboard.NOTE)
@@ -315,7 +318,7 @@ def train(name: str, arguments: Sequence[str]) -> int:
     )
     for label, cls in ESTIMATORS.classes().items():
         if cls.needs_training == name:
-            estimator = cls.load(path, system)
+            estimator = suite.load(cls, path, system)
             own, example = score_batch(
                 estimator, env, chosen.setup, chosen.condition, [chosen.episode]
             )

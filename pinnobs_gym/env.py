@@ -408,7 +408,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             rewards = -((error * error) @ self._weights)
         terminated = np.zeros(self.num_envs, dtype=bool)
         if not math.isfinite(rewards.sum()):
-            terminated = ~np.isfinite(estimates).all(axis=1)
+            terminated = np.asarray(~np.isfinite(estimates).all(axis=1))
             rewards = np.where(terminated, NOT_FINITE_REWARD, rewards)
             np.maximum(rewards, -sys.float_info.max, out=rewards)
         for row, picture in enumerate(self._pictures):
@@ -419,7 +419,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             self._begin(np.flatnonzero(over))
             rewards[over] = 0.0
             terminated &= ~over
-        truncated = self._k == self._num_steps
+        truncated = np.asarray(self._k == self._num_steps)
         self._over = terminated | truncated
         self._any_over = bool(self._over.any())
         observations, infos = self._look()

@@ -172,6 +172,7 @@ class SingleEpisode(Protocol):
 
     def update(self, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Take the sample y (ny,), u (nu,) at time t (s) and return x̂ (nx,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -183,8 +184,12 @@ class PerEpisode(Estimator):
 
     make: Callable[[], SingleEpisode] = field(kw_only=True)
     """Makes the object of one row."""
-    label: str = field(default="per_episode", kw_only=True)
+    title: str = field(default="per_episode", kw_only=True)
     """Its name in tables."""
+
+    @property
+    def label(self) -> str:
+        return self.title
 
     def reset(self, prior: Prior) -> State:
         rows = [self.make() for _ in prior.mean]

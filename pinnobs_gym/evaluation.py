@@ -21,7 +21,7 @@ from pinnobs_gym.env import EstimationVectorEnv
 from pinnobs_gym.estimator import Estimates, Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.figures import state_figure
-from pinnobs_gym.log import Log
+from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.metrics import score
 from pinnobs_gym.rows import SCHEMA, Row
 from pinnobs_gym.system import System
@@ -40,7 +40,7 @@ def evaluate(
     condition: str = "nominal",
     options: Mapping[str, Any] | None = None,
     results: Path | str | None = None,
-    log: Log | None = None,
+    log: Log = SILENT,
     progress: Callable[[int], None] | None = None,
 ) -> list[Row]:
     """Score an estimator on an env's episodes.
@@ -71,32 +71,56 @@ def evaluate(
         ValueError: in one line, for an unknown id, setup, condition or option, or an estimator
             whose model does not fit the env.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes={episodes}; expected at least 1")
-    if seed < 0:
-        raise ValueError(f"seed={seed}; expected at least 0")
+    result, made, example = run_episodes(
+        estimator,
+        env_id,
+        range(seed, seed + episodes),
+        setup,
+        condition,
+        options,
+        results,
+        progress,
+    )
+    log_episodes(log, result, made, example)
+    log_summary(log, result)
+    return result
+
+
+def run_episodes(
+    estimator: Estimator | type[Estimator] | str,
+    env_id: str,
+    seeds: range,
+    setup: str,
+    condition: str,
+    options: Mapping[str, Any] | None = None,
+    results: Path | str | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[list[Row], Estimator, dict[str, Any] | None]:
+    """What `evaluate` does but for logging; returns also the estimator that was scored, and what
+    `state_figure` draws of one episode, if any was run."""
+    if not len(seeds):
+        raise ValueError(f"episodes={len(seeds)}; expected at least 1")
+    if seeds[0] < 0:
+        raise ValueError(f"seed={seeds[0]}; expected at least 0")
     env = make_vector_env(env_id, 1, setup, condition)
     made = _make(estimator, env, options or {})
     common = _common(made, env, env_id, setup, condition)
     path = None if results is None else Path(results)
     stored = {} if path is None else {rows_module.key(row): row for row in rows_module.read(path)}
-    wanted = [{**common, "episode_seed": seed + i} for i in range(episodes)]
+    wanted = [{**common, "episode_seed": seed} for seed in seeds]
     missing = [row for row in wanted if rows_module.key(row) not in stored]
     example = None
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
-        seeds = [row["episode_seed"] for row in batch]
-        scored, example = score_batch(made, env_id, setup, condition, seeds)
+        now = [row["episode_seed"] for row in batch]
+        scored, example = score_batch(made, env_id, setup, condition, now)
         done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
         if path is not None:
             rows_module.append(path, done)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))
-    result = [stored[rows_module.key(row)] for row in wanted]
-    if log is not None:
-        _write_log(log, result, made, example)
-    return result
+    return [stored[rows_module.key(row)] for row in wanted], made, example
 
 
 def make_vector_env(env_id: str, num_envs: int, setup: str, condition: str) -> EstimationVectorEnv:
@@ -254,21 +278,31 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _write_log(
+LOGGED = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
+"""The scores that TensorBoard shows."""
+
+
+def log_episodes(
     log: Log, rows: list[Row], estimator: Estimator, example: dict[str, Any] | None
 ) -> None:
-    names = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
+    """Log the scores of each episode over its seed, and a picture of one of them."""
     for row in rows:
-        for name in names:
+        for name in LOGGED:
             if np.isfinite(row[name]):
                 log.scalar(f"episode/{name}", row[name], row["episode_seed"])
     first = rows[0]
-    if example is not None:
+    if example is not None and log.active:
         title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
         figure = state_figure(estimator.system, title=title, **example)
         log.figure("states", figure, first["episode_seed"])
+
+
+def log_summary(log: Log, rows: list[Row]) -> None:
+    """Log an estimator's settings and what came of them for the HPARAMS table."""
+    first = rows[0]
     parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
     parameters |= {name: str(value) for name, value in first["options"].items()}
-    summary = {f"median/{name}": float(np.median([row[name] for row in rows])) for name in names}
+    medians = {f"median/{name}": float(np.median([row[name] for row in rows])) for name in LOGGED}
+    summary = {name: value for name, value in medians.items() if np.isfinite(value)}
     summary["diverged"] = float(np.mean([row["diverged"] for row in rows]))
-    log.hparams(parameters, {n: v for n, v in summary.items() if np.isfinite(v)})
+    log.hparams(parameters, summary)

@@ -110,13 +110,13 @@ class EpisodePicture:
             self._prepare()
         self._canvas.restore_region(self._background)
         shown = slice(0, k + 1)
+        for panel, output, dots in self._dots:
+            dots.set_data(self._times[shown], self._y[shown, output])
+            panel.draw_artist(dots)
         curves = {"true": self._x, "estimate": self._xhat}
         for panel, state, label, line in self._lines:
             line.set_data(self._times[shown], curves[label][shown, state])
             panel.draw_artist(line)
-        for panel, output, dots in self._dots:
-            dots.set_data(self._times[shown], self._y[shown, output])
-            panel.draw_artist(dots)
         image = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
         if self._mode == "human":
             self._show(image)

@@ -50,7 +50,10 @@ class Standing:
     """90th percentile over the last quarter."""
     us_per_step: float
     knows: str
+    budget: float | None
+    """CPU seconds that training was given, if it was limited so."""
     training: str
+    """How it was trained, in a few words."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ def standing(rows: Sequence[Row]) -> Standing:
         tail_90=float(np.quantile(values("nrmse_tail"), 0.9, method="higher")),
         us_per_step=float(np.median([row["us_per_step"] for row in rows])),
         knows=", ".join(first["knows"]),
+        budget=first["training"].get("config", {}).get("budget"),
         training=training_of(rows),
     )
 
@@ -175,7 +179,7 @@ def cells(table: Table, intervals: bool = True) -> list[list[str]]:
         lines.append(
             [
                 str(ranks[s.track]),
-                s.estimator,
+                s.estimator if s.budget is None else f"{s.estimator}, {s.budget:g} s",
                 s.track,
                 str(s.episodes),
                 shown(s.diverged.percent),
@@ -206,7 +210,8 @@ NOTE = (
     "system's fixed scale, transient included, and tail NRMSE that over the last 25 %; an episode "
     "diverged if its tail NRMSE is above 0.2 or anything is not finite, and then scores infinity. "
     "Online estimators are causal; offline ones see the whole record first and are ranked apart. "
-    "In brackets: modulo states that no output tells apart."
+    "In brackets: modulo states that no output tells apart. Seconds behind a name are the CPU time "
+    "that each training was given."
 )
 """How to read the tables."""
 

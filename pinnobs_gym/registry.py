@@ -86,8 +86,7 @@ class Registry(Generic[T]):
             raise ValueError(f"unknown {self._kind} {spec!r}; known are {', '.join(classes)}")
         return classes[spec]
 
-    @staticmethod
-    def name_of(cls: type[T]) -> str:
+    def name_of(self, cls: type[T]) -> str:
         """The name a class is found by."""
         return getattr(cls, "name", cls.__name__)
 

@@ -6,8 +6,7 @@ import importlib
 import os
 import pkgutil
 import sys
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -18,9 +17,10 @@ import joblib
 from pinnobs_gym import env_id
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.evaluation import evaluate, make_vector_env
+from pinnobs_gym.evaluation import log_episodes, log_summary, make_vector_env, run_episodes
 from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
+from pinnobs_gym.rows import Row
 from pinnobs_gym.system import System
 from pinnobs_gym.systems import SYSTEMS
 
@@ -116,7 +116,7 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, str | N
         yield from map(_attempt, jobs)
         return
     with joblib.parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
-        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+        parallel: Any = joblib.Parallel(return_as="generator_unordered")
         yield from parallel(joblib.delayed(_attempt)(job) for job in jobs)
 
 
@@ -137,27 +137,35 @@ def run_job(job: Job) -> None:
         sys.path.insert(0, os.getcwd())  # for module:Class of the user's folder, in workers too
     name = env_id(job.system)
     cls = ESTIMATORS.resolve(job.estimator)
-    label = ESTIMATORS.name_of(cls)
     options: dict[str, Any] = {}
     estimator: Estimator | type[Estimator] = cls
     if cls.trains_on_record is not None:
         options = {"config": trainer(cls.trains_on_record).Config(**job.training)}
     elif cls.needs_training is not None:
         estimator = trained(cls, job)
-    system = name.removeprefix("pinnobs/")
-    folder = job.folder / "tensorboard" / system / job.setup / job.condition / label
-    with Log(folder) as log, warnings.catch_warnings():
-        evaluate(
-            estimator,
-            name,
-            episodes=job.episodes,
-            seed=job.seed,
-            setup=job.setup,
-            condition=job.condition,
-            options=options,
-            results=job.rows,
-            log=log,
-        )
+    seeds = range(job.seed, job.seed + job.episodes)
+    scored, made, example = run_episodes(
+        estimator, name, seeds, job.setup, job.condition, options, job.rows
+    )
+    if example is not None:  # something was run, and not all of it was there already
+        with Log(log_folder(job.folder, scored[0])) as log:
+            log_episodes(log, scored, made, example)
+
+
+def log_folder(folder: Path, row: Row) -> Path:
+    """Where TensorBoard's log of a row's estimator lies."""
+    system = row["env_id"].removeprefix("pinnobs/")
+    return folder / "tensorboard" / system / row["setup"] / row["condition"] / row["estimator"]
+
+
+def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
+    """Log what came of every estimator in these rows for TensorBoard's HPARAMS table."""
+    groups: dict[tuple[Path, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((log_folder(folder, row), row["config_hash"]), []).append(row)
+    for (place, _), group in groups.items():
+        with Log(place) as log:
+            log_summary(log, group)
 
 
 def trained(cls: type[Estimator], job: Job) -> Estimator:
@@ -171,7 +179,19 @@ def trained(cls: type[Estimator], job: Job) -> Estimator:
         with Log(job.folder / "tensorboard" / "training" / label) as log:
             result = module.train(system, module.Config(**job.training), record=record, log=log)
         result.save(path)
-    return cls.load(path, system)
+    return load(cls, path, system)
+
+
+def load(cls: type[Estimator], path: Path, system: System) -> Estimator:
+    """The trained estimator in a file.
+
+    Raises:
+        ValueError: in one line, if it cannot be read or belongs to another system.
+    """
+    if cls.needs_training is None:
+        raise ValueError(f"estimator {ESTIMATORS.name_of(cls)!r} is not one that is trained first")
+    trained_cls: Any = cls
+    return trained_cls.load(path, system)
 
 
 def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Record]:

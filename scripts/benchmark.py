@@ -76,7 +76,8 @@ def cpu_seconds(run: Callable[[], object]) -> float:
 
 def median_ratio(peer: Callable[[], object], own: Callable[[], object], repeats: int) -> float:
     """The median of the peer's CPU time over one's own, the two taken in turn."""
-    peer(), own()  # the first call builds what is kept
+    peer()  # the first call builds what is kept
+    own()
     return float(np.median([cpu_seconds(peer) / cpu_seconds(own) for _ in range(repeats)]))
 
 

@@ -160,7 +160,7 @@ class FilterpyRow:
 
 def test_the_adapter_runs_single_episode_objects_row_by_row():
     record = linear_record()
-    adapted = PerEpisode(Linear(), make=FilterpyRow, label="filterpy").run(record)
+    adapted = PerEpisode(Linear(), make=FilterpyRow, title="filterpy").run(record)
     own = EKF(Linear(), noise_std=0.1).run(record)
     np.testing.assert_allclose(adapted.xhat, own.xhat, atol=1e-12)
 

@@ -86,10 +86,10 @@ def test_resuming_runs_only_what_is_missing(tmp_path):
 
 
 def test_conditions_are_played_and_told():
-    quiet = evaluate("ekf", ENV, episodes=5, condition="noise0.5")
-    loud = evaluate("ekf", ENV, episodes=5, condition="noise5")
+    quiet = evaluate("ekf", ENV, episodes=5, condition="noise5")
+    loud = evaluate("ekf", ENV, episodes=5, condition="noise15")
     ratio = np.median([a["nrmse_tail"] / b["nrmse_tail"] for a, b in zip(loud, quiet, strict=True)])
-    assert 7 < ratio < 13  # errors in proportion to the noise, which is ten times as strong
+    assert 2 < ratio < 4  # errors in proportion to the noise, which is three times as strong
 
 
 def test_the_satellite_is_also_scored_modulo_its_sign():

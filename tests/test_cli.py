@@ -1,0 +1,269 @@
+"""The command, as a user meets it: what it prints, writes and answers to mistakes."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pinnobs_gym import rows
+from pinnobs_gym.cli import main
+from pinnobs_gym.env import EpisodeSource, Stream
+from pinnobs_gym.estimators.ekf import EKF
+
+QUICK = ["--systems", "ReverseDuffing", "--episodes", "4", "--jobs", "1"]
+
+
+def run(*arguments):
+    """The exit status of the command, also where the parser ends it."""
+    try:
+        return main([str(a) for a in arguments])
+    except SystemExit as end:
+        return end.code
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_log(path, source, header=None):
+    episodes = source.play(source.draw([Stream(np.random.SeedSequence(0))]))
+    record = source.record(episodes)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header or ["t", "y1"])
+        writer.writerows(zip(record.t.tolist(), record.y[0, :, 0].tolist(), strict=True))
+    return episodes, record
+
+
+def test_estimate_is_the_same_path_as_a_record_from_an_env(folder, capsys):
+    source = EpisodeSource("ReverseDuffing")
+    _, record = write_log(folder / "log.csv", source)
+    assert run("estimate", "--system", "ReverseDuffing", "--log", "log.csv") == 0
+    with (folder / "estimates.csv").open() as file:
+        header, *lines = csv.reader(file)
+    assert header == ["t", "x1", "x2", "x1_std", "x2_std"]
+    table = np.array(lines, dtype=float)
+    own = EKF.for_setup(source.system, source.setup).run(record)
+    np.testing.assert_allclose(table[:, 1:3], own.xhat[0], rtol=1e-12)
+    np.testing.assert_allclose(table[:, 3] ** 2, own.P[0, :, 0, 0], rtol=1e-9)
+    with Image.open(folder / "estimates.png") as picture:
+        assert picture.size[0] > 500
+    assert "estimates: estimates.csv; picture: estimates.png" in capsys.readouterr().out
+
+
+def test_estimate_with_settings_prior_and_another_estimator(folder):
+    write_log(folder / "log.csv", EpisodeSource("ReverseDuffing", duration=1.0))
+    common = ("estimate", "--system", "ReverseDuffing", "--log", "log.csv")
+    assert (
+        run(*common, "--xhat0", 0, 0, "--P0-std", 2, 2, "--noise-std", 0.1, "--out", "a.csv") == 0
+    )
+    assert run(*common, "--set", "process_noise=0.1", "--out", "b.csv") == 0
+    assert run(*common, "--estimator", "open_loop", "--out", "c.csv") == 0
+    first = [(folder / name).read_text().splitlines() for name in ("a.csv", "b.csv", "c.csv")]
+    assert first[0][-1] != first[1][-1]
+    assert first[2][1] == "0.0,1.0,1.0"  # the initial estimate, untouched by the output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evaluate", "--system", "Duffing"], "unknown system 'Duffing'; known are Academic"),
+        (["evaluate", "--system", "Academic", "--estimator", "kf"], "unknown estimator 'kf'; know"),
+        (["evaluate", "--system", "Academic", "--condition", "x"], "unknown condition 'x'; known"),
+        (["evaluate", "--system", "Academic", "--setup", "x"], "unknown setup 'x' of Academic"),
+        (["evaluate", "--system", "Academic", "--set", "x=1"], "setting 'x=1'; expected name=val"),
+        (["evaluate", "--system", "Academic", "--checkpoint", "x"], "is not one that is trained"),
+        (["evaluate", "--system", "Academic", "--out", "file/x"], "cannot write"),
+        (["systems", "Duffing"], "unknown system 'Duffing'"),
+        (["train"], "name a trainer first: pinnobs train pinn_obs"),
+        (["train", "gpt", "--system", "Academic"], "unknown trainer 'gpt'; known are pinn_obs"),
+        (["leaderboard", "--out", "file/x"], "cannot write to folder file/x"),
+        (["leaderboard", "--jobs", "0"], "jobs=0"),
+        (["leaderboard", "--condition", "load_step"], "needs a plant with a load torque"),
+        (["estimate", "--system", "Academic", "--log", "none.csv"], "cannot read log none.csv"),
+        (["estimate", "--system", "Academic", "--log", "bad.csv"], "has no column y1; Academic"),
+        (["dance"], "unknown command 'dance'; known are systems, estimators, train"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_two(folder, capsys, arguments, message):
+    (folder / "file").write_text("")
+    (folder / "bad.csv").write_text("t,z\n0,1\n")
+    assert run(*arguments) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert len(printed.err.splitlines()) == 1
+    assert printed.err.startswith("pinnobs: error: ")
+
+
+def test_the_parsers_mistakes_are_status_two_as_well(folder):
+    assert run("evaluate") == 2
+    assert run("evaluate", "--system", "Academic", "--episodes", "many") == 2
+    assert run("train", "pinn_obs", "--system", "Academic", "--depth", "0") == 2
+    assert run() == 2
+    assert run("--help") == 0
+
+
+def test_listings_name_everything(folder, capsys):
+    assert run("systems") == 0
+    assert run("estimators") == 0
+    printed = capsys.readouterr().out
+    for name in ("pinnobs/InductionMotor-v0", "phi1", "open_loop", "ekf", "pinn_obs", "offline"):
+        assert name in printed
+    assert run("systems", "Satellite") == 0
+    page = capsys.readouterr().out
+    for words in ("## Action Space", "## Observation Space", "## Reward", "## Starting State"):
+        assert words in page
+    assert "| 2 | x3 | rad/s | ±3.5 | 2.2 |" in page
+    assert "(I₂ − I₃)/I₁" in page
+
+
+def test_leaderboard_prints_ranks_writes_and_resumes(folder, capsys):
+    arguments = ["leaderboard", *QUICK, "--estimators", "open_loop", "ekf", "--out", "lb"]
+    assert run(*arguments) == 0
+    first = capsys.readouterr().out
+    assert first.index(" ekf ") < first.index(" open_loop ")
+    for what in ("lb/leaderboard.md", "lb/rows.jsonl", "lb/tensorboard", "lb/trained"):
+        assert what in first
+    stored = (folder / "lb" / "rows.jsonl").read_text()
+    assert len(stored.splitlines()) == 8
+    assert run(*arguments) == 0
+    assert (folder / "lb" / "rows.jsonl").read_text() == stored
+    assert "| ekf | online |" in (folder / "lb" / "leaderboard.md").read_text()
+    assert list((folder / "lb" / "tensorboard").rglob("events.*"))
+
+
+def test_a_truncated_rows_file_is_refused_before_anything_runs(folder, capsys):
+    path = folder / "lb" / "rows.jsonl"
+    path.parent.mkdir()
+    path.write_text('{"schema": 1, "env')
+    assert run("leaderboard", *QUICK, "--out", "lb") == 2
+    assert "lb/rows.jsonl, line 1, is cut off" in capsys.readouterr().err
+    assert path.read_text() == '{"schema": 1, "env'
+
+
+def test_a_failed_job_is_told_and_the_rest_goes_on(folder, capsys):
+    (folder / "failing_module.py").write_text(
+        "from pinnobs_gym.estimators.ekf import EKF\n"
+        "class Broken(EKF):\n"
+        "    name = 'broken'\n"
+        "    def update(self, state, t, y, u):\n"
+        "        raise RuntimeError('out of luck')\n"
+    )
+    estimators = ["--estimators", "failing_module:Broken", "ekf"]
+    assert run("leaderboard", *QUICK, *estimators, "--out", "lb") == 1
+    printed = capsys.readouterr().out
+    assert "RuntimeError: out of luck" in printed
+    assert {row["estimator"] for row in rows.read(folder / "lb" / "rows.jsonl")} == {"ekf"}
+
+
+def test_train_evaluate_and_refuse_another_system(folder, capsys):
+    small = ["--depth", "1", "--width", "4", "--iterations", "20"]
+    where = ["--system", "ReverseDuffing", "--out", "tr"]
+    assert run("train", "pinn_obs", *where, *small) == 0
+    printed = capsys.readouterr().out
+    assert "after 20 iterations" in printed
+    assert "pinn_obs_replay on its own record" in printed
+    (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
+    assert len(list(Path("tr").glob("*.png"))) == 2
+    assert run("train", "pinn_obs", *where, *small[:4], "--iterations", "30", "--resume") == 0
+    assert "after 30 iterations" in capsys.readouterr().out
+    scored = ["evaluate", "--estimator", "pinn_obs_replay", "--checkpoint", trained]
+    assert run(*scored, "--system", "ReverseDuffing", "--episodes", "2") == 0
+    capsys.readouterr()
+    assert run(*scored, "--system", "Academic", "--episodes", "2") == 2
+    assert (
+        "was trained with system='ReverseDuffing'; expected 'Academic'" in capsys.readouterr().err
+    )
+    trained.write_bytes(trained.read_bytes()[:100])
+    assert run(*scored, "--system", "ReverseDuffing", "--episodes", "2") == 2
+    assert "is damaged or no file of saved weights" in capsys.readouterr().err
+
+
+def test_a_killed_run_loses_nothing_that_was_finished(folder):
+    (folder / "slow_module.py").write_text(
+        "import time\n"
+        "from pinnobs_gym.estimators.ekf import EKF\n"
+        "class Slow(EKF):\n"
+        "    name = 'slow'\n"
+        "    def run(self, record):\n"
+        "        time.sleep(60)\n"
+    )
+    command = [sys.executable, "-m", "pinnobs_gym.cli", "leaderboard", *QUICK]
+    started = subprocess.Popen(
+        [*command, "--estimators", "ekf", "slow_module:Slow"],
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    path = folder / "runs" / "leaderboard" / "rows.jsonl"
+    deadline = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    os.killpg(started.pid, signal.SIGKILL)
+    started.wait()
+    assert len(rows.read(path)) == 4
+    assert run("leaderboard", *QUICK, "--estimators", "ekf") == 0
+    assert len(rows.read(path)) == 4
+
+
+PENDULUM = Path(__file__).parents[2] / "shared" / "data" / "pendulum"
+
+PENDULUM_MODULE = '''
+from array_api_compat import array_namespace
+from pinnobs_gym import Setup, System
+from pinnobs_gym.system import stack
+
+
+class Pendulum(System):
+    """A pendulum swinging freely: angle from hanging at rest, angular velocity."""
+
+    state_names = ("theta", "omega")
+    output_names = ("y1",)
+    scale = (1.0, 8.0)
+    setups = {
+        "benchmark": Setup(
+            (-1.6, -3.0), (1.6, 3.0), (0.0, 0.0), (1.5, 8.0), duration=9.0, dt=0.01, noise_std=0.003
+        )
+    }
+
+    def f(self, t, x, u):
+        theta, omega = x[..., 0], x[..., 1]
+        return stack(x, omega, -64.22 * array_namespace(x).sin(theta) - 0.0672 * omega)
+
+    def h(self, x):
+        return x[..., :1]
+'''
+
+
+@pytest.mark.skipif(not PENDULUM.exists(), reason="the recorded pendulum is not here")
+@pytest.mark.parametrize("swing", ["swing-1", "swing-2"])
+def test_the_velocity_of_a_real_pendulum(folder, swing):
+    (folder / "pendulum_module.py").write_text(PENDULUM_MODULE)
+    log = PENDULUM / f"{swing}.csv"
+    assert run("estimate", "--system", "pendulum_module:Pendulum", "--log", log) == 0
+    own = np.genfromtxt("estimates.csv", delimiter=",", names=True)
+    reference = np.genfromtxt(PENDULUM / f"{swing}-velocity.csv", delimiter=",", names=True)
+    later = reference["t"] >= 1
+    error = np.interp(reference["t"], own["t"], own["omega"]) - reference["omega"]
+    rms = np.sqrt((error[later] ** 2).mean())
+    assert rms <= 0.01 * abs(reference["omega"]).max()
+
+
+@pytest.mark.skipif(not PENDULUM.exists(), reason="the recorded pendulum is not here")
+def test_the_frequency_of_a_real_pendulum(folder):
+    log = PENDULUM / "swing-2.csv"
+    prior = ["--xhat0", 0, 0, 40, "--P0-std", 1, 4, 30, "--noise-std", 0.003]
+    assert run("estimate", "--system", "HarmonicOscillator", "--log", log, *prior) == 0
+    own = np.genfromtxt("estimates.csv", delimiter=",", names=True)
+    crossings = own["t"][1:][np.diff(np.sign(own["x1"])) != 0]
+    frequency = np.pi / np.diff(crossings[2:]).mean()  # half a period from one to the next
+    assert np.sqrt(own["x3"][-1]) == pytest.approx(frequency, rel=0.03)
+    assert own["x3"][-1] == pytest.approx(64.0, rel=0.06)

@@ -1,0 +1,68 @@
+"""The README's snippets run, and what it names is there."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PYTHON = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+SHELL = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("number", range(len(PYTHON)))
+def test_python_snippet(number, tmp_path):
+    path = tmp_path / "snippet.py"
+    path.write_text(PYTHON[number])
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", path],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    if "class Luenberger" in PYTHON[number]:
+        tail, diverged = done.stdout.split()
+        assert float(tail) < 0.2
+        assert diverged == "False"
+
+
+def test_there_is_a_snippet_of_each_kind():
+    for words in ("gym.make(", "class Luenberger(Estimator)", "class VanDerPol(System)"):
+        assert any(words in snippet for snippet in PYTHON), words
+
+
+def test_the_custom_estimator_takes_fifteen_lines():
+    (snippet,) = (s for s in PYTHON if "class Luenberger" in s)
+    body = snippet.partition("@dataclass")[2].partition("\n\n\n")[0]
+    assert len([line for line in ("@dataclass" + body).splitlines() if line.strip()]) <= 15
+
+
+def test_the_estimate_command(tmp_path):
+    (snippet,) = (s for s in PYTHON if "class VanDerPol" in s)
+    (tmp_path / "my_module.py").write_text(snippet)
+    (tmp_path / "log.csv").write_text("t,y1\n" + "".join(f"{k / 20},{1.5}\n" for k in range(20)))
+    (command,) = (s for s in SHELL if "pinnobs estimate" in s)
+    done = subprocess.run(
+        [sys.executable, "-m", "pinnobs_gym.cli", *command.split()[1:]],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "estimates.csv").read_text().startswith("t,position,velocity,position_std")
+    assert (tmp_path / "estimates.png").stat().st_size > 1000
+
+
+def test_make_targets_files_and_options_it_names_are_there():
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"`?make ([a-z-]+)", README):
+        if target not in ("a",):
+            assert f"\n{target}:" in makefile, target
+    for path in re.findall(r"(?:\]\(|`python )((?:docs|scripts)/[\w./]+)", README):
+        assert (ROOT / path).exists(), path
