@@ -22,6 +22,8 @@ _NODES = 6
 """Solver steps that one interpolating polynomial passes through, with value and slope."""
 _HALVINGS = 7
 """How often the step is halved before an episode is given to an adaptive solver."""
+_FAR = 1e9
+"""Size of a state, over its scale, from which on it is taken to have run away."""
 
 
 def truth(
@@ -96,10 +98,10 @@ def _smooth(
             if not len(rows):
                 return last
             steps *= 2
-    for row in rows:
-        plant = rows_of(system, np.array([row]))
-        x = _adaptive(plant, x0[row], start, end, np.append(times, end))
-        out[:, row], last[row] = x[:-1], x[-1]
+        for row in rows:
+            plant = rows_of(system, np.array([row]))
+            x = _adaptive(plant, x0[row], start, end, np.unique(np.append(times, end)))
+            out[:, row], last[row] = x[: len(times)], x[-1]
     return last
 
 
@@ -229,17 +231,24 @@ def _hermite(nodes: tuple[float, ...]) -> tuple[_Weights, _Weights]:
 def _adaptive(
     system: System, x0: np.ndarray, start: float, end: float, times: np.ndarray
 ) -> np.ndarray:
-    """One episode by an adaptive method that also takes stiff and kinked plants."""
+    """One episode by an adaptive method that also takes stiff and kinked plants; not a number if
+    the state runs away, before whose singularity such a method would stand still for ever."""
     last = np.nextafter(end, start)
+    scale = vector(system.scale, system.nx, "scale")
 
     def rate(t: float, x: np.ndarray) -> np.ndarray:
         now = np.asarray(min(t, last))
         return system.f(now, x[None], system.input(now))[0]
 
-    atol = 1e-12 * vector(system.scale, system.nx, "scale")
-    solution = solve_ivp(rate, (start, end), x0, "LSODA", times, rtol=1e-11, atol=atol)
+    def far(t: float, x: np.ndarray) -> float:
+        return _FAR - float((abs(x) / scale).max())
+
+    far.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
+    solution = solve_ivp(
+        rate, (start, end), x0, "LSODA", times, events=far, rtol=1e-11, atol=1e-12 * scale
+    )
     x = np.full((len(times), len(x0)), np.nan)
-    if solution.success:
+    if solution.status == 0:
         x[:] = solution.y.T
     return x
 

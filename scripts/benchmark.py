@@ -25,7 +25,7 @@ import tyro
 from scipy.integrate import solve_ivp
 
 from pinnobs_gym import env_id, evaluate
-from pinnobs_gym.env import EpisodeSource, Stream
+from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.record import Record
 from pinnobs_gym.simulate import truth

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from pinnobs_gym import leaderboard, rows
-from pinnobs_gym.env import EpisodeSource, Stream
+from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.figures import state_figure
 from pinnobs_gym.report import replacing, write_figure

@@ -27,6 +27,7 @@ ALLOWED = {
 """What a module or subpackage may import of ours; itself is a case of its own below."""
 FORBIDDEN = {
     "env": {"estimator", "estimators", "evaluation", "trainers"},
+    "episodes": {"env", "estimator", "estimators", "evaluation", "trainers"},
     "evaluation": {"trainers"},
 }
 

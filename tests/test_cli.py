@@ -14,7 +14,7 @@ from PIL import Image
 
 from pinnobs_gym import rows
 from pinnobs_gym.cli import main
-from pinnobs_gym.env import EpisodeSource, Stream
+from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
 
 QUICK = ["--systems", "ReverseDuffing", "--episodes", "4", "--jobs", "1"]

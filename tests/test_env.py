@@ -12,7 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from pinnobs_gym import env_id
-from pinnobs_gym.env import NOT_FINITE_REWARD, EpisodeSource, EstimationEnv, EstimationVectorEnv
+from pinnobs_gym.env import NOT_FINITE_REWARD, EstimationEnv, EstimationVectorEnv
+from pinnobs_gym.episodes import EpisodeSource
 from pinnobs_gym.systems import SYSTEMS
 
 IDS = {name: env_id(cls) for name, cls in SYSTEMS.classes().items()}
@@ -27,11 +28,11 @@ ALLOWED_WARNINGS = (
 )
 
 
-def make(name: str, **kwargs: Any) -> gymnasium.Env:
+def make(name: str, **kwargs: Any) -> Any:
     return gymnasium.make(name, disable_env_checker=True, **kwargs)
 
 
-def make_vec(name: str, num_envs: int, **kwargs: Any) -> gymnasium.vector.VectorEnv:
+def make_vec(name: str, num_envs: int, **kwargs: Any) -> Any:
     return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)
 
 

@@ -7,7 +7,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import block_diag
 
-from pinnobs_gym.env import EpisodeSource, Stream
+from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimator import PerEpisode
 from pinnobs_gym.estimators.ekf import EKF, joseph_update
 from pinnobs_gym.estimators.open_loop import OpenLoop
@@ -53,13 +53,7 @@ def record_of(source, batch):
 
 
 def linear_record(batch=3):
-    from pinnobs_gym.systems import SYSTEMS
-
-    try:
-        return record_of(EpisodeSource(Linear), batch)
-    finally:
-        SYSTEMS.classes()
-        SYSTEMS._classes.pop("Linear", None)
+    return record_of(EpisodeSource(Linear), batch)
 
 
 def test_on_a_linear_system_the_ekf_is_the_kalman_filter():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -57,7 +59,7 @@ def test_truth_agrees_with_scipy(name: str, setup_name: str) -> None:
     cls = SYSTEMS.resolve(name)
     duration = LONGEST.get((name, setup_name))
     system, setup = cls.configured(setup_name, duration=duration)
-    x0 = initial_states(system, setup, 3)
+    x0 = initial_states(system, setup, 2)
     times = setup.times
     x = truth(system, x0, times, setup.truth_step)
     few = np.unique(np.append(np.arange(0, len(times), 7), len(times) - 1))
@@ -142,13 +144,13 @@ def test_hard_neighbour_changes_nothing() -> None:
 
 def test_motor_load_step_is_solved_in_two_pieces() -> None:
     setup = InductionMotor.setups["benchmark"]
-    torque = np.array([0.0, 17.0, 40.0])
+    torque = np.array([3.0, 40.0])
     step_time = 0.6003  # between two samples
     system = InductionMotor(load_step_time=step_time, load_step_torque=torque)  # pyright: ignore
-    x0 = initial_states(InductionMotor(), setup, 3)
+    x0 = initial_states(InductionMotor(), setup, 2)
     times = setup.times
     x = truth(system, x0, times, setup.truth_step)
-    for row in range(3):
+    for row in range(2):
         before = times[times < step_time]
         first = reference(InductionMotor(), x0[row], np.append(before, step_time), rtol=3e-14)
         loaded = InductionMotor(T_L=torque[row])
@@ -263,6 +265,21 @@ def test_system_that_is_not_smooth() -> None:
     assert abs(x[:, 0] - expected).max() < 1e-8
 
 
+@pytest.fixture
+def limited() -> Iterator[None]:
+    """A solver that stands still before a singularity fails the test, rather than hang it."""
+
+    def stop(number: int, frame: object) -> None:
+        raise TimeoutError("the solver does not come to an end")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("limited")
 def test_blow_up_names_the_initial_state() -> None:
     x0 = np.array([[0.1, -1.0], [0.75, -0.5]])
     with pytest.raises(FloatingPointError, match=r"Blowup .* x0=\[0\.75, -0\.5\]"):

@@ -1,0 +1,181 @@
+"""Where episodes come from: what chance decides in them, and their simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypedDict, Unpack
+
+import numpy as np
+
+from pinnobs_gym.conditions import Condition, parse_condition
+from pinnobs_gym.record import Prior, Record
+from pinnobs_gym.simulate import truth
+from pinnobs_gym.system import System, vector
+from pinnobs_gym.systems import SYSTEMS
+
+_DRAWS = 64
+"""Initial states drawn at a time."""
+_ATTEMPTS = 1000
+"""Such draws without an admissible state before the initial set is taken to be empty."""
+
+
+class Changes(TypedDict, total=False):
+    """Values that replace those of a setup; None keeps the setup's."""
+
+    dt: float | None
+    """Time between samples in s."""
+    duration: float | None
+    """Length of an episode in s."""
+    noise_std: Sequence[float] | float | None
+    """Standard deviation of the output noise, in output units."""
+    parameters: Mapping[str, float] | None
+    """Physical parameters."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """All that chance decides in a batch of episodes."""
+
+    x0: np.ndarray
+    """Initial states, shape (batch, nx)."""
+    noise: np.ndarray
+    """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
+    seeds: tuple[int, ...]
+    """A seed per episode for what its condition draws; none if that draws nothing."""
+
+    def row(self, i: int) -> Draws:
+        """Those of one episode."""
+        return Draws(self.x0[i : i + 1], self.noise[i : i + 1], self.seeds[i : i + 1])
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Simulated episodes of a system on common sample times, (time, batch, dim)."""
+
+    x: np.ndarray
+    """True states, shape (num_steps + 1, batch, nx)."""
+    y: np.ndarray
+    """Outputs as measured, shape (num_steps + 1, batch, ny)."""
+    observations: np.ndarray
+    """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
+
+
+class EpisodeSource:
+    """Makes the episodes of an env: every seed names an endless sequence of them.
+
+    What chance decides in an episode (`Draws`) depends on the seed and on how many episodes of that
+    seed came before, and the rest on these draws alone: the same seed gives the same episodes in
+    any batch.
+
+    Args:
+        system: name, ``module:Class`` or class of the system.
+        setup: the setup's name.
+        condition: how episodes depart from the setup; see `pinnobs_gym.conditions`.
+        changes: values that replace the setup's.
+    """
+
+    def __init__(
+        self,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        **changes: Unpack[Changes],
+    ) -> None:
+        self.system, chosen = SYSTEMS.resolve(system).configured(setup, **changes)
+        self.condition = parse_condition(condition)
+        self.condition.plant(self.system, ())  # a condition that does not fit says so now
+        self.setup = self.condition.setup(self.system, chosen)
+        self.fixed_x0 = self.setup.fixed_x0
+        self.trivial = type(self.condition) is Condition
+        self.times = self.setup.times
+        self.inputs = np.asarray(self.system.input(self.times))
+        self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
+        self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
+        self._noise_std = vector(self.setup.noise_std, self.system.ny, "noise_std")
+
+    def contains(self, x0: np.ndarray) -> bool:
+        """Whether all initial states (..., nx) belong to the setup's set."""
+        if self.fixed_x0:
+            return bool((x0 == self.x0_low).all())
+        inside = (x0 >= self.x0_low) & (x0 <= self.x0_high)
+        return bool(inside.all() and np.all(self.system.admissible(x0)))
+
+    def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
+        """What chance decides in the next episode of each stream; a stream may stand there several
+        times. The array ``noise``, of the right size, is written anew if given."""
+        x0 = np.empty((len(streams), self.system.nx))
+        if noise is None:
+            noise = np.empty((len(streams), len(self.times), self.system.ny))
+        for i, stream in enumerate(streams):
+            x0[i] = stream.next_x0(self)
+            stream.noise.standard_normal(out=noise[i])
+        seeds = () if self.trivial else tuple(int(s.conditions.integers(2**63)) for s in streams)
+        return Draws(x0, noise, seeds)
+
+    def play(
+        self, draws: Draws, x0: np.ndarray | None = None, into: Episodes | None = None
+    ) -> Episodes:
+        """The episodes of these draws.
+
+        Args:
+            draws: what chance decided.
+            x0: initial states (batch, nx) that replace those drawn.
+            into: episodes of the same size that are over, whose arrays are written anew.
+        """
+        start = draws.x0 if x0 is None else x0
+        episodes = self._empty(len(start)) if into is None else into
+        x, y, observations = episodes.x, episodes.y, episodes.observations
+        rngs = [np.random.default_rng(seed) for seed in draws.seeds]
+        plant = self.condition.plant(self.system, rngs)
+        if plant is self.system and len(start) > 1 and (start == start[0]).all():
+            x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
+        else:
+            truth(plant, start, self.times, self.setup.truth_step, out=x)
+        np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
+        y += self.system.h(x)
+        if not self.trivial:
+            y[:] = self.condition.outputs(y, self.setup, rngs)
+        ny = self.system.ny
+        observations[..., :ny] = y
+        observations[..., ny:-1] = self.inputs[:, None]
+        observations[..., -1] = (self.times / self.times[-1])[:, None]
+        return episodes
+
+    def _empty(self, batch: int) -> Episodes:
+        shape, system = (len(self.times), batch), self.system
+        return Episodes(
+            np.empty((*shape, system.nx)),
+            np.empty((*shape, system.ny)),
+            np.empty((*shape, system.ny + system.nu + 1), np.float32),
+        )
+
+    def record(self, episodes: Episodes, xhat0: object = None) -> Record:
+        """What an estimator may see of the episodes: their samples up to the last action's."""
+        batch, last = episodes.y.shape[1], self.setup.num_steps
+        u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
+        prior = Prior.of(self.system, self.setup, batch, xhat0)
+        return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
+
+
+class Stream:
+    """The random numbers that one seed stands for, and its queue of initial states."""
+
+    def __init__(self, seeds: np.random.SeedSequence) -> None:
+        states, noise, conditions = (np.random.default_rng(seed) for seed in seeds.spawn(3))
+        self._states = states
+        self._queue: list[np.ndarray] = []
+        self.noise = noise
+        self.conditions = conditions
+
+    def next_x0(self, source: EpisodeSource) -> np.ndarray:
+        """The next initial state (nx,) from the setup's set."""
+        if source.fixed_x0:
+            return source.x0_low
+        for _ in range(_ATTEMPTS):
+            if self._queue:
+                return self._queue.pop(0)
+            drawn = self._states.uniform(source.x0_low, source.x0_high, (_DRAWS, source.system.nx))
+            self._queue = list(drawn[source.system.admissible(drawn)])
+        name = type(source.system).__name__
+        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")
