@@ -169,8 +169,10 @@ def _system_attributes(cls: type[System]) -> None:
     """The class attributes are complete and make sense."""
     cls.validate()
     frozen = is_dataclass(cls) and getattr(cls, "__dataclass_params__").frozen  # noqa: B009
-    own = frozen and "__dataclass_params__" in vars(cls)
-    _require(own, f"{cls.__name__} is not decorated; expected @dataclass(frozen=True)")
+    own = "__dataclass_params__" in vars(cls) or not vars(cls).get("__annotations__")
+    _require(
+        frozen and own, f"{cls.__name__} has parameters; expected @dataclass(frozen=True) above it"
+    )
     system = cls()
     for kind in ("state_names", "output_names", "input_names"):
         names = getattr(system, kind)

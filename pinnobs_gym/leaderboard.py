@@ -174,7 +174,7 @@ def cells(table: Table, intervals: bool = True) -> list[list[str]]:
     for s in table.standings:
         ranks[s.track] += 1
         tail = shown(s.tail)
-        if s.tail_modulo is not None:
+        if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
             tail += f" [{number(s.tail_modulo)}]"
         lines.append(
             [

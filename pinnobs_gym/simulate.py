@@ -307,11 +307,11 @@ def model_step_jacobian(
         # The variational equation Φ' = A(t)Φ, by the same method along the same stages.
         stage_times = t[[0, 1, 1, 2], None]
         A = system.f_jacobian(stage_times, points, u[[0, 1, 1, 2], None])
-        A = A.transpose(2, 3, 0, 1)  # (nx, nx, 4, batch)
-        K1, A2, A3, A4 = A[:, :, 0], A[:, :, 1], A[:, :, 2], A[:, :, 3]
-        K2 = A2 + (step / 2) * product(A2, K1)
-        K3 = A3 + (step / 2) * product(A3, K2)
-        K4 = A4 + step * product(A4, K3)
+        A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
+        K1 = A[0]
+        K2 = A[1] + product(A[1], (step / 2) * K1)
+        K3 = A[2] + product(A[2], (step / 2) * K2)
+        K4 = A[3] + product(A[3], step * K3)
         flow = (step / 6) * (K1 + 2 * (K2 + K3) + K4)
         for i in range(nx):
             flow[i, i] += 1
