@@ -195,10 +195,14 @@ class NoScale(Pendulum):
 
 
 class NotDecorated(Pendulum):
+    length: float = 1.0
+
+
+class WithoutParameters(Pendulum):
     pass
 
 
-@pytest.mark.parametrize("cls", [Pendulum, QuickPendulum])
+@pytest.mark.parametrize("cls", [Pendulum, QuickPendulum, WithoutParameters])
 def test_sound_system_passes(cls: type[System]) -> None:
     check_system(cls)
 
