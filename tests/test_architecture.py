@@ -20,7 +20,7 @@ ALLOWED = {
     "simulate": {"system"},
     "conditions": {"system"},
     "estimator": {"system", "record", "simulate"},
-    "checks": {"system", "simulate", "estimator", "record", "env", "systems", "estimators"},
+    "checks": {"checks", "system", "simulate", "estimator", "record"},
     "systems": {"system", "registry"},
     "estimators": {"estimator", "record", "simulate", "system", "network", "registry"},
 }
