@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, get_args, get_type_hints
 
 import numpy as np
 import tyro
@@ -31,7 +31,7 @@ from pinnobs_gym.evaluation import evaluate, make_vector_env, score_batch
 from pinnobs_gym.figures import state_figure
 from pinnobs_gym.log import Log
 from pinnobs_gym.record import Prior, read_log
-from pinnobs_gym.report import page, write_estimates, write_figure
+from pinnobs_gym.report import page, replacing, write_estimates, write_figure
 from pinnobs_gym.systems import SYSTEMS
 
 console = Console() if Console().is_terminal else Console(width=150)
@@ -115,16 +115,19 @@ class Evaluate:
         cls = ESTIMATORS.resolve(self.estimator)
         estimator: Estimator | type[Estimator] = cls
         options = parse_settings(cls, self.set)
+        source = make_vector_env(name, 1, self.setup, self.condition).source
         if self.checkpoint is not None:
-            model = make_vector_env(name, 1, self.setup, self.condition).source.system
-            estimator = suite.load(cls, self.checkpoint, model)
+            estimator = suite.load(cls, self.checkpoint, source.system)
+        episodes = 1 if source.deterministic else self.episodes
+        if episodes < self.episodes:
+            console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         folder = self.out / "tensorboard" / name.removeprefix("pinnobs/") / self.setup
         with Log(folder / self.condition / ESTIMATORS.name_of(cls)) as log, _progress() as bar:
-            task = bar.add_task("episodes", total=self.episodes)
+            task = bar.add_task("episodes", total=episodes)
             scored = evaluate(
                 estimator,
                 name,
-                episodes=self.episodes,
+                episodes=episodes,
                 seed=self.seed,
                 setup=self.setup,
                 condition=self.condition,
@@ -133,7 +136,7 @@ class Evaluate:
                 log=log,
                 progress=lambda done: bar.advance(task, done),
             )
-            bar.update(task, completed=self.episodes)
+            bar.update(task, completed=episodes)
         for table in leaderboard.tables(scored):
             print_table(table)
         console.print(f"rows: {self.out / 'rows.jsonl'}; TensorBoard: {self.out / 'tensorboard'}")
@@ -167,10 +170,11 @@ class Leaderboard:
 
     def run(self) -> int:
         """Run what is missing, then print and write the tables."""
-        if self.jobs < 1 or self.trained_episodes < 1:
-            raise ValueError(
-                f"jobs={self.jobs}, trained_episodes={self.trained_episodes}; expected at least 1"
-            )
+        for name, least in (("jobs", 1), ("episodes", 1), ("trained_episodes", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)}; expected at least {least}")
+        if not self.budget > 0:
+            raise ValueError(f"budget={self.budget}; expected a positive number of seconds")
         check_writable(self.out)
         rows.read(self.out / "rows.jsonl")  # a damaged file is refused before anything is run
         jobs = suite.jobs_of(
@@ -199,14 +203,16 @@ class Leaderboard:
             print_table(table)
         console.print(leaderboard.NOTE)
         path = self.out / "leaderboard.md"
-        path.write_text(leaderboard.markdown(tables), encoding="utf-8")
+        with replacing(path) as temporary:
+            temporary.write_text(leaderboard.markdown(tables), encoding="utf-8")
         for what, where in (
             ("tables", path),
             ("rows", self.out / "rows.jsonl"),
             ("TensorBoard", self.out / "tensorboard"),
             ("trained files", self.out / "trained"),
         ):
-            console.print(f"{what + ':':14} {where}", soft_wrap=True)
+            if where.exists():
+                console.print(f"{what + ':':14} {where}", soft_wrap=True)
         return 1 if failures else 0
 
 
@@ -246,6 +252,9 @@ class Estimate:
                 f"estimator {self.estimator!r} is trained beforehand; for a log take one that is "
                 f"not, or trains on the record"
             )
+        picture = self.out.with_suffix(".png")
+        if picture == self.out or self.log.resolve() in (self.out.resolve(), picture.resolve()):
+            raise ValueError(f"out={self.out} would overwrite the log or the picture; name a .csv")
         check_writable(self.out.parent)
         estimator = kind.for_setup(system, setup, **parse_settings(kind, self.set))
         estimates = estimator.run(record)
@@ -255,7 +264,6 @@ class Estimate:
         P = None if estimates.P is None else estimates.P[0]
         title = f"{self.log.name}: {type(system).__name__}, {estimator.label}"
         figure = state_figure(system, record.t, estimates.xhat[0], y=record.y[0], P=P, title=title)
-        picture = self.out.with_suffix(".png")
         write_figure(picture, figure)
         last = ", ".join(
             f"{name} = {value:.6g}"
@@ -301,6 +309,12 @@ def train(name: str, arguments: Sequence[str]) -> int:
     played = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
     stem = chosen.out / f"{played}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
+    path = stem.with_name(stem.name + ".pt")
+    for earlier in (checkpoint, path):
+        if earlier.exists() and not chosen.resume:
+            raise ValueError(
+                f"{earlier} is there already; --resume goes on with it, --out names another folder"
+            )
     with Log(chosen.out / "tensorboard" / stem.name) as log:
         result = module.train(
             system,
@@ -311,7 +325,6 @@ def train(name: str, arguments: Sequence[str]) -> int:
             resume=chosen.resume,
             progress=True,
         )
-    path = stem.with_name(stem.name + ".pt")
     result.save(path)
     console.print(
         f"loss {result.loss:.3g} after {result.iterations} iterations, {result.seconds:.1f} CPU s"
@@ -345,24 +358,50 @@ def default_estimators() -> tuple[str, ...]:
 
 
 def parse_settings(cls: type[Estimator], settings: Sequence[str]) -> dict[str, Any]:
-    """The values of ``name=number`` settings of an estimator.
+    """The values of ``name=value`` settings of an estimator, or of the recipe it trains by.
 
     Raises:
         ValueError: in one line, naming what is unknown and what is known.
     """
     base = {f.name for f in fields(Estimator)}
-    known = {f.name for f in fields(cls) if f.name not in base}
+    own = {f.name: f for f in fields(cls) if f.name not in base and f.repr}
+    makers = {name: f.default_factory for name, f in own.items()}
+    recipes = {name: maker for name, maker in makers.items() if is_dataclass(maker)}
+    hints = {n: h for n, h in get_type_hints(cls).items() if n in own and n not in recipes}
+    nested = {
+        name: (field_name, hint)
+        for field_name, recipe in recipes.items()
+        for name, hint in get_type_hints(recipe).items()
+    }
     values: dict[str, Any] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
-        if not equals or name not in known:
-            listed = ", ".join(sorted(known)) or "none"
+        if equals and name in hints:
+            values[name] = _parsed(setting, text, hints[name])
+        elif equals and name in nested:
+            field_name, hint = nested[name]
+            values.setdefault(field_name, {})[name] = _parsed(setting, text, hint)
+        else:
+            listed = ", ".join(sorted([*hints, *nested])) or "none"
             raise ValueError(f"setting {setting!r}; expected name=value with a name of: {listed}")
-        try:
-            values[name] = float(text)
-        except ValueError:
-            values[name] = text
+    for name, recipe in recipes.items():
+        if name in values:
+            make: Any = recipe
+            values[name] = make(**values[name])
     return values
+
+
+def _parsed(setting: str, text: str, hint: Any) -> Any:
+    """The text as the number or string that a field is declared to hold."""
+    kinds = get_args(hint) or (hint,)
+    for kind in (int, float):
+        if kind in kinds:
+            try:
+                return kind(text)
+            except ValueError:
+                expected = "a whole number" if kind is int else "a number"
+                raise ValueError(f"setting {setting!r}; expected {expected}") from None
+    return text
 
 
 def check_writable(folder: Path) -> None:
@@ -384,8 +423,8 @@ def print_table(table: leaderboard.Table) -> None:
     """Print a leaderboard's table; a narrow terminal is spared the intervals."""
     wide = console.width >= 145
     shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
-    skipped = () if wide else ("90th pct.", "µs/step")
-    columns = [i for i, name in enumerate(leaderboard.HEADER) if name not in (*skipped, "training")]
+    hidden = {"is told", "training"} | (set() if wide else {"90th pct.", "µs/step"})
+    columns = [i for i, name in enumerate(leaderboard.HEADER) if name not in hidden]
     for i in columns:
         name = leaderboard.HEADER[i]
         text = name in ("estimator", "track")
@@ -394,8 +433,10 @@ def print_table(table: leaderboard.Table) -> None:
         shown.add_row(*(line[i] for i in columns))
     console.print(shown)
     for standing in table.standings:
-        if standing.training:
-            console.print(f"  {standing.estimator}: {standing.training}")
+        trained = f"; trained: {standing.training}" if standing.training else ""
+        console.print(f"  {standing.estimator} is told: {standing.knows}{trained}")
+    if table.note:
+        console.print(f"  {table.note}", style="yellow")
 
 
 def _progress() -> Progress:
@@ -428,7 +469,8 @@ USAGE = """usage: pinnobs COMMAND ...
   leaderboard ...       run every estimator on every system
   estimate ...          estimate the states behind a sensor log
 
-pinnobs COMMAND --help says more. A system or estimator of your own is given as module:Class."""
+pinnobs COMMAND --help says more. A system or estimator of your own is given as module:Class.
+With PINNOBS_TRACEBACK=1 in the environment an error shows where it came from."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -437,7 +479,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if arguments else 2
-    sys.path.insert(0, os.getcwd())  # so that module:Class finds the user's own files
+    sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
     name, rest = arguments[0], list(arguments[1:])
     try:
         if name not in COMMANDS:
@@ -450,6 +492,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"pinnobs: error: {error}", file=sys.stderr)
         return 2
+    except Exception as error:  # of a plug-in, or a fault of ours
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        print(f"pinnobs: error: {what} (PINNOBS_TRACEBACK=1 shows where)", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("pinnobs: stopped; what was written is kept", file=sys.stderr)
         return 130

@@ -10,6 +10,14 @@ import numpy as np
 from pinnobs_gym.system import Setup, System, vector
 
 
+def noise_scale(system: System, setup: Setup) -> np.ndarray:
+    """The output noise (ny,) that conditions multiply: the setup's, or where that is zero the
+    benchmark's."""
+    own = vector(setup.noise_std, system.ny, "noise_std")
+    benchmark = vector(system.setups["benchmark"].noise_std, system.ny, "noise_std")
+    return np.where(own > 0, own, benchmark)
+
+
 @dataclass(frozen=True)
 class Condition:
     """What changes in an episode. The base class changes nothing.
@@ -27,20 +35,21 @@ class Condition:
         return system
 
     def outputs(
-        self, y: np.ndarray, setup: Setup, rngs: Sequence[np.random.Generator]
+        self, y: np.ndarray, noise_std: np.ndarray, rngs: Sequence[np.random.Generator]
     ) -> np.ndarray:
-        """What becomes of the noisy outputs (num_samples, batch, ny) on the way; a new array."""
+        """What becomes of the noisy outputs (num_samples, batch, ny) on the way, a new array;
+        ``noise_std`` (ny,) is the noise that `noise_scale` gives."""
         return y
 
 
 @dataclass(frozen=True)
 class Noise(Condition):
-    """Output noise of another strength, which the estimators are told."""
+    """Output noise of another strength, times that of `noise_scale`; the estimators are told."""
 
     factor: float
 
     def setup(self, system: System, setup: Setup) -> Setup:
-        std = self.factor * vector(setup.noise_std, system.ny, "noise_std")
+        std = self.factor * noise_scale(system, setup)
         return replace(setup, noise_std=tuple(std.tolist()))
 
 
@@ -51,7 +60,7 @@ class Dropouts(Condition):
     probability: float
 
     def outputs(
-        self, y: np.ndarray, setup: Setup, rngs: Sequence[np.random.Generator]
+        self, y: np.ndarray, noise_std: np.ndarray, rngs: Sequence[np.random.Generator]
     ) -> np.ndarray:
         lost = [rng.random((len(y), y.shape[-1])) < self.probability for rng in rngs]
         return np.where(np.stack(lost, axis=1), np.nan, y)
@@ -59,17 +68,16 @@ class Dropouts(Condition):
 
 @dataclass(frozen=True)
 class Outliers(Condition):
-    """Some samples off by a Gaussian error many times the noise (of the benchmark, if the setup
-    has none)."""
+    """Some samples off by a Gaussian error many times the noise of `noise_scale`."""
 
     probability: float
     strength: float
 
     def outputs(
-        self, y: np.ndarray, setup: Setup, rngs: Sequence[np.random.Generator]
+        self, y: np.ndarray, noise_std: np.ndarray, rngs: Sequence[np.random.Generator]
     ) -> np.ndarray:
         shape = (len(y), y.shape[-1])
-        std = self.strength * vector(setup.noise_std, y.shape[-1], "noise_std")
+        std = self.strength * noise_std
         errors = [
             (rng.random(shape) < self.probability) * rng.standard_normal(shape) for rng in rngs
         ]
@@ -111,10 +119,10 @@ class Combined(Condition):
         return system
 
     def outputs(
-        self, y: np.ndarray, setup: Setup, rngs: Sequence[np.random.Generator]
+        self, y: np.ndarray, noise_std: np.ndarray, rngs: Sequence[np.random.Generator]
     ) -> np.ndarray:
         for part in self.parts:
-            y = part.outputs(y, setup, rngs)
+            y = part.outputs(y, noise_std, rngs)
         return y
 
 

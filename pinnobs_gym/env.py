@@ -188,7 +188,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._streams: list[Stream] = []
         self._episodes: Episodes | None = None
         self._noise: np.ndarray | None = None
-        self._xhat0: np.ndarray | None = None
+        self._prior = Prior.of(self.source.system, self.source.setup, num_envs)
         self._pictures: list[EpisodePicture] = []
 
     def reset(
@@ -207,13 +207,10 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         xhat0 = options.get("xhat0")
         prior = Prior.of(self.source.system, self.source.setup, self.num_envs, xhat0)
         x0 = _given_x0(self.source, options, self.num_envs)
-        self._seed(seed)
-        self._xhat0 = prior.mean
-        self._begin(rows, None if x0 is None else x0[rows])
+        self._seed(seed, rows)
+        self._begin(rows, prior.mean[rows], None if x0 is None else x0[rows])
         observations, infos = self._look()
-        for name, value in (("xhat0", prior.mean.copy()), ("P0", prior.cov)):
-            infos[name], infos[f"_{name}"] = value, np.ones(self.num_envs, dtype=bool)
-        return observations, infos
+        return observations, infos | self._begun(rows)
 
     def step(
         self, actions: np.ndarray
@@ -237,21 +234,26 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             if not over[row]:
                 picture.add(int(self._k[row]), estimates[row])
         self._k += 1
+        begun = None
         if self._any_over:
             over = over.copy()  # beginning anew clears the original
-            self._begin(np.flatnonzero(over))
+            begun = np.flatnonzero(over)
+            default = Prior.of(self.source.system, self.source.setup, len(begun))
+            self._begin(begun, default.mean)
             rewards[over] = 0.0
             terminated &= ~over
         truncated = np.asarray(self._k == self._num_steps)
         self._over = terminated | truncated
         self._any_over = bool(self._over.any())
         observations, infos = self._look()
+        if begun is not None:
+            infos |= self._begun(begun)
         return observations, rewards, terminated, truncated, infos
 
     def record(self) -> Record:
         """What an estimator may see of the episodes now playing, from their first sample to that
         of the last action."""
-        return self.source.record(self._playing, self._xhat0)
+        return self.source.record(self._playing, self._prior.mean)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """An image (height, width, 3) per row."""
@@ -272,8 +274,8 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             raise RuntimeError("no episode has begun; call reset first")
         return self._episodes
 
-    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
-        """Give every row its stream, if there is a seed or no stream yet."""
+    def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
+        """Give these rows their streams, if there is a seed or no stream yet."""
         seeds: list[int | None]
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))
@@ -284,11 +286,22 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             seeds = list(seed)
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds; expected {self.num_envs}, one per row")
-        if seed is not None or not self._streams:
+        if not self._streams:
             self._streams = [Stream(np.random.SeedSequence(s)) for s in seeds]
+        elif seed is not None:
+            for row in rows:
+                self._streams[row] = Stream(np.random.SeedSequence(seeds[row]))
 
-    def _begin(self, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
-        """Begin the next episode of these rows."""
+    def _begun(self, rows: np.ndarray) -> dict[str, Any]:
+        """The infos of rows whose episode has just begun: their prior."""
+        mask = np.zeros(self.num_envs, dtype=bool)
+        mask[rows] = True
+        mean, cov = self._prior.mean.copy(), self._prior.cov.copy()
+        return {"xhat0": mean, "_xhat0": mask, "P0": cov, "_P0": mask.copy()}
+
+    def _begin(self, rows: np.ndarray, xhat0: np.ndarray, x0: np.ndarray | None = None) -> None:
+        """Begin the next episode of these rows, from prior means (len(rows), nx)."""
+        self._prior.mean[rows] = xhat0
         # Arrays of this size are slow to allocate: those of the episodes that are over serve again.
         everything = len(rows) == self.num_envs
         draws = self.source.draw(

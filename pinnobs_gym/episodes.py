@@ -8,7 +8,7 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
-from pinnobs_gym.conditions import Condition, parse_condition
+from pinnobs_gym.conditions import Condition, noise_scale, parse_condition
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import truth
 from pinnobs_gym.system import System, vector
@@ -82,12 +82,17 @@ class EpisodeSource:
         condition: str = "nominal",
         **changes: Unpack[Changes],
     ) -> None:
+        for name in changes:
+            if name not in Changes.__annotations__:
+                known = ", ".join(["setup", "condition", *Changes.__annotations__])
+                raise ValueError(f"unknown argument {name!r}; known are {known}")
         self.system, chosen = SYSTEMS.resolve(system).configured(setup, **changes)
         self.condition = parse_condition(condition)
         self.condition.plant(self.system, ())  # a condition that does not fit says so now
         self.setup = self.condition.setup(self.system, chosen)
         self.fixed_x0 = self.setup.fixed_x0
         self.trivial = type(self.condition) is Condition
+        self.deterministic = self.fixed_x0 and self.trivial and not np.any(self.setup.noise_std)
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
@@ -135,7 +140,7 @@ class EpisodeSource:
         np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
         y += self.system.h(x)
         if not self.trivial:
-            y[:] = self.condition.outputs(y, self.setup, rngs)
+            y[:] = self.condition.outputs(y, noise_scale(self.system, self.setup), rngs)
         ny = self.system.ny
         observations[..., :ny] = y
         observations[..., ny:-1] = self.inputs[:, None]

@@ -103,6 +103,9 @@ class Estimator(ABC):
         with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
             for k, t in enumerate(record.t):
                 state = self.update(state, float(t), y[k], u[k])
+                if not isinstance(state, State):
+                    name, kind = type(self).__name__, type(state).__name__
+                    raise TypeError(f"{name}.update returned {kind}; expected a State")
                 if k == 0:
                     columns = _empty_columns(state, record.num_samples)
                 for name, column in columns.items():
@@ -114,14 +117,16 @@ class Estimator(ABC):
         """Diagonal of R, shape (ny,), in squared output units.
 
         Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; the
-        scale of an output is that of the state with the largest influence on it.
+        scale of an output is that of the state with the largest influence on it at x̂₀, or one if
+        none has any there.
         """
         benchmark = self.system.setups["benchmark"].noise_std
         told = benchmark if self.noise_std is None else self.noise_std
         std = vector(told, self.system.ny, "noise_std")
         scale = vector(self.system.scale, self.system.nx, "scale")
         H = self.system.h_jacobian(vector(self.system.setups["benchmark"].xhat0, len(scale), ""))
-        return np.maximum(std, NOISE_FLOOR * abs(H * scale).max(axis=-1)) ** 2
+        size = abs(H * scale).max(axis=-1)
+        return np.maximum(std, NOISE_FLOOR * np.where(size > 0, size, 1.0)) ** 2
 
     @property
     def label(self) -> str:

@@ -228,7 +228,7 @@ def _common(
         "model": canonical(estimator.system),
         "noise_std": canonical(estimator.noise_std),
         "options": canonical(estimator.options),
-        "training": canonical(estimator.training),
+        "training": {k: v for k, v in canonical(estimator.training).items() if k != "seconds"},
         "played": canonical(env.source.setup),
     }
     text = json.dumps(identity, sort_keys=True)

@@ -64,6 +64,8 @@ class Table:
     setup: str
     condition: str
     standings: tuple[Standing, ...]
+    note: str = ""
+    """What to know about it, if anything."""
 
     @property
     def title(self) -> str:
@@ -83,8 +85,21 @@ def tables(rows: Iterable[Row]) -> list[Table]:
     for game, groups in sorted(played.items()):
         standings = [standing(group) for group in groups.values()]
         standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
-        result.append(Table(*game, tuple(standings)))
+        result.append(Table(*game, tuple(standings), _note(list(groups.values()))))
     return result
+
+
+def _note(groups: Sequence[Sequence[Row]]) -> str:
+    """A warning if estimators of one track were not run on the same episodes."""
+    for track in {group[0]["track"] for group in groups}:
+        played = {
+            frozenset(row["episode_seed"] for row in group)
+            for group in groups
+            if group[0]["track"] == track
+        }
+        if len(played) > 1:
+            return f"Not all {track} estimators were run on the same episodes: ranks are uncertain."
+    return ""
 
 
 def standing(rows: Sequence[Row]) -> Standing:
@@ -162,6 +177,7 @@ HEADER = (
     "tail NRMSE",
     "90th pct.",
     "µs/step",
+    "is told",
     "training",
 )
 """The columns of a table."""
@@ -188,6 +204,7 @@ def cells(table: Table, intervals: bool = True) -> list[list[str]]:
                 tail,
                 number(s.tail_90),
                 number(s.us_per_step),
+                s.knows,
                 s.training,
             ]
         )
@@ -202,6 +219,7 @@ def markdown(tables: Iterable[Table]) -> str:
         parts.append("| " + " | ".join(HEADER) + " |")
         parts.append("|" + "|".join(["---"] * len(HEADER)) + "|")
         parts += ["| " + " | ".join(line) + " |" for line in cells(table)]
+        parts += [f"\n{table.note}"] if table.note else []
     return "\n".join(parts) + "\n"
 
 

@@ -52,7 +52,10 @@ class Record:
         steps = np.diff(self.t)
         if self.t.ndim != 1 or not len(self.t):
             raise ValueError(f"t has shape {self.t.shape}; expected (num_samples,)")
-        if not np.isfinite(self.t).all() or (steps <= 0).any():
+        if not np.isfinite(self.t).all():
+            row = int(np.flatnonzero(~np.isfinite(self.t))[0])
+            raise ValueError(f"t must be finite; sample {row} has t={self.t[row]}")
+        if (steps <= 0).any():
             row = int(np.flatnonzero(~(steps > 0))[0]) + 1
             raise ValueError(
                 f"t must increase; sample {row} has t={self.t[row]} after {self.t[row - 1]}"
@@ -112,6 +115,9 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
             f"log {path} has no column {', '.join(missing)}; {type(system).__name__} needs "
             f"{', '.join(['t', *outputs, *inputs])}, and the header has {', '.join(header)}"
         )
+    twice = [name for name in ["t", *outputs, *inputs] if header.count(name) > 1]
+    if twice:
+        raise ValueError(f"log {path} has column {twice[0]} twice")
     columns = {name: header.index(name) for name in ["t", *outputs, *inputs]}
     table = {name: np.empty(len(rows) - 1) for name in columns}
     for i, (number, row) in enumerate(rows[1:]):
@@ -127,6 +133,8 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
         number, later, earlier = rows[wrong[0] + 2][0], t[wrong[0] + 1], t[wrong[0]]
         raise ValueError(f"log {path}, line {number}: t={later} after {earlier}; t must increase")
     y = np.stack([table[name] for name in outputs], axis=-1)[None]
+    if np.isnan(y).all():
+        raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
     u = np.stack([table[n] for n in inputs], axis=-1) if inputs else system.input(t)
     return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior)
 

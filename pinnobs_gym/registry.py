@@ -79,8 +79,9 @@ class Registry(Generic[T]):
             module, _, name = spec.partition(":")
             try:
                 return self.register(getattr(importlib.import_module(module), name))
-            except (ImportError, AttributeError, TypeError) as error:
-                raise ValueError(f"cannot load {self._kind} {spec!r}: {error}") from None
+            except Exception as error:  # whatever the user's module raises
+                kind = type(error).__name__
+                raise ValueError(f"cannot load {self._kind} {spec!r}: {kind}: {error}") from error
         classes = self.classes()
         if spec not in classes:
             raise ValueError(f"unknown {self._kind} {spec!r}; known are {', '.join(classes)}")

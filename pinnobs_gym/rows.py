@@ -47,17 +47,19 @@ def key(row: Row) -> tuple[Any, ...]:
 
 def append(path: Path, rows: Iterable[Row]) -> None:
     """Append rows to a file in one write, so that processes may share it and a kill leaves no half
-    line.
+    line. If the file ends in one all the same, the rows begin on a line of their own.
 
     Raises:
         ValueError: in one line, if the file cannot be written; what it held is untouched.
     """
-    lines = "".join(json.dumps(_encoded(row)) + "\n" for row in rows)
+    data = "".join(json.dumps(_encoded(row)) + "\n" for row in rows).encode()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:
-            data = lines.encode()
+            size = os.fstat(descriptor).st_size
+            if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                data = b"\n" + data
             written = os.write(descriptor, data)
             if written < len(data):
                 raise OSError(f"only {written} of {len(data)} bytes fitted")

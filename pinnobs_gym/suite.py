@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import json
 import os
 import pkgutil
 import sys
@@ -17,7 +19,13 @@ import joblib
 from pinnobs_gym import env_id
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.evaluation import log_episodes, log_summary, make_vector_env, run_episodes
+from pinnobs_gym.evaluation import (
+    canonical,
+    log_episodes,
+    log_summary,
+    make_vector_env,
+    run_episodes,
+)
 from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.rows import Row
@@ -96,16 +104,20 @@ def jobs_of(
     quick, long = [], []
     for estimator in estimators:
         cls = ESTIMATORS.resolve(estimator)
+        if cls.needs_training is not None and cls.track == "offline":
+            raise ValueError(f"estimator {estimator!r} knows one record; it cannot be ranked")
         for system in systems:
             name, ranked = env_id(system), SYSTEMS.resolve(system).ranked_condition
             played = list(dict.fromkeys(["nominal", ranked])) if condition is None else [condition]
             for each in played:
-                make_vector_env(name, 1, setup, each)  # a bad combination is refused before any run
-                job = Job(system, estimator, setup, each, episodes, seed, folder, dict(training))
+                # A bad combination is refused before any run.
+                source = make_vector_env(name, 1, setup, each).source
+                count = 1 if source.deterministic else episodes
+                job = Job(system, estimator, setup, each, count, seed, folder, dict(training))
                 if cls.trains_on_record is None:
                     (quick if cls.needs_training is None else long).append(job)
                 else:
-                    for i in range(trained_episodes):
+                    for i in range(min(count, trained_episodes)):
                         long.append(replace(job, episodes=1, seed=seed + i))
     return long + quick
 
@@ -134,13 +146,15 @@ def run_job(job: Job) -> None:
 
     torch.set_num_threads(1)
     if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())  # for module:Class of the user's folder, in workers too
+        sys.path.append(os.getcwd())  # for module:Class of the user's folder, in workers too
     name = env_id(job.system)
     cls = ESTIMATORS.resolve(job.estimator)
     options: dict[str, Any] = {}
     estimator: Estimator | type[Estimator] = cls
     if cls.trains_on_record is not None:
-        options = {"config": trainer(cls.trains_on_record).Config(**job.training)}
+        recipe = trainer(cls.trains_on_record).Config(**job.training)
+        place = f"{_played(job)}-{cls.trains_on_record}-{_digest(recipe)}-episode{job.seed}"
+        options = {"config": recipe, "folder": job.folder / "trained" / place}
     elif cls.needs_training is not None:
         estimator = trained(cls, job)
     seeds = range(job.seed, job.seed + job.episodes)
@@ -171,15 +185,25 @@ def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
 def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on one episode that is never scored, loaded if that was done before."""
     module = trainer(str(cls.needs_training))
-    name = env_id(job.system)
-    system, record = record_of(name, job.setup, job.condition, TRAINING_SEED)
-    label = f"{name.removeprefix('pinnobs/')}-{job.setup}-{job.condition}-{cls.needs_training}"
+    recipe = module.Config(**job.training)
+    system, record = record_of(env_id(job.system), job.setup, job.condition, TRAINING_SEED)
+    label = f"{_played(job)}-{cls.needs_training}-{_digest(recipe)}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = module.train(system, module.Config(**job.training), record=record, log=log)
+            result = module.train(system, recipe, record=record, log=log)
         result.save(path)
     return load(cls, path, system)
+
+
+def _played(job: Job) -> str:
+    return f"{env_id(job.system).removeprefix('pinnobs/')}-{job.setup}-{job.condition}"
+
+
+def _digest(recipe: Any) -> str:
+    """Tells recipes apart in the names of files."""
+    text = json.dumps(canonical(recipe), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def load(cls: type[Estimator], path: Path, system: System) -> Estimator:

@@ -47,7 +47,7 @@ class Setup:
     def __post_init__(self) -> None:
         for name in ("dt", "duration"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
+            if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
                 raise ValueError(f"{name}={value} s; expected a positive number of seconds")
         if self.duration < self.dt * (1 - 1e-9):
             raise ValueError(
@@ -56,6 +56,12 @@ class Setup:
         noise = np.asarray(self.noise_std, dtype=float)
         if not (np.isfinite(noise).all() and (noise >= 0).all()):
             raise ValueError(f"noise_std={self.noise_std}; expected numbers of at least 0")
+
+        if np.any(np.asarray(self.x0_low) > np.asarray(self.x0_high)):
+            raise ValueError(f"x0_low={self.x0_low} is above x0_high={self.x0_high}")
+        P0_std = np.asarray(self.P0_std, dtype=float)
+        if not (np.isfinite(P0_std).all() and (P0_std >= 0).all()):
+            raise ValueError(f"P0_std={self.P0_std}; expected numbers of at least 0")
 
     @property
     def num_steps(self) -> int:

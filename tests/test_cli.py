@@ -91,17 +91,32 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["leaderboard", "--condition", "load_step"], "needs a plant with a load torque"),
         (["estimate", "--system", "Academic", "--log", "none.csv"], "cannot read log none.csv"),
         (["estimate", "--system", "Academic", "--log", "bad.csv"], "has no column y1; Academic"),
+        (["leaderboard", "--episodes", "0"], "episodes=0; expected at least 1"),
+        (["leaderboard", "--estimators", "pinn_obs_direct"], "'pinn_obs_direct' knows one record"),
+        (["estimate", "--system", "Academic", "--log", "a.csv", "--out", "a.csv"], "overwrite"),
+        (["estimate", "--system", "Academic", "--log", "a.csv", "--out", "b.png"], "overwrite"),
+        (["estimate", "--system", "Academic", "--log", "a.csv", "--P0-std", "-1", "2"], "P0_std="),
+        (["estimate", "--system", "Academic", "--log", "none_at_all.csv"], "no output at all"),
+        (["estimate", "--system", "Academic", "--log", "twice.csv"], "has column y1 twice"),
+        (["evaluate", "--system", "failing_plug_in:X"], "'failing_plug_in:X': SyntaxError"),
+        (["evaluate", "--system", "Academic", "--set", "process_noise=a"], "expected a number"),
+        (["evaluate", "--system", "Academic", "--set", "process_noise=-1"], "process_noise=-1"),
         (["dance"], "unknown command 'dance'; known are systems, estimators, train"),
     ],
 )
 def test_mistakes_are_one_line_and_status_two(folder, capsys, arguments, message):
     (folder / "file").write_text("")
     (folder / "bad.csv").write_text("t,z\n0,1\n")
+    (folder / "a.csv").write_text("t,y1\n0,1\n1,2\n")
+    (folder / "twice.csv").write_text("t,y1,y1\n0,1,1\n")
+    (folder / "none_at_all.csv").write_text("t,y1\n0,\n1,\n")
+    (folder / "failing_plug_in.py").write_text("def\n")
     assert run(*arguments) == 2
     printed = capsys.readouterr()
     assert message in printed.err
     assert len(printed.err.splitlines()) == 1
     assert printed.err.startswith("pinnobs: error: ")
+    assert (folder / "a.csv").read_text() == "t,y1\n0,1\n1,2\n"
 
 
 def test_the_parsers_mistakes_are_status_two_as_well(folder):
@@ -131,7 +146,7 @@ def test_leaderboard_prints_ranks_writes_and_resumes(folder, capsys):
     assert run(*arguments) == 0
     first = capsys.readouterr().out
     assert first.index(" ekf ") < first.index(" open_loop ")
-    for what in ("lb/leaderboard.md", "lb/rows.jsonl", "lb/tensorboard", "lb/trained"):
+    for what in ("lb/leaderboard.md", "lb/rows.jsonl", "lb/tensorboard"):
         assert what in first
     stored = (folder / "lb" / "rows.jsonl").read_text()
     assert len(stored.splitlines()) == 8
@@ -174,6 +189,10 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert "pinn_obs_replay on its own record" in printed
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
     assert len(list(Path("tr").glob("*.png"))) == 2
+    before = trained.read_bytes()
+    assert run("train", "pinn_obs", *where, *small) == 2
+    assert "is there already; --resume goes on with it" in capsys.readouterr().err
+    assert trained.read_bytes() == before
     assert run("train", "pinn_obs", *where, *small[:4], "--iterations", "30", "--resume") == 0
     assert "after 30 iterations" in capsys.readouterr().out
     scored = ["evaluate", "--estimator", "pinn_obs_replay", "--checkpoint", trained]
@@ -186,6 +205,48 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     trained.write_bytes(trained.read_bytes()[:100])
     assert run(*scored, "--system", "ReverseDuffing", "--episodes", "2") == 2
     assert "is damaged or no file of saved weights" in capsys.readouterr().err
+
+
+def test_an_estimators_fault_is_one_line(folder, capsys):
+    (folder / "faulty_module.py").write_text(
+        "from pinnobs_gym.estimators.ekf import EKF\n"
+        "class Faulty(EKF):\n"
+        "    name = 'faulty'\n"
+        "    def update(self, state, t, y, u):\n"
+        "        {}['missing']\n"
+        "class Forgetful(EKF):\n"
+        "    name = 'forgetful'\n"
+        "    def update(self, state, t, y, u):\n"
+        "        pass\n"
+    )
+    where = ["evaluate", "--system", "Academic", "--episodes", "1"]
+    assert run(*where, "--estimator", "faulty_module:Faulty") == 1
+    assert "error: KeyError: 'missing' (PINNOBS_TRACEBACK=1 shows" in capsys.readouterr().err
+    assert run(*where, "--estimator", "faulty_module:Forgetful") == 2
+    assert "Forgetful.update returned NoneType; expected a State" in capsys.readouterr().err
+
+
+def test_a_recipe_can_be_set(folder, capsys):
+    recipe = ["--set", "depth=1", "width=4", "iterations=5"]
+    where = ["--system", "ReverseDuffing", "--estimator", "pinn_obs"]
+    assert run("evaluate", *where, *recipe, "--episodes", "1", "--out", "ev") == 0
+    (row,) = rows.read(folder / "ev" / "rows.jsonl")
+    assert row["options"]["config"]["width"] == 4
+    assert row["options"]["config"]["iterations"] == 5
+
+
+def test_another_budget_trains_anew(folder, capsys):
+    arguments = ["leaderboard", *QUICK, "--estimators", "pinn_obs_replay", "--out", "lb"]
+    assert run(*arguments, "--budget", "0.2") == 0
+    assert run(*arguments, "--budget", "0.3") == 0
+    budgets = {r["training"]["config"]["budget"] for r in rows.read(folder / "lb" / "rows.jsonl")}
+    assert budgets == {0.2, 0.3}
+
+
+def test_the_same_episode_is_not_run_a_hundred_times(folder, capsys):
+    assert run("evaluate", "--system", "ReverseDuffing", "--setup", "paper", "--out", "ev") == 0
+    assert "1 is run" in capsys.readouterr().out
+    assert len(rows.read(folder / "ev" / "rows.jsonl")) == 1
 
 
 def test_a_killed_run_loses_nothing_that_was_finished(folder):

@@ -629,3 +629,57 @@ def test_rendering_without_a_mode_warns() -> None:
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
         assert env.render() is None
+
+
+def test_a_masked_reset_leaves_the_other_rows_alone() -> None:
+    """Neither their streams nor their prior change when others are seeded anew."""
+
+    def play(masked: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        envs = EstimationVectorEnv(3, "Academic", duration=0.2)
+        envs.reset(seed=0, options={"xhat0": [0.5, 0.5]})
+        if masked:
+            mask = np.array([True, False, False])
+            envs.reset(seed=[70, 80, 90], options={"reset_mask": mask, "xhat0": [3.0, 3.0]})
+        prior = envs.record().prior.mean
+        observations, _ = envs.reset()
+        return prior, observations, envs.record().prior.mean
+
+    prior, following, default = play(masked=True)
+    untouched_prior, untouched, _ = play(masked=False)
+    np.testing.assert_array_equal(prior[0], [3.0, 3.0])
+    np.testing.assert_array_equal(prior[1:], untouched_prior[1:])
+    np.testing.assert_array_equal(following[1:], untouched[1:])
+    assert not np.array_equal(following[0], untouched[0])
+    np.testing.assert_array_equal(default, np.tile([1.0, 2.0], (3, 1)))
+
+
+def test_the_prior_is_told_again_after_an_autoreset() -> None:
+    envs = EstimationVectorEnv(2, "Academic", duration=0.1)
+    _, infos = envs.reset(seed=0, options={"xhat0": [0.5, 0.5]})
+    actions = np.zeros((2, 2))
+    for _ in range(5):
+        *_, infos = envs.step(actions)
+        assert "xhat0" not in infos
+    *_, infos = envs.step(actions)
+    np.testing.assert_array_equal(infos["_xhat0"], [True, True])
+    np.testing.assert_array_equal(infos["xhat0"], np.tile([1.0, 2.0], (2, 1)))
+    np.testing.assert_array_equal(envs.record().prior.mean, infos["xhat0"])
+
+
+def test_conditions_take_the_benchmarks_noise_where_the_setup_has_none() -> None:
+    for condition in ("outliers", "noise5"):
+        quiet = EstimationEnv("Academic", "paper", duration=2.0)
+        loud = EstimationEnv("Academic", "paper", condition, duration=2.0)
+        quiet.reset(seed=0)
+        loud.reset(seed=0)
+        off = []
+        for _ in range(900):
+            first, *_ = quiet.step(np.zeros(2))
+            second, *_ = loud.step(np.zeros(2))
+            off.append(second[0] - first[0])
+        assert np.max(np.abs(off)) > 0.1, condition
+
+
+def test_unknown_arguments_list_the_known_ones() -> None:
+    with pytest.raises(ValueError, match="unknown argument 'foo'; known are setup, condition, dt"):
+        gymnasium.make("pinnobs/Academic-v0", foo=1)

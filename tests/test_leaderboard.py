@@ -82,6 +82,16 @@ def test_markdown_has_a_table_per_game_with_all_columns():
     assert "0.2" in body
 
 
+def test_unequal_episodes_are_pointed_out():
+    same = leaderboard.tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1, 0.2])])
+    assert same[0].note == ""
+    uneven = leaderboard.tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1])])
+    assert "Not all online estimators" in uneven[0].note
+    assert uneven[0].note in leaderboard.markdown(uneven)
+    apart = [*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1], track="offline")]
+    assert leaderboard.tables(apart)[0].note == ""
+
+
 def test_training_is_told_in_the_row():
     facts = {"config": {"budget": 25.0}, "iterations": 1000, "seconds": 25.0}
     standing = leaderboard.standing(rows_of("pinn", [0.1], training=facts))

@@ -45,6 +45,23 @@ def test_a_truncated_line_is_named_and_the_file_kept(tmp_path):
     assert path.read_text() == whole[:-30]
 
 
+@pytest.mark.parametrize("cut", [1, 30])
+def test_rows_appended_after_a_cut_begin_on_a_line_of_their_own(tmp_path, cut):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(1)])
+    path.write_text(path.read_text()[:-cut])
+    rows.append(path, [row(2), row(3)])
+    lines = path.read_text().splitlines()
+    assert len(lines) == 4
+    if cut == 1:  # only the line's end was missing
+        assert [r["episode_seed"] for r in rows.read(path)] == [0, 1, 2, 3]
+    else:
+        with pytest.raises(ValueError, match="line 2, is cut off"):
+            rows.read(path)
+        path.write_text("\n".join([lines[0], *lines[2:]]) + "\n")  # as the error advises
+        assert [r["episode_seed"] for r in rows.read(path)] == [0, 2, 3]
+
+
 def test_another_schema_and_missing_fields_are_refused(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(schema=99)])

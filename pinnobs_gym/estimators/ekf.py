@@ -29,6 +29,10 @@ class EKF(Estimator):
 
     name = "ekf"
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.process_noise < np.inf:
+            raise ValueError(f"process_noise={self.process_noise}; expected a number of at least 0")
+
     def reset(self, prior: Prior) -> State:
         return State(prior.mean, P=prior.cov, memory=self._tuning())
 
