@@ -77,9 +77,7 @@ def test_unknown_names_list_the_known_ones():
         SYSTEMS.resolve("Duffing")
     with pytest.raises(ValueError, match="unknown estimator 'kf'; known are ekf, open_loop"):
         ESTIMATORS.resolve("kf")
-    with pytest.raises(
-        ValueError, match="cannot load system 'nowhere:X': ModuleNotFound"
-    ):
+    with pytest.raises(ValueError, match="cannot load system 'nowhere:X': ModuleNotFound"):
         SYSTEMS.resolve("nowhere:X")
 
 
