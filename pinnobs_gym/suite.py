@@ -21,7 +21,7 @@ from pinnobs_gym.evaluation import log_episodes, log_summary, make_vector_env, r
 from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.rows import Row
-from pinnobs_gym.system import System
+from pinnobs_gym.system import Setup, System
 from pinnobs_gym.systems import SYSTEMS
 
 TRAINING_SEED = 10**6
@@ -172,12 +172,14 @@ def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on one episode that is never scored, loaded if that was done before."""
     module = trainer(str(cls.needs_training))
     name = env_id(job.system)
-    system, record = record_of(name, job.setup, job.condition, TRAINING_SEED)
+    system, setup, record = record_of(name, job.setup, job.condition, TRAINING_SEED)
     label = f"{name.removeprefix('pinnobs/')}-{job.setup}-{job.condition}-{cls.needs_training}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = module.train(system, module.Config(**job.training), record=record, log=log)
+            config = module.Config(**job.training)
+            told = setup.noise_std
+            result = module.train(system, config, record=record, noise_std=told, log=log)
         result.save(path)
     return load(cls, path, system)
 
@@ -194,8 +196,9 @@ def load(cls: type[Estimator], path: Path, system: System) -> Estimator:
     return trained_cls.load(path, system)
 
 
-def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Record]:
-    """An env's model, and the record of its episode of that seed."""
+def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Setup, Record]:
+    """An env's model, what estimators are told of the setup, and the record of its episode of that
+    seed."""
     env = make_vector_env(name, 1, setup, condition)
     env.reset(seed=seed)
-    return env.source.system, env.record()
+    return env.source.system, env.source.setup, env.record()

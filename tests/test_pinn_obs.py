@@ -25,7 +25,7 @@ def box(nx):
     return Setup(x0_low=corner, x0_high=corner, xhat0=corner, P0_std=corner, duration=1, dt=0.05)
 
 
-SMALL = Config(depth=2, width=8, iterations=60, log_every=10)
+SMALL = Config("paper", depth=2, width=8, iterations=60, log_every=10)
 
 
 @dataclass(frozen=True)
@@ -378,13 +378,13 @@ def test_direct_estimates_belong_to_one_record(trained):
 
 def test_the_papers_recipe_lowers_the_loss():
     system, record = duffing()
-    start = train(system, Config(iterations=1), record=record)
-    assert train(system, Config(iterations=600), record=record).loss < start.loss / 2
+    start = train(system, Config("paper", iterations=1), record=record)
+    assert train(system, Config("paper", iterations=600), record=record).loss < start.loss / 2
 
 
 def test_training_finds_the_output_and_the_initial_estimate():
     system, record = duffing(duration=4.0)
-    trained = train(system, Config(depth=3, iterations=1500), record=record)
+    trained = train(system, Config("paper", depth=3, iterations=1500), record=record)
     xhat = trained.xhat(record.t)
     error = xhat[:, 0] - record.y[0, :, 0]
     assert np.sqrt(np.mean(error**2)) < 0.2 * record.y.std()
