@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
-from scipy.linalg.blas import dsymv, dsyr2k
+from scipy.linalg import get_blas_funcs
 
 Objective: TypeAlias = Callable[[np.ndarray], tuple[float, np.ndarray]]
 """A function and its gradient: f and ∇f (n,) at x (n,)."""
@@ -24,6 +24,7 @@ SUFFICIENT_DECREASE = 1e-4
 CURVATURE = 0.9
 """c₂ of the strong Wolfe conditions."""
 _TRIALS = 25
+_symv, _syr2k = get_blas_funcs(("symv", "syr2k"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +140,8 @@ class QuasiNewton:
     def step(self, objective: Objective) -> bool:
         """One iteration; False if no lower value can be found, and nothing has changed but H.
 
-        If the search fails along the quasi-Newton direction, the matrix is forgotten and the steepest
-        descent tried.
+        If the search fails along the quasi-Newton direction, the matrix is forgotten and the
+        steepest descent tried.
         """
         while True:
             direction = self._direction()
@@ -162,7 +163,7 @@ class QuasiNewton:
     def _direction(self) -> np.ndarray:
         if self.H is None:
             return -self.gradient
-        return dsymv(-1.0, self.H, self.gradient, lower=1)
+        return _symv(-1.0, self.H, self.gradient, lower=1)
 
     def _update(self, found: Point) -> None:
         """The new H: (H − wwᵀ/yᵀw + φ·vvᵀ)/τ + ssᵀ/sᵀy with w = Hy and
@@ -176,14 +177,14 @@ class QuasiNewton:
             sBs = float(s @ s) / (sy / float(y @ y))
         else:
             sBs = -found.step * float(s @ self.gradient)
-        w = dsymv(1.0, self.H, y, lower=1)
+        w = _symv(1.0, self.H, y, lower=1)
         yw = float(y @ w)
         phi, tau = _scaled_broyden(sBs / sy, yw / sy, len(s))
         ss = phi * yw / (sy * sy) / tau + 1 / sy
         sw, ww = -phi / sy / tau, (phi - 1) / yw / tau
         left = np.stack([s, w], axis=1)
         right = np.stack([ss / 2 * s + sw * w, ww / 2 * w], axis=1)
-        self.H = dsyr2k(1.0, left, right, 1 / tau, self.H, lower=1, overwrite_c=1)
+        self.H = _syr2k(1.0, left, right, 1 / tau, self.H, lower=1, overwrite_c=1)
 
 
 def _scaled_broyden(b: float, h: float, n: int) -> tuple[float, float]:

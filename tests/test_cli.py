@@ -171,7 +171,7 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert run("train", "pinn_obs", *where, *small) == 0
     printed = capsys.readouterr().out
     assert "after 20 iterations" in printed
-    assert "pinn_obs_replay on its own record" in printed
+    assert "pinn_obs_replay on own record" in printed
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
     assert len(list(Path("tr").glob("*.png"))) == 2
     assert run("train", "pinn_obs", *where, *small[:4], "--iterations", "30", "--resume") == 0

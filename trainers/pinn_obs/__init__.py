@@ -44,8 +44,9 @@ def train(
 ) -> Trained:
     """Train PINN-Obs on the record of one episode.
 
-    The weights of the least training loss are kept. Ctrl-C ends it early and keeps them as well. If the loss leaves the finite numbers, it begins again from the next seed,
-    three times at most. On a CPU the same seed gives the same weights.
+    The weights of the least training loss are kept. Ctrl-C ends it early and keeps them as well.
+    If the loss leaves the finite numbers, it begins again from the next seed, three times at most.
+    On a CPU the same seed gives the same weights.
 
     Args:
         system: the model.

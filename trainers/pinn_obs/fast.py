@@ -44,9 +44,10 @@ class FastRun(Run):
     ReverseDuffing that is within a factor of 1.7 of the paper's own loss, and the loss that is
     logged and returned is the paper's. A record without noise is looked at in `Config.points`
     samples, and in further points right after t₀, where x̂ has to leave x̂₀; otherwise the network
-    jumps from x̂₀ to the trajectory where no residual is taken, and L is arbitrary. There y is joined
-    by straight lines, as in the replay. Outputs of noise σ weigh less by (0.01/σ)², σ over their
-    scale, if that is less than one, so that the equations decide and the fit does not chase it.
+    jumps from x̂₀ to the trajectory where no residual is taken, and L is arbitrary. There y is
+    joined by straight lines, as in the replay. Outputs of noise σ weigh less by (0.01/σ)², σ over
+    their scale, if that is less than one, so that the equations decide and the fit does not chase
+    it.
     """
 
     def _architecture(self) -> Architecture:
@@ -57,7 +58,7 @@ class FastRun(Run):
         unit = length / UNITS
         x_scale, y_scale = np.asarray(system.scale, float), output_scale(system, self.record)
         per_gain = x_scale[:, None] / y_scale / unit
-        quiet = np.minimum(1.0, (NOISE * y_scale / np.maximum(self.noise_std, 1e-300)) ** 2)
+        quiet = np.minimum(1.0, (NOISE * y_scale / np.maximum(self.noise_std, 1e-100)) ** 2)
         self._weights = Weights(
             config.w0 / x_scale**2,
             config.w_ode * (unit / x_scale) ** 2,

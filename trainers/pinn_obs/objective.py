@@ -61,8 +61,8 @@ class Points:
     equation: np.ndarray
     """Quadrature weights of the equation's residuals, shape (num_points,); their sum is 1."""
     output: np.ndarray
-    """Quadrature weights of the outputs, shape (num_points, ny); zero where they are missing, with a
-    sum of 1 over the points."""
+    """Quadrature weights of the outputs, shape (num_points, ny); zero where they are missing, with
+    a sum of 1 over the points."""
     xhat0: np.ndarray
     """Initial estimate at t₀, shape (nx,)."""
 
@@ -104,7 +104,7 @@ class Objective:
         self._activation = _ACTIVATIONS[architecture.activation]
         value, rate = architecture.features(points.t)
         self._inputs = np.concatenate([value.T, rate.T], axis=1)
-        scale = np.ones(self.nx * (1 + self.ny)) if architecture.scale is None else architecture.scale
+        scale = architecture.scale or (1.0,) * architecture.shapes[-1][0]
         self._scale = np.asarray(scale)[:, None]
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:

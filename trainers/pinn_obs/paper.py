@@ -17,6 +17,7 @@ from pinnobs_gym.system import System
 from trainers.pinn_obs.config import Config
 from trainers.pinn_obs.run import Run
 
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Samples of a record, as the loss takes them."""
@@ -77,7 +78,6 @@ def loss_terms(network: Network, system: System, samples: Samples) -> Tensor:
             (innovation * innovation).sum() / there,
         ]
     )
-
 
 
 class PaperRun(Run):

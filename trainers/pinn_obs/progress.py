@@ -89,5 +89,3 @@ def bar(total: int | None) -> Iterator[Callable[[Run], None]]:
             shown.update(task, completed=run.iteration, description=f"{text} best {best}")
 
         yield show
-
-
