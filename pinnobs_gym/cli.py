@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar, get_args, get_type_hints
 
@@ -24,7 +26,7 @@ from rich.progress import (
 )
 from rich.table import Table as RichTable
 
-from pinnobs_gym import env_id, leaderboard, rows, suite
+from pinnobs_gym import acceptance, env_id, leaderboard, rows, suite
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.evaluation import evaluate, make_vector_env, score_batch
@@ -157,7 +159,7 @@ class Leaderboard:
     """Condition; nominal, and the one that a system is ranked under, if none is given."""
     episodes: int = 100
     """Episodes of each estimator and system."""
-    trained_episodes: int = 2
+    trained_episodes: int = 5
     """Episodes of those that train on every record."""
     budget: float = 20.0
     """CPU seconds of each training."""
@@ -300,14 +302,13 @@ class Train(Generic[ConfigType]):
 def train(name: str, arguments: Sequence[str]) -> int:
     """Train an estimator with the trainer of that name."""
     module = suite.trainer(name)
-    default = tyro.conf.OmitArgPrefixes
-    kind = Train[module.Config]
-    chosen = tyro.cli(kind, prog=f"pinnobs train {name}", args=arguments, config=(default,))
+    chosen = _chosen_training(name, module.Config, arguments)
     check_writable(chosen.out)
     env = env_id(chosen.system)
-    system, record = suite.record_of(env, chosen.setup, chosen.condition, chosen.episode)
-    played = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
-    stem = chosen.out / f"{played}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
+    played = (env, chosen.setup, chosen.condition, chosen.episode)
+    system, setup, record = suite.record_of(*played)
+    title = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
+    stem = chosen.out / f"{title}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
     path = stem.with_name(stem.name + ".pt")
     for earlier in (checkpoint, path):
@@ -320,6 +321,7 @@ def train(name: str, arguments: Sequence[str]) -> int:
             system,
             chosen.config,
             record=record,
+            noise_std=setup.noise_std,
             log=log,
             checkpoint=checkpoint,
             resume=chosen.resume,
@@ -332,20 +334,51 @@ def train(name: str, arguments: Sequence[str]) -> int:
     for label, cls in ESTIMATORS.classes().items():
         if cls.needs_training == name:
             estimator = suite.load(cls, path, system)
-            own, example = score_batch(
-                estimator, env, chosen.setup, chosen.condition, [chosen.episode]
-            )
-            console.print(
-                f"{label} on its own record: RMSE {own[0]['rmse']:.4g}, NRMSE "
-                f"{own[0]['nrmse']:.4g}, last 25 % {own[0]['nrmse_tail']:.4g}"
-            )
+            example = _report_training(label, estimator, played, result.loss)
             picture = stem.with_name(f"{stem.name}-{label}.png")
-            write_figure(picture, state_figure(system, title=f"{label}: {played}", **example))
+            write_figure(picture, state_figure(system, title=f"{label}: {title}", **example))
             console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"trained file: {path}", soft_wrap=True)
-    console.print(f"checkpoint: {checkpoint} (go on with --resume)", soft_wrap=True)
+    if checkpoint.exists():
+        console.print(f"checkpoint: {checkpoint} (go on with --resume)", soft_wrap=True)
     console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
     return 0
+
+
+def _chosen_training(name: str, config: type, arguments: Sequence[str]) -> Train[Any]:
+    """The command line of a training; what a preset says is its default."""
+    options: dict[str, Any] = {
+        "prog": f"pinnobs train {name}",
+        "args": arguments,
+        "config": (tyro.conf.OmitArgPrefixes,),
+    }
+    make: Callable[[], Any] = config
+    for option, value in pairwise(arguments):
+        if option == "--preset":
+            make = partial(config, preset=value)
+    default = Train(system=tyro.MISSING, config=make())
+    return tyro.cli(Train[type(default.config)], default=default, **options)
+
+
+def _report_training(
+    label: str, estimator: Estimator, played: tuple[str, str, str, int], loss: float
+) -> dict[str, Any]:
+    """Print how a trained estimator does; returns what `state_figure` draws of its own record."""
+    if estimator.track == "online":
+        found, example = acceptance.replays(estimator, *played)
+    else:
+        own, example = score_batch(estimator, *played[:-1], [played[-1]])
+        found = [acceptance.Replay("own record", own[0])]
+    for replay in found:
+        row = replay.scores
+        console.print(
+            f"{label} on {replay.name}: RMSE {row['rmse']:.4g}, NRMSE {row['nrmse']:.4g}, "
+            f"last 25 % {row['nrmse_tail']:.4g}",
+            highlight=False,
+        )
+    if estimator.track == "online" and (told := acceptance.warning(loss, found[0].scores)):
+        console.print(f"warning: {told}", style="yellow")
+    return example
 
 
 def default_estimators() -> tuple[str, ...]:

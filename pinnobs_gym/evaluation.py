@@ -123,8 +123,10 @@ def run_episodes(
     return [stored[rows_module.key(row)] for row in wanted], made, example
 
 
-def make_vector_env(env_id: str, num_envs: int, setup: str, condition: str) -> EstimationVectorEnv:
-    """The vectorised env of that id.
+def make_vector_env(
+    env_id: str, num_envs: int, setup: str, condition: str, **changes: Any
+) -> EstimationVectorEnv:
+    """The vectorised env of that id; ``changes`` are further settings of it, such as noise_std.
 
     Raises:
         ValueError: listing the valid ids, if it is unknown.
@@ -138,6 +140,7 @@ def make_vector_env(env_id: str, num_envs: int, setup: str, condition: str) -> E
         vectorization_mode="vector_entry_point",
         setup=setup,
         condition=condition,
+        **changes,
     ).unwrapped
     assert isinstance(env, EstimationVectorEnv)
     return env
@@ -176,11 +179,18 @@ def _make(
 
 
 def score_batch(
-    estimator: Estimator, env_id: str, setup: str, condition: str, seeds: list[int]
+    estimator: Estimator,
+    env_id: str,
+    setup: str,
+    condition: str,
+    seeds: list[int],
+    reset_options: dict[str, Any] | None = None,
+    **changes: Any,
 ) -> tuple[list[Row], dict[str, Any]]:
-    """The scores of the episodes of these seeds, and the first of them for a picture."""
-    env = make_vector_env(env_id, len(seeds), setup, condition)
-    _, infos = env.reset(seed=seeds)
+    """The scores of the episodes of these seeds, and the first of them for a picture; the env is
+    made with the changes and reset with the options."""
+    env = make_vector_env(env_id, len(seeds), setup, condition, **changes)
+    _, infos = env.reset(seed=seeds, options=reset_options)
     record = env.record()
     start = time.process_time()
     estimates = estimator.run(record)

@@ -29,7 +29,7 @@ from pinnobs_gym.evaluation import (
 from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.rows import Row
-from pinnobs_gym.system import System
+from pinnobs_gym.system import Setup, System
 from pinnobs_gym.systems import SYSTEMS
 
 TRAINING_SEED = 10**6
@@ -186,12 +186,14 @@ def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on one episode that is never scored, loaded if that was done before."""
     module = trainer(str(cls.needs_training))
     recipe = module.Config(**job.training)
-    system, record = record_of(env_id(job.system), job.setup, job.condition, TRAINING_SEED)
+    place = (env_id(job.system), job.setup, job.condition, TRAINING_SEED)
+    system, setup, record = record_of(*place)
     label = f"{_played(job)}-{cls.needs_training}-{_digest(recipe)}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = module.train(system, recipe, record=record, log=log)
+            told = setup.noise_std
+            result = module.train(system, recipe, record=record, noise_std=told, log=log)
         result.save(path)
     return load(cls, path, system)
 
@@ -218,8 +220,9 @@ def load(cls: type[Estimator], path: Path, system: System) -> Estimator:
     return trained_cls.load(path, system)
 
 
-def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Record]:
-    """An env's model, and the record of its episode of that seed."""
+def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Setup, Record]:
+    """An env's model, what estimators are told of the setup, and the record of its episode of that
+    seed."""
     env = make_vector_env(name, 1, setup, condition)
     env.reset(seed=seed)
-    return env.source.system, env.record()
+    return env.source.system, env.source.setup, env.record()

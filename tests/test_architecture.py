@@ -22,6 +22,8 @@ ALLOWED = {
     "estimator": {"system", "record", "simulate"},
     "checks": {"checks", "system", "simulate", "estimator", "record"},
     "systems": {"system", "registry"},
+    "network": {"system"},
+    "quasi_newton": set(),
     "estimators": {"estimator", "record", "simulate", "system", "network", "registry"},
 }
 """What a module or subpackage may import of ours; itself is a case of its own below."""

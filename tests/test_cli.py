@@ -186,7 +186,7 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert run("train", "pinn_obs", *where, *small) == 0
     printed = capsys.readouterr().out
     assert "after 20 iterations" in printed
-    assert "pinn_obs_replay on its own record" in printed
+    assert "pinn_obs_replay on own record" in printed
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
     assert len(list(Path("tr").glob("*.png"))) == 2
     before = trained.read_bytes()
@@ -328,3 +328,24 @@ def test_the_frequency_of_a_real_pendulum(folder):
     frequency = np.pi / np.diff(crossings[2:]).mean()  # half a period from one to the next
     assert np.sqrt(own["x3"][-1]) == pytest.approx(frequency, rel=0.03)
     assert own["x3"][-1] == pytest.approx(64.0, rel=0.06)
+
+
+def test_ctrl_c_in_training_keeps_weights_and_checkpoint(folder):
+    command = [sys.executable, "-m", "pinnobs_gym.cli", "train", "pinn_obs", "--preset", "paper"]
+    command += ["--system", "Academic", "--out", "tr"]
+    started = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    log = folder / "tr" / "tensorboard"
+    deadline = time.monotonic() + 60
+    while not list(log.rglob("events.*")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    time.sleep(0.5)
+    started.send_signal(signal.SIGINT)
+    printed, _ = started.communicate(timeout=60)
+    assert started.returncode == 0
+    assert "trained file: " in printed
+    iterations = int(printed.partition(" after ")[2].partition(" ")[0])
+    assert 0 < iterations < 1000
+    resume = ["--resume", "--iterations", str(iterations + 2)]
+    again = subprocess.run([*command, *resume], capture_output=True, text=True, timeout=60)
+    assert again.returncode == 0, again.stderr
+    assert f"after {iterations + 2} iterations" in again.stdout

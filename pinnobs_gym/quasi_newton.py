@@ -1,0 +1,225 @@
+"""Self-scaled Broyden minimisation of smooth functions of up to a few thousand variables.
+
+The method of Al-Baali, in the form that Urbán, Stefanou & Pons ("Unveiling the optimization process
+of physics informed neural networks", 2025) found best for such networks (their SSBroyden): a member
+of Broyden's family chosen anew at each step between BFGS and beyond, its matrix scaled beforehand.
+The line search is that of Nocedal & Wright, "Numerical Optimization", algorithms 3.5 and 3.6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from scipy.linalg import get_blas_funcs
+
+Objective: TypeAlias = Callable[[np.ndarray], tuple[float, np.ndarray]]
+"""A function and its gradient: f and ∇f (n,) at x (n,)."""
+
+SUFFICIENT_DECREASE = 1e-4
+"""c₁ of the strong Wolfe conditions."""
+CURVATURE = 0.9
+"""c₂ of the strong Wolfe conditions."""
+_TRIALS = 25
+_symv, _syr2k = get_blas_funcs(("symv", "syr2k"), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A place on the line x + a·d."""
+
+    step: float
+    """a."""
+    f: float
+    """The function there."""
+    slope: float
+    """Its derivative along d."""
+    x: np.ndarray
+    """The place itself, shape (n,)."""
+    gradient: np.ndarray
+    """The gradient there, shape (n,)."""
+
+
+def line_search(
+    objective: Objective,
+    start: Point,
+    direction: np.ndarray,
+    first: float = 1.0,
+    curvature: float = CURVATURE,
+) -> Point | None:
+    """A step along a direction of descent that satisfies the strong Wolfe conditions
+
+    f(a) ≤ f(0) + c₁·a·f'(0) and abs f'(a) ≤ c₂·abs f'(0), or None if rounding hides one.
+
+    Args:
+        objective: the function.
+        start: where the line begins, with ``step`` 0 and a negative slope.
+        direction: d, shape (n,).
+        first: the first step tried.
+        curvature: c₂; the smaller, the nearer to the minimum along the line.
+    """
+
+    def at(step: float) -> Point:
+        x = start.x + step * direction
+        f, gradient = objective(x)
+        f = f if math.isfinite(f) else math.inf
+        return Point(step, f, float(gradient @ direction), x, gradient)
+
+    def decreases(point: Point) -> bool:
+        return point.f <= start.f + SUFFICIENT_DECREASE * point.step * start.slope
+
+    low, high, step = start, None, first
+    for _ in range(_TRIALS):
+        point = at(step)
+        if not decreases(point) or point.f >= low.f:
+            high = point
+        elif abs(point.slope) <= -curvature * start.slope:
+            return point
+        else:
+            end = math.inf if high is None else high.step
+            if point.slope * (end - point.step if high is None else end - low.step) >= 0:
+                high = low
+            low = point
+        if high is None:
+            step = min(10 * low.step, max(2 * low.step, _minimiser(start, low, math.inf)))
+        elif abs(high.step - low.step) <= 1e-14 * max(abs(low.step), abs(high.step)):
+            break
+        else:
+            step = _between(low, high)
+    return None
+
+
+def _between(low: Point, high: Point) -> float:
+    """The next trial inside an interval: by interpolation, but not too near its ends."""
+    width = high.step - low.step
+    middle = low.step + width / 2
+    guess = _minimiser(low, high, middle) if math.isfinite(high.f) else low.step + 0.1 * width
+    inside = sorted((low.step + 0.05 * width, high.step - 0.05 * width))
+    return min(max(guess, inside[0]), inside[1])
+
+
+def _minimiser(one: Point, other: Point, otherwise: float) -> float:
+    """The minimiser of the cubic through two points with their slopes (Nocedal & Wright, 3.59)."""
+    width = other.step - one.step
+    d1 = one.slope + other.slope - 3 * (other.f - one.f) / width
+    root = d1 * d1 - one.slope * other.slope
+    if not root >= 0:
+        return otherwise
+    d2 = math.copysign(math.sqrt(root), width)
+    below = other.slope - one.slope + 2 * d2
+    step = other.step - width * (other.slope + d2 - d1) / below if below else otherwise
+    return step if math.isfinite(step) else otherwise
+
+
+@dataclass(eq=False)
+class QuasiNewton:
+    """A minimisation in progress: all that changes from one step to the next."""
+
+    x: np.ndarray
+    """Where it stands, shape (n,)."""
+    f: float
+    """The function there."""
+    gradient: np.ndarray
+    """The gradient there, shape (n,)."""
+    H: np.ndarray | None = field(default=None, repr=False)
+    """The inverse Hessian's approximation, shape (n, n), of which the lower triangle counts; the
+    identity if None."""
+    curvature: float = CURVATURE
+    """c₂ of the line search."""
+
+    @staticmethod
+    def start(objective: Objective, x: np.ndarray, curvature: float = CURVATURE) -> QuasiNewton:
+        """A minimisation that begins at x (n,)."""
+        x = np.array(x, dtype=float)
+        f, gradient = objective(x)
+        return QuasiNewton(x, float(f), gradient, curvature=curvature)
+
+    def step(self, objective: Objective) -> bool:
+        """One iteration; False if no lower value can be found, and nothing has changed but H.
+
+        If the search fails along the quasi-Newton direction, the matrix is forgotten and the
+        steepest descent tried.
+        """
+        while True:
+            direction = self._direction()
+            slope = float(self.gradient @ direction)
+            here = Point(0.0, self.f, slope, self.x, self.gradient)
+            first = 1.0 if self.H is not None else min(1.0, 1 / math.sqrt(max(-slope, 1e-300)))
+            found = None
+            if slope < 0:
+                found = line_search(objective, here, direction, first, self.curvature)
+            if found is not None or self.H is None:
+                break
+            self.H = None
+        if found is None:
+            return False
+        self._update(found)
+        self.x, self.f, self.gradient = found.x, found.f, found.gradient
+        return True
+
+    def _direction(self) -> np.ndarray:
+        if self.H is None:
+            return -self.gradient
+        return _symv(-1.0, self.H, self.gradient, lower=1)
+
+    def _update(self, found: Point) -> None:
+        """The new H: (H − wwᵀ/yᵀw + φ·vvᵀ)/τ + ssᵀ/sᵀy with w = Hy and
+        v = √(yᵀw)·(s/sᵀy − w/yᵀw), written out in ssᵀ, swᵀ + wsᵀ and wwᵀ."""
+        s, y = found.x - self.x, found.gradient - self.gradient
+        sy = float(s @ y)  # positive by the curvature condition
+        if not sy > 1e-14 * math.sqrt(float(s @ s) * float(y @ y)):
+            return
+        if self.H is None:  # Nocedal & Wright, 6.20
+            self.H = np.asfortranarray(np.eye(len(s)) * (sy / float(y @ y)))
+            sBs = float(s @ s) / (sy / float(y @ y))
+        else:
+            sBs = -found.step * float(s @ self.gradient)
+        w = _symv(1.0, self.H, y, lower=1)
+        yw = float(y @ w)
+        phi, tau = _scaled_broyden(sBs / sy, yw / sy, len(s))
+        ss = phi * yw / (sy * sy) / tau + 1 / sy
+        sw, ww = -phi / sy / tau, (phi - 1) / yw / tau
+        left = np.stack([s, w], axis=1)
+        right = np.stack([ss / 2 * s + sw * w, ww / 2 * w], axis=1)
+        self.H = _syr2k(1.0, left, right, 1 / tau, self.H, lower=1, overwrite_c=1)
+
+
+def _scaled_broyden(b: float, h: float, n: int) -> tuple[float, float]:
+    """φ, the member of the family, and τ, the scale, from b = sᵀBs/sᵀy and h = yᵀHy/sᵀy."""
+    a = max(h * b - 1, 1e-12)  # zero where s and Hy are parallel: all members agree
+    rho = min(1.0, h * (1 - math.sqrt(a / (a + 1))))
+    theta = max((rho - 1) / a, min(1 / rho, (1 - b) / b))
+    sigma = 1 + a * theta
+    root = abs(sigma) ** (-1 / (n - 1)) if n > 1 and sigma else 1.0
+    tau = min(rho * root, sigma) if theta <= 0 else rho * min(root, 1 / theta)
+    return (1 - theta) / sigma, tau
+
+
+def minimise(
+    objective: Objective,
+    x: np.ndarray,
+    *,
+    iterations: int = 1000,
+    tolerance: float = 1e-8,
+    curvature: float = CURVATURE,
+    watch: Callable[[QuasiNewton], None] = lambda state: None,
+) -> QuasiNewton:
+    """Minimise from x (n,) until the largest component of the gradient is within the tolerance.
+
+    Args:
+        objective: the function and its gradient.
+        x: where to begin.
+        iterations: most iterations.
+        tolerance: largest component of the gradient that counts as zero.
+        curvature: c₂ of the line search.
+        watch: called after each iteration.
+    """
+    state = QuasiNewton.start(objective, x, curvature)
+    for _ in range(iterations):
+        if abs(state.gradient).max() <= tolerance or not state.step(objective):
+            break
+        watch(state)
+    return state

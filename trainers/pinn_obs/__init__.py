@@ -1,0 +1,205 @@
+"""PINN-Obs: a network and a gain for one record, by the paper's recipe or a fast one.
+
+Farkane, Boutayeb, Oudani & Ghogho, "PINN-Obs: Physics-Informed Neural Network-Based Observer for
+Nonlinear Dynamical Systems". Equation numbers are the paper's.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.estimator import OfflineEstimator
+from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.log import SILENT, Log
+from pinnobs_gym.record import Record
+from pinnobs_gym.system import System, vector
+from trainers.pinn_obs.config import Config
+from trainers.pinn_obs.fast import FastRun
+from trainers.pinn_obs.paper import PaperRun, Samples, loss_terms
+from trainers.pinn_obs.progress import bar, gain_figure, log_end, log_held_out, log_terms
+from trainers.pinn_obs.run import Run
+
+__all__ = ["Config", "PinnObs", "Samples", "gain_figure", "loss_terms", "train"]
+
+MIN_SAMPLES = 10
+"""The shortest record that is trained on."""
+_RUNS: dict[str, type[Run]] = {"adam": PaperRun, "ssbroyden": FastRun}
+
+
+def train(
+    system: System,
+    config: Config,
+    *,
+    record: Record,
+    noise_std: Sequence[float] | float | None = None,
+    log: Log = SILENT,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: bool = False,
+) -> Trained:
+    """Train PINN-Obs on the record of one episode.
+
+    The weights of the least training loss are kept. Ctrl-C ends it early and keeps them as well.
+    If the loss leaves the finite numbers, it begins again from the next seed, three times at most.
+    On a CPU the same seed gives the same weights.
+
+    Args:
+        system: the model.
+        config: the recipe.
+        record: the samples of one episode and the initial estimate; NaN is a missing output.
+        noise_std: standard deviation of the output noise in output units, shape (ny,) or one number
+            for all; zero if None. The paper's recipe makes no use of it.
+        log: where curves and figures go.
+        checkpoint: a file to keep the training's state in, written again as it goes on.
+        resume: go on from that file, exactly.
+        progress: show a bar with the terms of the loss in the terminal.
+
+    Raises:
+        ValueError: in one line, if the record cannot be trained on, or the checkpoint is missing,
+            damaged, or of another system, record or config (`Config` may differ in ``iterations``,
+            ``budget``, ``checkpoint_every`` and ``log_every``).
+        FloatingPointError: if the loss does not stay finite from any of four seeds.
+    """
+    _check(system, record, config)
+    if resume and checkpoint is None:
+        raise ValueError("resume=True without a checkpoint; name its file")
+    noise = vector(0.0 if noise_std is None else noise_std, system.ny, "noise_std")
+    run = _RUNS[config.optimiser](system, config, record, noise)
+    if resume and checkpoint is not None:
+        run.restore(checkpoint)
+    try:
+        with bar(config.iterations if progress else None) as show, _interruption() as stopped:
+            while not run.finished() and not (stopped and run.best):
+                _iterate(run, log, checkpoint, show if progress else None)
+        if checkpoint is not None and run.best is not None:
+            run.save(checkpoint)
+    except KeyboardInterrupt:  # amid a step: the last checkpoint stays as it is
+        if run.best is None:
+            raise
+    trained = run.result()
+    log_end(log, system, trained, run)
+    return trained
+
+
+@contextmanager
+def _interruption() -> Iterator[list[bool]]:
+    """A list that Ctrl-C puts something into, so that training ends between two iterations; a
+    second Ctrl-C ends it at once. Elsewhere than in the main thread Ctrl-C is as ever."""
+    stopped: list[bool] = []
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield stopped
+        return
+
+    def stop(number: int, frame: object) -> None:
+        if stopped:
+            raise KeyboardInterrupt
+        stopped.append(True)
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        yield stopped
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _iterate(
+    run: Run, log: Log, checkpoint: Path | None, show: Callable[[Run], None] | None
+) -> None:
+    """One iteration, and what is to be shown and kept of it."""
+    config = run.config
+    told = run.iteration % config.log_every == 0
+    if told:
+        log_held_out(log, run)
+    run.step()
+    if told:
+        log_terms(log, run)
+        if show is not None:
+            show(run)
+    if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
+        run.save(checkpoint)
+
+
+def _check(system: System, record: Record, config: Config) -> None:
+    """Whether the record can be trained on."""
+    name = type(system).__name__
+    if (np.diff(record.t.astype(config.dtype)) <= 0).any():
+        raise ValueError(
+            f"sample times from t={record.t[0]} s on are the same in {config.dtype}; subtract the"
+            " first, or use dtype float64"
+        )
+    if record.batch != 1:
+        raise ValueError(f"the record holds {record.batch} episodes; PINN-Obs is trained on one")
+    if record.num_samples < MIN_SAMPLES:
+        raise ValueError(
+            f"the record has {record.num_samples} samples; PINN-Obs needs {MIN_SAMPLES} or more"
+        )
+    sizes = (("y", record.y, system.ny), ("u", record.u, system.nu))
+    for symbol, array, size in (*sizes, ("xhat0", record.prior.mean, system.nx)):
+        if array.shape[-1] != size:
+            raise ValueError(f"{symbol} has {array.shape[-1]} columns; {name} has n={size}")
+    y = record.y[0]
+    if np.isinf(y).any():
+        raise ValueError(
+            f"y holds infinite numbers; {name} needs finite ones, or NaN where missing"
+        )
+    there = [column[~np.isnan(column)] for column in y.T]
+    if not any(len(column) and np.ptp(column) > 0 for column in there):
+        raise ValueError(f"y of {name} does not vary over the record; there is nothing to learn")
+
+
+@dataclass(frozen=True)
+class PinnObs(OfflineEstimator):
+    """PINN-Obs trained anew on every record it is given, and its network's x̂(t)."""
+
+    config: Config = field(default_factory=Config)
+    """The recipe; its seed is that of every row."""
+    folder: Path | None = field(default=None, repr=False)
+    """Where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained network; None
+    keeps nothing."""
+
+    name = "pinn_obs"
+    trains_on_record = "pinn_obs"
+
+    @property
+    def training(self) -> dict[str, Any]:
+        facts = {"trainer": "pinn_obs", "seed": self.config.seed, "per_record": True}
+        return {**facts, "config": asdict(self.config)}
+
+    def fit(self, record: Record) -> list[Trained]:
+        """Train on each row of the record; see `train`."""
+        return [self._fit_row(record, i) for i in range(record.batch)]
+
+    def estimate(self, record: Record) -> np.ndarray:
+        return np.stack([trained.xhat(record.t) for trained in self.fit(record)])
+
+    @property
+    def _told_noise(self) -> Sequence[float] | float:
+        benchmark = self.system.setups["benchmark"].noise_std
+        return benchmark if self.noise_std is None else self.noise_std
+
+    def _fit_row(self, record: Record, i: int) -> Trained:
+        row = record.rows(slice(i, i + 1))
+        told = self._told_noise
+        if self.folder is None:
+            return train(self.system, self.config, record=row, noise_std=told)
+        folder = self.folder / f"row-{i}"
+        with Log(folder) as log:
+            trained = train(
+                self.system,
+                self.config,
+                record=row,
+                noise_std=told,
+                log=log,
+                checkpoint=folder / "checkpoint.pt",
+            )
+        trained.save(folder / "trained.pt")
+        return trained

@@ -1,0 +1,132 @@
+"""The settings of the trainer of PINN-Obs, in two presets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal, TypeAlias, get_args
+
+from pinnobs_gym.network import Activation, Architecture, Precision
+
+Preset: TypeAlias = Literal["fast", "paper"]
+
+PRESETS = MappingProxyType(
+    {
+        "fast": {
+            "depth": 3,
+            "optimiser": "ssbroyden",
+            "iterations": 3000,
+            "patience": 300,
+            "improvement": 0.02,
+            "train_fraction": 1.0,
+            "points": 300,
+            "gain_penalty": 1e-5,
+            "dtype": "float64",
+            "checkpoint_every": 200,
+            "log_every": 20,
+        },
+        "paper": {
+            "depth": 9,
+            "optimiser": "adam",
+            "iterations": 200_000,
+            "patience": 20_000,
+            "improvement": 0.0,
+            "train_fraction": 0.6,
+            "points": 0,
+            "gain_penalty": 0.0,
+            "dtype": "float32",
+            "checkpoint_every": 1000,
+            "log_every": 100,
+        },
+    }
+)
+"""The settings in which the presets differ. Those of ``paper`` are from the paper's "Ablation
+studies"."""
+
+_PRESET: Any = None  # stands for what the preset says, which `Config` puts in its place
+
+
+@dataclass(frozen=True)
+class Config:
+    """The recipe of PINN-Obs.
+
+    Settings that are not given are those of the preset: ``Config("paper", width=30)``. To change
+    the preset of a config that is there, make a new one: its other settings are no longer open.
+    """
+
+    preset: Preset = "fast"
+    """Where the other settings come from: the paper's recipe, or a fast one."""
+    depth: int = _PRESET
+    """Number of hidden layers."""
+    width: int = 20
+    """Neurons in each hidden layer."""
+    activation: Activation = "tanh"
+    """Activation of the hidden layers."""
+    w0: float = 1.0
+    """Weight of the initial estimate in the loss."""
+    w_ode: float = 1.0
+    """Weight of the observer's equation in the loss."""
+    w_y: float = 1.0
+    """Weight of the outputs in the loss."""
+    gain_penalty: float = _PRESET
+    """Weight of the mean squared gain in the loss, in scaled units; not of Adam's."""
+    learning_rate: float = 1e-3
+    """Step of Adam; constant."""
+    optimiser: Literal["adam", "ssbroyden"] = _PRESET
+    """Method that minimises the loss: Adam in torch, on samples; or self-scaled Broyden in NumPy,
+    in scaled quantities."""
+    iterations: int = _PRESET
+    """Most iterations."""
+    patience: int = _PRESET
+    """Iterations without a lower training loss after which training stops."""
+    improvement: float = _PRESET
+    """How much lower the loss has to be for the patience to begin anew, relative to it."""
+    train_fraction: float = _PRESET
+    """Part of the samples that Adam trains on; the others only measure the held-out loss."""
+    points: int = _PRESET
+    """Most samples that self-scaled Broyden looks at, five times as many if they are noisy."""
+    dtype: Precision = _PRESET
+    """Precision."""
+    seed: int = 0
+    """What the initial weights and the training samples are drawn from."""
+    budget: float | None = None
+    """CPU seconds after which training stops, those before a resumption included."""
+    checkpoint_every: int = _PRESET
+    """Iterations from one checkpoint to the next."""
+    log_every: int = _PRESET
+    """Iterations from one point of the logged curves to the next."""
+
+    def __post_init__(self) -> None:
+        _expect(self, "preset", " or ".join(get_args(Preset)), lambda v: v in PRESETS)
+        for name, value in PRESETS[self.preset].items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        Architecture(1, 1, self.depth, self.width, self.activation, self.dtype)
+        for name in ("iterations", "patience", "checkpoint_every", "log_every"):
+            _expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
+        _expect(self, "seed", "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
+        for name in ("w0", "w_ode", "w_y", "gain_penalty"):
+            _expect(self, name, "a number of at least 0", lambda v: 0 <= v < math.inf)
+        _expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
+        _expect(self, "improvement", "a number of at least 0 and under 1", lambda v: 0 <= v < 1)
+        _expect(self, "train_fraction", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
+        _expect(self, "optimiser", "adam or ssbroyden", lambda v: v in ("adam", "ssbroyden"))
+        _expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
+        if self.optimiser == "ssbroyden":
+            _expect(self, "points", "a whole number of at least 10", lambda v: v == int(v) >= 10)
+            _expect(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
+            _expect(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
+        else:
+            _expect(self, "gain_penalty", "0 with adam", lambda v: v == 0)
+
+
+def _expect(config: Config, name: str, expected: str, fits: Callable[[Any], bool]) -> None:
+    value = getattr(config, name)
+    try:
+        good = fits(value)
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise ValueError(f"{name}={value!r}; expected {expected}")
