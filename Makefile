@@ -3,16 +3,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: leaderboard test test-slow lint benchmark clean
+.PHONY: leaderboard test lint benchmark clean
 
 leaderboard: $(VENV)/installed
 	$(BIN)/python scripts/leaderboard.py
 
 test: $(VENV)/installed-dev
 	$(BIN)/pytest -n 2
-
-test-slow: $(VENV)/installed-dev
-	$(BIN)/pytest -m slow
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
