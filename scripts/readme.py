@@ -55,8 +55,8 @@ def summary(tables: list[leaderboard.Table]) -> str:
     """A line per system and estimator: divergence, settling, NRMSE and tail."""
     date = datetime.now(UTC).date().isoformat()
     lines = [
-        f"Measured on {date} with Python {platform.python_version()} on one thread of a "
-        f"{processor()} by `make leaderboard`; medians of the episodes.",
+        f"Measured on {date} with Python {platform.python_version()}, one thread a job "
+        f"({processor()}), by `make leaderboard`; medians of the episodes.",
         "",
         "| system | condition | estimator | track | episodes | diverged % | settled s | NRMSE | "
         "tail NRMSE |",
