@@ -333,14 +333,23 @@ def test_the_frequency_of_a_real_pendulum(folder):
 def test_ctrl_c_in_training_keeps_weights_and_checkpoint(folder):
     command = [sys.executable, "-m", "pinnobs_gym.cli", "train", "pinn_obs", "--preset", "paper"]
     command += ["--system", "Academic", "--out", "tr"]
-    started = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    log = folder / "tr" / "tensorboard"
-    deadline = time.monotonic() + 60
-    while not list(log.rglob("events.*")) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    time.sleep(0.5)
-    started.send_signal(signal.SIGINT)
-    printed, _ = started.communicate(timeout=60)
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        # In a background job Ctrl-C is ignored, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as started:
+        try:
+            log = folder / "tr" / "tensorboard"
+            deadline = time.monotonic() + 60
+            while not list(log.rglob("events.*")) and time.monotonic() < deadline:
+                time.sleep(0.1)
+            time.sleep(0.5)
+            started.send_signal(signal.SIGINT)
+            printed, _ = started.communicate(timeout=60)
+        finally:
+            started.kill()
     assert started.returncode == 0
     assert "trained file: " in printed
     iterations = int(printed.partition(" after ")[2].partition(" ")[0])
