@@ -160,8 +160,8 @@ class EpisodePicture:
         if self._window is None:
             if pyplot.get_backend().lower() == "agg":
                 raise RuntimeError(
-                    "render_mode='human' needs a display and a window toolkit that matplotlib takes,"
-                    " such as PySide6; use render_mode='rgb_array' without them"
+                    "render_mode='human' needs a display and a window toolkit for matplotlib, such"
+                    " as PySide6; use render_mode='rgb_array' without them"
                 )
             height, width = image.shape[:2]
             window = pyplot.figure(figsize=(width / 100, height / 100))
