@@ -62,7 +62,8 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = _spaces(self.source.system)
         self._weights = _reward_weights(self.source.system)
         self._num_steps = self.source.setup.num_steps
-        self._k = self._num_steps
+        self._k = 0
+        self._over = True
         self._stream: Stream | None = None
         self._ahead: list[tuple[Draws, np.ndarray, np.ndarray]] = []
         self._picture: EpisodePicture | None = None
@@ -84,6 +85,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
             episode = self.source.play(draws, x0)
             self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]
         self._k = 0
+        self._over = False
         if self.render_mode is not None:
             self._picture = self._picture or EpisodePicture(self.source.system, self.render_mode)
             self._picture.begin(self.source.times, self._x, self._observations)
@@ -94,7 +96,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         k = self._k
-        if k >= self._num_steps:
+        if self._over:
             raise RuntimeError("the episode is over; call reset before step")
         estimate = np.asarray(action, dtype=float)
         x = self._x[k]
@@ -113,8 +115,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         truncated = self._k == self._num_steps
         info = {"state": self._x[self._k].copy()}
         observation = self._observations[self._k].copy()
-        if terminated:
-            self._k = self._num_steps
+        self._over = terminated or truncated
         if self.render_mode == "human":
             self.render()
         return observation, reward, terminated, truncated, info

@@ -53,11 +53,6 @@ class Log:
         if writer := self._writer():
             writer.add_figure(tag, figure, step)
 
-    def text(self, tag: str, text: str, step: int = 0) -> None:
-        """Add text, in Markdown."""
-        if writer := self._writer():
-            writer.add_text(tag, text, step)
-
     def hparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """Add the run's settings and what came of them to the HPARAMS table."""
         if writer := self._writer():

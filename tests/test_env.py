@@ -683,3 +683,20 @@ def test_conditions_take_the_benchmarks_noise_where_the_setup_has_none() -> None
 def test_unknown_arguments_list_the_known_ones() -> None:
     with pytest.raises(ValueError, match="unknown argument 'foo'; known are setup, condition, dt"):
         gymnasium.make("pinnobs/Academic-v0", foo=1)
+
+
+def test_an_episode_ended_early_is_drawn_no_further_than_it_went() -> None:
+    """The truth to come is not in the picture, and the env wants a reset."""
+    env = EstimationEnv("Academic", duration=2.0, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(np.zeros(2))
+    before = env.render()
+    _, _, terminated, _, _ = env.step(np.array([np.nan, 0.0]))
+    assert terminated
+    after = env.render()
+    assert before is not None
+    assert after is not None
+    halves = [image[:, image.shape[1] // 2 :] for image in (before, after)]
+    np.testing.assert_array_equal(*halves)  # the later part of the time axis stays empty
+    with pytest.raises(RuntimeError, match="the episode is over"):
+        env.step(np.zeros(2))

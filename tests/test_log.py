@@ -13,21 +13,18 @@ def events(folder):
     return accumulator
 
 
-def test_scalars_and_figures_and_text_can_be_read_back(tmp_path):
+def test_scalars_and_figures_can_be_read_back(tmp_path):
     figure = Figure()
     figure.subplots().plot([0, 1], [1, 0])
     with Log(tmp_path / "run") as log:
         for step in range(5):
             log.scalar("loss", 0.5**step, step)
         log.figure("states", figure, 7)
-        log.text("note", "measured *here*")
     read = events(tmp_path / "run")
     assert [(e.step, e.value) for e in read.Scalars("loss")] == [(k, 0.5**k) for k in range(5)]
     (image,) = read.Images("states")
     assert image.step == 7
     assert image.encoded_image_string.startswith(b"\x89PNG")
-    (text,) = read.Tensors("note/text_summary")
-    assert text.tensor_proto.string_val[0] == b"measured *here*"
 
 
 def test_hparams_stay_in_the_run_and_take_any_value(tmp_path):
@@ -60,7 +57,6 @@ def test_without_a_folder_nothing_happens(monkeypatch, tmp_path):
     with Log(None) as log:
         log.scalar("a", 1.0, 0)
         log.figure("b", Figure(), 0)
-        log.text("c", "d")
         log.hparams({"e": 1}, {"f": 2.0})
     assert not log.active
     assert not SILENT.active
