@@ -25,6 +25,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table as RichTable
+from threadpoolctl import threadpool_limits
 
 from pinnobs_gym import acceptance, env_id, leaderboard, rows, suite
 from pinnobs_gym.estimator import Estimator
@@ -512,6 +513,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if arguments else 2
+    _one_thread()
     sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
     name, rest = arguments[0], list(arguments[1:])
     try:
@@ -534,6 +536,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("pinnobs: stopped; what was written is kept", file=sys.stderr)
         return 130
+
+
+def _one_thread() -> None:
+    """Run numerical libraries on one thread unless OMP_NUM_THREADS says otherwise: the arrays are
+    so small that several threads mostly wait for each other."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        os.environ["OMP_NUM_THREADS"] = "1"  # for what is loaded later, torch and workers among it
+        threadpool_limits(1)
 
 
 def _train(arguments: list[str]) -> int:

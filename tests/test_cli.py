@@ -358,3 +358,20 @@ def test_ctrl_c_in_training_keeps_weights_and_checkpoint(folder):
     again = subprocess.run([*command, *resume], capture_output=True, text=True, timeout=60)
     assert again.returncode == 0, again.stderr
     assert f"after {iterations + 2} iterations" in again.stdout
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1 1"), ("2", "2 2")])
+def test_numerical_libraries_get_one_thread_unless_told_otherwise(given, expected):
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    environment |= {} if given is None else {"OMP_NUM_THREADS": given}
+    code = (
+        "from pinnobs_gym.cli import main\n"
+        "main(['systems', 'Academic'])\n"
+        "import threadpoolctl, torch\n"
+        "own = [p for p in threadpoolctl.threadpool_info() if p['user_api'] == 'blas']\n"
+        "print(torch.get_num_threads(), max(p['num_threads'] for p in own))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout.splitlines()[-1] == expected, done.stderr
