@@ -91,8 +91,9 @@ def main(
         rows_file: the leaderboard's scores.
         paper_file: the results of reproduce_paper.py.
     """
-    scored, reproduced = rows.read(rows_file), paper.read(paper_file)
-    if not scored and not reproduced:
+    scored = rows.read(rows_file)
+    section = paper.readme_section(paper.read(paper_file), TABLES.values())
+    if not scored and not section:
         print(
             f"nothing in {rows_file} or {paper_file}; run make leaderboard or reproduce_paper.py",
             file=sys.stderr,
@@ -104,8 +105,7 @@ def main(
         picture(ROOT / "docs" / "reverse_duffing.png")
         table = summary(leaderboard.tables(scored))
         text = replaced(text, "leaderboard", table, "## Leaderboard")
-    if reproduced:
-        section = paper.readme_section(reproduced, TABLES.values())
+    if section:
         text = replaced(text, "paper", section, PAPER_HEADING)
     with replacing(readme) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -141,7 +141,7 @@ def test_a_run_leaves_its_row_table_and_pictures(short, tmp_path, capsys):
     assert "| one | the paper | 0.5000 | 0.25000 |" in table
     assert f"| one | fast, to the end | {row['rmse']:.4f} |" in table
     assert "| other | the paper |" in table
-    assert "x₀ = [2.0, -1.0], x̂₀ = [1.0, 1.0], 101 samples over 2 s" in table
+    assert "100 samples over 2 s: ShortDuffing x₀ = [2, -1], x̂₀ = [1, 1]." in table
     assert "A note." in table
     assert row["processor"] in table
     assert "RMSE" in capsys.readouterr().out
@@ -162,14 +162,14 @@ def test_a_second_run_does_only_what_is_missing(short, tmp_path, monkeypatch):
 
 
 def test_a_stopped_run_goes_on_to_the_same_result(short, tmp_path, monkeypatch, capsys):
-    assert command("depth", out=tmp_path / "whole") == 0
+    assert command("depth", "--only", "one", out=tmp_path / "whole") == 0
     with monkeypatch.context() as patch:
         stop_at(patch, 36)
-        assert command("depth", out=tmp_path / "stopped") == 130
+        assert command("depth", "--only", "one", out=tmp_path / "stopped") == 130
     assert rows_in(tmp_path / "stopped") == []
     assert "stopped" in capsys.readouterr().err
     assert (tmp_path / "stopped" / "depth.md").exists()
-    assert command("depth", out=tmp_path / "stopped") == 0
+    assert command("depth", "--only", "one", out=tmp_path / "stopped") == 0
     for one, other in zip(rows_in(tmp_path / "whole"), rows_in(tmp_path / "stopped"), strict=True):
         for name in ("loss", "iterations", "best_iteration", "rmse", "replay_rmse"):
             assert one[name] == other[name], name
@@ -223,6 +223,7 @@ def test_the_readme_gets_a_section(short, tmp_path):
     assert str(tmp_path) not in text
     assert text.index(readme.PAPER_HEADING) < text.index(readme.BEFORE)
     assert text.endswith("end")
+    assert report.readme_section([], TABLES.values()) == ""
 
 
 # Bad input

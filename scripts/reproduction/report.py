@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from pinnobs_gym.rows import Row
 from pinnobs_gym.systems import SYSTEMS
 from reproduction.running import PLAYED, REPEATS, Job
@@ -21,7 +23,7 @@ HEADER = (
     "MAE",
     "replay RMSE",
     "best loss",
-    "at",
+    "found at",
     "iterations",
     "training s",
     "inference ms",
@@ -32,25 +34,29 @@ PROTOCOL = (
     f"Ours: setup `{PLAYED[0]}`, without noise. RMSE and MAE are those of the network's own x̂(t), "
     "in state units, over all samples of the record and all states, the transient included. The "
     "replay is the observer integrated with the learned L(t) over the same record, which the paper "
-    "does not score. The loss is that of the samples trained on, and “at” the iteration that found "
-    "it, to within a hundred. Training is CPU seconds of one thread; inference is the network at "
-    f"all times of the record, one thread, median of {REPEATS}.",
+    "does not score. The loss is that of the samples trained on, and “found at” the iteration that "
+    "found it, to within a hundred. Training is CPU seconds of one thread, inference the network "
+    f"at all times of the record, one thread, median of {REPEATS}.",
     "The paper's: 60 % of the samples are trained on and 40 % are for tests; it does not say which "
-    "of them its RMSE and MAE are of. Its “Conv. Iter.” stand under “at”, since some are over "
-    "180,000 with a patience of 20,000 and a limit of 200,000. Training and inference are on a "
-    "Tesla T4.",
+    "of them its RMSE and MAE are of. Its “Conv. Iter.” stand under “found at”, since some are "
+    "over 180,000 with a patience of 20,000 and a limit of 200,000. Training and inference are on "
+    "a Tesla T4.",
 )
 
 
 def starts(table: Table) -> str:
     """The records of a table: initial states and estimates, and samples."""
-    parts = []
+    parts, sizes = [], set()
     for name in dict.fromkeys(case.system for case in table.cases):
         _, setup = SYSTEMS.resolve(name).configured(PLAYED[0])
-        x0, xhat0 = (list(value) for value in (setup.x0_low, setup.xhat0))
-        samples = f"{setup.num_steps + 1:,} samples over {setup.duration:g} s"
-        parts.append(f"{name} x₀ = {x0}, x̂₀ = {xhat0}, {samples}")
-    return "Records: " + "; ".join(parts) + "."
+        x0, xhat0 = (_vector(value) for value in (setup.x0_low, setup.xhat0))
+        parts.append(f"{name} x₀ = {x0}, x̂₀ = {xhat0}")
+        sizes.add(f"{setup.num_steps:,} samples over {setup.duration:g} s")
+    return f"Records of {' or '.join(sorted(sizes))}: {'; '.join(parts)}."
+
+
+def _vector(values: Sequence[float] | float) -> str:
+    return "[" + ", ".join(f"{value:g}" for value in np.atleast_1d(values)) + "]"
 
 
 def read(path: Path) -> list[Row]:
@@ -132,7 +138,7 @@ def _printed(printed: Printed) -> tuple[str, ...]:
         return "" if value is None else format(value, form)
 
     return (
-        shown(printed.rmse, ".4f"),
+        "" if printed.rmse is None else _error(printed.rmse),
         shown(printed.mae, ".5f"),
         "",
         shown(printed.loss, ".2e"),
@@ -141,6 +147,13 @@ def _printed(printed: Printed) -> tuple[str, ...]:
         shown(printed.seconds, ".0f"),
         shown(printed.inference_ms, ".2f"),
     )
+
+
+def _error(value: float) -> str:
+    """An RMSE in the paper's digits."""
+    if not math.isfinite(value):
+        return "diverges"
+    return format(value, ".5f" if value < 0.01 else ".4f" if value < 10 else ".4g")
 
 
 def _recipe(row: Row) -> str:
@@ -156,11 +169,10 @@ def _is_cut(row: Row) -> bool:
 
 
 def _measured(row: Row) -> tuple[str, ...]:
-    replay = row["replay_rmse"]
     return (
-        f"{row['rmse']:.4f}",
+        _error(row["rmse"]),
         f"{row['mae']:.5f}",
-        f"{replay:.4f}" if replay < 1e2 else "diverges",
+        _error(row["replay_rmse"]),
         f"{row['loss']:.2e}",
         f"{row['best_iteration']:,}",
         f"{row['iterations']:,}",
@@ -186,21 +198,20 @@ def markdown(table: Table, rows: Sequence[Row]) -> str:
 
 
 def readme_section(rows: Sequence[Row], tables: Iterable[Table]) -> str:
-    """The tables that have results, each case with its longest training."""
-    chosen = longest(rows)
-    parts = [
-        "`python scripts/reproduce_paper.py depth` (`activation`, `weights`, `examples`) makes the "
-        f"paper's tables anew. {measured_on(chosen)}",
-    ]
+    """The tables that have results of the recipes as they are now, each case with its longest
+    training; nothing if there are none."""
+    parts, used = [], []
     for table in tables:
-        if any(of_case(case, chosen) for case in table.cases):
-            parts += [
-                f"**{table.title}**",
-                markdown(replace(table, cases=done(table, chosen)), chosen),
-            ]
-    return "\n\n".join([*parts, *PROTOCOL])
-
-
-def done(table: Table, rows: Sequence[Row]) -> tuple[Case, ...]:
-    """The cases of a table that have rows."""
-    return tuple(case for case in table.cases if of_case(case, rows))
+        found = {case: longest(of_case(case, rows)) for case in table.cases}
+        shown = [row for chosen in found.values() for row in chosen]
+        if shown:
+            with_rows = tuple(case for case, chosen in found.items() if chosen)
+            parts += [f"**{table.title}**", markdown(replace(table, cases=with_rows), shown)]
+            used += shown
+    if not used:
+        return ""
+    made = (
+        "`python scripts/reproduce_paper.py depth` (`activation`, `weights`, `examples`) makes the "
+        f"paper's tables anew. {measured_on(used)}"
+    )
+    return "\n\n".join([made, *parts, *PROTOCOL])
