@@ -18,7 +18,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import joblib
 import tyro
@@ -42,12 +42,12 @@ console = Console() if Console().is_terminal else Console(width=150)
 class Options:
     """Make one of the paper's tables anew, its figures beside ours."""
 
-    table: Annotated[Literal["depth", "activation", "weights", "examples"], tyro.conf.Positional]
-    """Which table; examples are the six systems."""
-    preset: Literal["fast", "paper"] = "fast"
-    """Recipe: a fast one, or the paper's."""
-    budget: float | None = 120.0
-    """CPU seconds that each training is given; None trains to the recipe's end."""
+    table: Annotated[str, tyro.conf.Positional]
+    """depth, activation, weights, or examples, which are the six systems."""
+    preset: str = "fast"
+    """Recipe: fast, or the paper's own, paper."""
+    budget: str = "120"
+    """CPU seconds that each training is given; none trains to the recipe's end."""
     seed: int = 0
     """Seed of the first weights."""
     jobs: int = 2
@@ -63,6 +63,8 @@ class Options:
         Raises:
             ValueError: in one line, for a case or setting that cannot be.
         """
+        if self.table not in TABLES:
+            raise ValueError(f"unknown table {self.table!r}; known are {', '.join(TABLES)}")
         cases = {case.name: case for case in TABLES[self.table].cases}
         for name in self.only:
             if name not in cases:
@@ -70,9 +72,18 @@ class Options:
                 raise ValueError(f"unknown case {name!r} of {self.table}; known are {known}")
         if self.jobs < 1:
             raise ValueError(f"jobs={self.jobs}; expected at least 1")
-        free: dict[str, Any] = {"preset": self.preset, "seed": self.seed, "budget": self.budget}
+        free: dict[str, Any] = {"preset": self.preset, "seed": self.seed, "budget": None}
+        if self.budget != "none":
+            free["budget"] = _number(self.budget)
         names = self.only or cases
         return [Job(cases[n], Config(**free, **cases[n].settings), self.out) for n in names]
+
+
+def _number(budget: str) -> float:
+    try:
+        return float(budget)
+    except ValueError:
+        raise ValueError(f"budget={budget!r}; expected CPU seconds or none") from None
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Row | str]]:

@@ -155,7 +155,7 @@ def test_a_second_run_does_only_what_is_missing(short, tmp_path, monkeypatch):
     assert command("depth", out=tmp_path) == 0
     assert [config.width for config in trained] == [4, 5]
     assert command("weights", out=tmp_path) == 0  # the same cases
-    assert command("depth", "--budget", "None", out=tmp_path) == 0  # they had come to their end
+    assert command("depth", "--budget", "none", out=tmp_path) == 0  # they had come to their end
     assert len(trained) == len(rows_in(tmp_path)) == 2
     assert command("depth", "--only", "one", "--seed", "1", out=tmp_path) == 0
     assert len(trained) == 3
@@ -184,7 +184,7 @@ def test_a_larger_budget_goes_on_from_a_smaller_one(short, tmp_path, monkeypatch
         return train(*arguments, **options)
 
     monkeypatch.setattr(running, "train", noted)
-    for budget in ("1e-6", "2e-6", "None"):
+    for budget in ("1e-6", "2e-6", "none"):
         assert command("depth", "--only", "one", "--budget", budget, out=tmp_path) == 0
     rows = rows_in(tmp_path)
     assert begun == [False, True, True]
@@ -234,6 +234,10 @@ def test_the_readme_gets_a_section(short, tmp_path):
     [
         (["depth", "--only", "9x21"], "unknown case '9x21' of depth; known are 15x30, 15x20"),
         (["weights", "--only", "8"], "unknown case '8' of weights; known are 1, 2"),
+        (["width"], "unknown table 'width'; known are depth, activation, weights, examples"),
+        (["depth", "--preset", "slow"], "preset='slow'; expected fast or paper"),
+        (["depth", "--budget", "long"], "budget='long'; expected CPU seconds or none"),
+        (["depth", "--budget", "nan"], "budget=nan; expected None or positive seconds"),
         (["depth", "--budget", "-1"], "budget=-1.0; expected None or positive seconds"),
         (["depth", "--seed", "-1"], "seed=-1; expected a whole number of at least 0"),
         (["depth", "--jobs", "0"], "jobs=0; expected at least 1"),

@@ -36,6 +36,7 @@ def readable_gain_figure(trained: Trained) -> Figure:
     figure = gain_figure(trained.t, L)
     for i, panel in enumerate(figure.axes):
         sizes = abs(L[:, i])
+        panel.legend(loc="best", fontsize=8)
         usual = float(np.quantile(sizes, 0.95))
         if 0 < 10 * usual < sizes.max():
             panel.set_yscale("symlog", linthresh=10 ** math.ceil(math.log10(usual)))
