@@ -1,6 +1,9 @@
-"""Make the README's picture and table from stored scores.
+"""Make the README's picture and tables from stored scores.
 
-python scripts/readme.py [--rows runs/leaderboard/rows.jsonl]
+    python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
+        [--paper-file runs/paper/results.jsonl]
+
+What has no stored scores stays as it is.
 """
 
 from __future__ import annotations
@@ -12,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from machine import processor
+from reproduction import report as paper
+from reproduction.tables import TABLES
 
 from pinnobs_gym import leaderboard, rows
 from pinnobs_gym.episodes import EpisodeSource, Stream
@@ -20,7 +26,10 @@ from pinnobs_gym.figures import state_figure
 from pinnobs_gym.report import replacing, write_figure
 
 ROOT = Path(__file__).parents[1]
-START, END = "<!-- leaderboard: written by scripts/readme.py -->", "<!-- end -->"
+END = "<!-- end -->"
+PAPER_HEADING = "## The paper's figures"
+BEFORE = "## Development"
+"""The heading before which a section goes that is not there yet."""
 
 
 def picture(path: Path, seed: int = 3) -> None:
@@ -42,15 +51,6 @@ def picture(path: Path, seed: int = 3) -> None:
     write_figure(path, figure)
 
 
-def processor() -> str:
-    """What the machine calls its processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
 def summary(tables: list[leaderboard.Table]) -> str:
     """A line per system and estimator: divergence, settling, NRMSE and tail."""
     date = datetime.now(UTC).date().isoformat()
@@ -70,24 +70,45 @@ def summary(tables: list[leaderboard.Table]) -> str:
     return "\n".join(lines)
 
 
-def main(rows_file: Path = ROOT / "runs/leaderboard/rows.jsonl") -> int:
-    """Rewrite the picture and the table.
+def replaced(text: str, name: str, content: str, heading: str) -> str:
+    """The text with the content between the marks of that name; under the heading, before that of
+    development, if they are not there yet."""
+    start = f"<!-- {name}: written by scripts/readme.py -->"
+    if start not in text:
+        text = text.replace(BEFORE, f"{heading}\n\n{start}\n{END}\n\n{BEFORE}", 1)
+    before, _, rest = text.partition(start)
+    after = rest.partition(END)[2]
+    return f"{before}{start}\n\n{content}\n\n{END}{after}"
+
+
+def main(
+    rows_file: Path = ROOT / "runs/leaderboard/rows.jsonl",
+    paper_file: Path = ROOT / "runs/paper/results.jsonl",
+) -> int:
+    """Rewrite the picture and the tables.
 
     Args:
-        rows_file: the scores.
+        rows_file: the leaderboard's scores.
+        paper_file: the results of reproduce_paper.py.
     """
     scored = rows.read(rows_file)
-    if not scored:
-        print(f"no rows in {rows_file}; run make leaderboard first", file=sys.stderr)
+    section = paper.readme_section(paper.read(paper_file), TABLES.values())
+    if not scored and not section:
+        print(
+            f"nothing in {rows_file} or {paper_file}; run make leaderboard or reproduce_paper.py",
+            file=sys.stderr,
+        )
         return 2
-    picture(ROOT / "docs" / "reverse_duffing.png")
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    before, _, rest = text.partition(START)
-    after = rest.partition(END)[2]
-    table = summary(leaderboard.tables(scored))
+    if scored:
+        picture(ROOT / "docs" / "reverse_duffing.png")
+        table = summary(leaderboard.tables(scored))
+        text = replaced(text, "leaderboard", table, "## Leaderboard")
+    if section:
+        text = replaced(text, "paper", section, PAPER_HEADING)
     with replacing(readme) as temporary:
-        temporary.write_text(f"{before}{START}\n\n{table}\n\n{END}{after}", encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -1,0 +1,175 @@
+"""Make the paper's tables and examples anew, its figures beside ours.
+
+    python scripts/reproduce_paper.py depth | activation | weights | examples
+
+Each case is trained once and kept, whichever table asks for it: what is there is not run again, and
+a training that was stopped, or that is given a larger budget, goes on from its checkpoint. Results
+are lines of ``results.jsonl`` in the folder, beside a Markdown file of each table and a folder of
+each training with its pictures, its TensorBoard log and the trained file.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import joblib
+import tyro
+from reproduction import report
+from reproduction.running import Job, run
+from reproduction.tables import TABLES, Table
+from rich import box
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table as RichTable
+
+from pinnobs_gym.cli import check_writable
+from pinnobs_gym.report import replacing
+from pinnobs_gym.rows import Row, append
+from trainers.pinn_obs import Config
+
+console = Console() if Console().is_terminal else Console(width=150)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make one of the paper's tables anew, its figures beside ours."""
+
+    table: Annotated[str, tyro.conf.Positional]
+    """depth, activation, weights, or examples, which are the six systems."""
+    preset: str = "fast"
+    """Recipe: fast, or the paper's own, paper."""
+    budget: str = "120"
+    """CPU seconds that each training is given; none trains to the recipe's end."""
+    seed: int = 0
+    """Seed of the first weights."""
+    jobs: int = 2
+    """Trainings at a time, one thread each."""
+    only: tuple[str, ...] = ()
+    """Names of cases, such as 9x20; all if none is named."""
+    out: Path = Path("runs/paper")
+    """Folder of results."""
+
+    def chosen(self) -> list[Job]:
+        """The jobs asked for.
+
+        Raises:
+            ValueError: in one line, for a case or setting that cannot be.
+        """
+        if self.table not in TABLES:
+            raise ValueError(f"unknown table {self.table!r}; known are {', '.join(TABLES)}")
+        cases = {case.name: case for case in TABLES[self.table].cases}
+        for name in self.only:
+            if name not in cases:
+                known = ", ".join(cases)
+                raise ValueError(f"unknown case {name!r} of {self.table}; known are {known}")
+        if self.jobs < 1:
+            raise ValueError(f"jobs={self.jobs}; expected at least 1")
+        free: dict[str, Any] = {"preset": self.preset, "seed": self.seed, "budget": None}
+        if self.budget != "none":
+            free["budget"] = _number(self.budget)
+        names = self.only or cases
+        return [Job(cases[n], Config(**free, **cases[n].settings), self.out) for n in names]
+
+
+def _number(budget: str) -> float:
+    try:
+        return float(budget)
+    except ValueError:
+        raise ValueError(f"budget={budget!r}; expected CPU seconds or none") from None
+
+
+def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Row | str]]:
+    """Run jobs, one thread each, and yield each as it ends with its row or what went wrong. A
+    single one shows its own progress."""
+    if len(jobs) == 1 or processes == 1:
+        for job in jobs:
+            yield _attempt(job, progress=len(jobs) == 1)
+        return
+    with joblib.parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
+        parallel: Any = joblib.Parallel(return_as="generator_unordered")
+        yield from parallel(joblib.delayed(_attempt)(job) for job in jobs)
+
+
+def _attempt(job: Job, progress: bool = False) -> tuple[Job, Row | str]:
+    try:
+        return job, run(job, progress)
+    except Exception as error:
+        return job, f"{type(error).__name__}: {error}"
+
+
+def work(jobs: Sequence[Job], processes: int, results: Path) -> int:
+    """Run jobs, keep the row of each as it ends, and say so; returns how many failed."""
+    failed = 0
+    columns = (SpinnerColumn(), TextColumn("cases"), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=len(jobs) == 1) as bar:
+        task = bar.add_task("", total=len(jobs))
+        for job, found in run_jobs(jobs, processes):
+            if isinstance(found, str):
+                failed += 1
+                console.print(f"{job.case.name} failed: {found}", style="red", markup=False)
+            else:
+                append(results, [found])
+                figures = f"RMSE {found['rmse']:.4g}, loss {found['loss']:.3g}"
+                console.print(
+                    f"{job.case.name}: {figures}, {found['seconds']:.0f} CPU s; {job.folder}"
+                )
+            bar.advance(task)
+    return failed
+
+
+def show(table: Table, rows: Sequence[Row], path: Path) -> None:
+    """Print a table and write it as Markdown."""
+    shown = RichTable(title=table.title, title_justify="left", box=box.SIMPLE)
+    for i, name in enumerate(report.HEADER):
+        shown.add_column(name, justify="left" if i < 2 else "right")
+    for line in report.lines(table, rows):
+        shown.add_row(*line)
+    console.print(shown)
+    notes = [*table.notes, report.starts(table), *report.PROTOCOL]
+    for note in notes:
+        console.print(note, style="dim", markup=False, highlight=False)
+    parts = [f"# {table.title}", report.markdown(table, rows), *report.PROTOCOL]
+    if rows:
+        parts.append(report.measured_on(rows))
+    with replacing(path) as temporary:
+        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    console.print(f"table: {path}", soft_wrap=True)
+
+
+def reproduce(options: Options) -> int:
+    """Run what is missing and show the table; returns the exit status."""
+    jobs, results = options.chosen(), options.out / "results.jsonl"
+    check_writable(options.out)
+    known = report.read(results)
+    missing = [job for job in jobs if not report.is_done(job, known)]
+    if len(missing) < len(jobs):
+        console.print(f"{len(jobs) - len(missing)} of {len(jobs)} cases are there already")
+    status = 0
+    try:
+        status = int(bool(missing) and work(missing, options.jobs, results) > 0)
+    except KeyboardInterrupt:
+        print("stopped; run again to go on", file=sys.stderr)
+        status = 130
+    show(TABLES[options.table], report.read(results), options.out / f"{options.table}.md")
+    return status
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status: 0, 1 if a case failed, 2 for bad input."""
+    try:
+        return reproduce(tyro.cli(Options, args=arguments))
+    except ValueError as error:
+        print(f"reproduce_paper: error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""Pictures of a training, from those of the package and the trainer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.figures import state_figure
+from pinnobs_gym.system import System
+from trainers.pinn_obs import gain_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def estimates_figure(system: System, example: Mapping[str, Any], title: str) -> Figure:
+    """True states and estimates (see `state_figure`), the legend above instead of on the curves."""
+    figure = state_figure(system, title=title, **example)
+    top = figure.axes[0]
+    legend = top.get_legend()
+    assert legend is not None
+    legend.remove()
+    handles, labels = top.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8)
+    return figure
+
+
+def readable_gain_figure(trained: Trained) -> Figure:
+    """The learned gains over the record; those over ten times a state's usual gain, as right after
+    t₀, are on a logarithmic scale."""
+    L = trained.gain(trained.t)
+    figure = gain_figure(trained.t, L)
+    for i, panel in enumerate(figure.axes):
+        sizes = abs(L[:, i])
+        panel.legend(loc="best", fontsize=8)
+        usual = float(np.quantile(sizes, 0.95))
+        if 0 < 10 * usual < sizes.max():
+            panel.set_yscale("symlog", linthresh=10 ** math.ceil(math.log10(usual)))
+    figure.axes[0].set_title(f"{trained.system}: learned gain", fontsize=10)
+    return figure
+
+
+def loss_figure(curve: np.ndarray, title: str) -> Figure:
+    """The least loss over iterations, from points (num_points, 2)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    panel = figure.subplots()
+    panel.semilogy(curve[:, 0], curve[:, 1], lw=1.3)
+    panel.set_title(title, fontsize=10)
+    panel.set_xlabel("iteration")
+    panel.set_ylabel("least loss so far")
+    panel.grid(alpha=0.3)
+    return figure

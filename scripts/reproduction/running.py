@@ -1,0 +1,210 @@
+"""Running one case: train, keep what came of it, and measure."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import torch
+from machine import processor
+
+from pinnobs_gym import env_id
+from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, Trained
+from pinnobs_gym.evaluation import canonical, score_batch, versions
+from pinnobs_gym.log import Log
+from pinnobs_gym.report import write_figure
+from pinnobs_gym.rows import Row
+from pinnobs_gym.suite import record_of
+from pinnobs_gym.system import System
+from reproduction.figures import estimates_figure, loss_figure, readable_gain_figure
+from reproduction.tables import Case
+from trainers.pinn_obs import Config, train
+
+PLAYED = ("paper", "nominal", 0)
+"""Setup, condition and seed of the episode."""
+REPEATS = 20
+"""How often inference is timed; the median counts."""
+CHECKPOINT = "checkpoint.pt"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A case and how it is to be trained."""
+
+    case: Case
+    config: Config
+    out: Path
+    """Folder under which all goes."""
+
+    @property
+    def key(self) -> str:
+        """What decides the result: two jobs of one key are the same."""
+        return _digest(self.case, self.config)
+
+    @property
+    def folder(self) -> Path:
+        """Where this budget's checkpoint, curves and pictures go."""
+        budget = self.config.budget
+        return self._training / ("to-the-end" if budget is None else f"budget-{budget:g}")
+
+    @property
+    def _training(self) -> Path:
+        """The folder of all budgets of this training, of which a larger one goes on from a smaller
+        one's checkpoint."""
+        config = self.config
+        network = f"{config.depth}x{config.width}-{config.activation}"
+        digest = _digest(self.case, replace(config, budget=None))
+        return self.out / f"{self.case.system}-{config.preset}-{network}-{digest}"
+
+    def prepare(self) -> bool:
+        """Make the folder; returns whether it has a checkpoint to go on from, its own or that of
+        the largest smaller budget."""
+        if (self.folder / CHECKPOINT).exists():
+            return True
+        shutil.rmtree(self.folder, ignore_errors=True)  # stopped before the first checkpoint
+        own = math.inf if self.config.budget is None else self.config.budget
+        earlier = {
+            float(path.parent.name.removeprefix("budget-")): path.parent
+            for path in self._training.glob(f"budget-*/{CHECKPOINT}")
+        }
+        smaller = [budget for budget in earlier if budget < own]
+        if smaller:
+            part = self._training / f"part-{os.getpid()}"
+            shutil.copytree(earlier[max(smaller)], part, dirs_exist_ok=True)
+            part.rename(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return bool(smaller)
+
+
+def _digest(case: Case, config: Config) -> str:
+    kind = f"{Config.__module__}.{Config.__qualname__}"
+    decides = {"system": case.system, "played": PLAYED, kind: config}
+    text = json.dumps(canonical(decides), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def run(job: Job, progress: bool = False) -> Row:
+    """Train a case, going on from its checkpoint if there is one, draw its pictures, and measure.
+
+    Returns:
+        A row: ``key``, ``case``, ``system``, ``config``; ``loss``, ``iterations`` made and that of
+        the best loss, ``best_iteration``, to within ``log_every``; training CPU ``seconds``;
+        ``inference_ms``; ``rmse`` and ``mae`` of the network, ``replay_rmse`` and ``replay_mae`` of
+        the observer with its gain, over the whole record in state units; ``date``, ``processor``
+        and ``versions``.
+
+    Raises:
+        KeyboardInterrupt: on Ctrl-C; the last checkpoint stays.
+    """
+    torch.set_num_threads(1)
+    name = env_id(job.case.system)
+    system, setup, record = record_of(name, *PLAYED)
+    checkpoint, resume = job.folder / CHECKPOINT, job.prepare()
+    with _stopping() as check, Log(job.folder / "tensorboard") as log:
+        trained = train(
+            system,
+            job.config,
+            record=record,
+            noise_std=setup.noise_std,
+            log=log,
+            checkpoint=checkpoint,
+            resume=resume,
+            progress=progress,
+        )
+        check()
+    trained.save(job.folder / "trained.pt")
+    scores, curve = _scores(job, system, trained), loss_curve(job.folder / "tensorboard")
+    write_figure(job.folder / "gain.png", readable_gain_figure(trained))
+    write_figure(job.folder / "loss.png", loss_figure(curve, f"{trained.system}: as minimised"))
+    budget = job.config.budget
+    if budget is None or trained.seconds < budget:  # nothing could go on from it
+        checkpoint.unlink(missing_ok=True)
+    return {
+        "key": job.key,
+        "case": job.case.name,
+        "system": job.case.system,
+        "config": asdict(job.config),
+        "loss": trained.loss,
+        "iterations": trained.iterations,
+        "best_iteration": int(curve[np.argmin(curve[:, 1]), 0]),
+        "seconds": trained.seconds,
+        "inference_ms": inference_ms(trained),
+        **scores,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": processor(),
+        "versions": versions(),
+    }
+
+
+@contextmanager
+def _stopping() -> Iterator[Callable[[], None]]:
+    """A function that raises KeyboardInterrupt if Ctrl-C came within: `train` ends as though it
+    were done, but a training cut short is no result. Elsewhere than in the main thread, nothing."""
+    stopped: list[bool] = []
+
+    def stop(number: int, frame: object) -> None:
+        stopped.append(True)
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if stopped:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _scores(job: Job, system: System, trained: Trained) -> dict[str, float]:
+    """The scores of the network and of its replay, each with a picture."""
+    found: dict[str, float] = {}
+    for prefix, picture, cls in (
+        ("", "states", PinnObsDirect),
+        ("replay_", "replay", PinnObsReplay),
+    ):
+        setup, condition, seed = PLAYED
+        estimator = cls.of(system, trained)
+        (row,), example = score_batch(estimator, env_id(job.case.system), setup, condition, [seed])
+        found |= {f"{prefix}{name}": row[name] for name in ("rmse", "mae")}
+        rmse = f"RMSE {row['rmse']:.3g}" if math.isfinite(row["rmse"]) else "diverges"
+        figure = estimates_figure(system, example, f"{job.case.system}, {cls.name}: {rmse}")
+        write_figure(job.folder / f"{picture}.png", figure)
+    return found
+
+
+def inference_ms(trained: Trained) -> float:
+    """Median time in ms to evaluate the network at all times of the record, one thread."""
+    taken = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        trained.xhat(trained.t)
+        taken.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(taken))
+
+
+def loss_curve(folder: Path) -> np.ndarray:
+    """Iterations and the least loss by then, shape (num_points, 2), from a TensorBoard log."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    # A training that went on from a checkpoint repeats some iterations.
+    points = {event.step: event.value for event in events.Scalars("loss/best")}
+    return np.array(sorted(points.items()), dtype=float)
