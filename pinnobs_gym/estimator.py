@@ -156,11 +156,8 @@ class OfflineEstimator(Estimator):
     track = "offline"
 
     @abstractmethod
-    def estimate(self, record: Record) -> np.ndarray:
-        """x̂ at every sample, shape (batch, num_samples, nx)."""
-
     def run(self, record: Record) -> Estimates:
-        return Estimates(self.estimate(record))
+        """The estimates over whole records."""
 
     def reset(self, prior: Prior) -> State:
         raise TypeError(f"{type(self).__name__} is offline: it takes whole records; call run")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, TypeAlias, get_args
 
+import numpy as np
 import torch
 from array_api_compat import array_namespace
 from torch import Tensor, nn
@@ -19,25 +20,27 @@ Precision: TypeAlias = Literal["float32", "float64"]
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
-def _tanh(z: Tensor) -> tuple[Tensor, Tensor]:
-    value = torch.tanh(z)
+def _tanh(z: Array) -> tuple[Array, Array]:
+    value = array_namespace(z).tanh(z)
     return value, 1 - value * value
 
 
-def _sine(z: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.sin(z), torch.cos(z)
+def _sine(z: Array) -> tuple[Array, Array]:
+    xp = array_namespace(z)
+    return xp.sin(z), xp.cos(z)
 
 
-def _sigmoid(z: Tensor) -> tuple[Tensor, Tensor]:
-    value = torch.sigmoid(z)
+def _sigmoid(z: Array) -> tuple[Array, Array]:
+    value = 0.5 + 0.5 * array_namespace(z).tanh(0.5 * z)
     return value, value * (1 - value)
 
 
-def _relu(z: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.relu(z), (z > 0).to(z.dtype)
+def _relu(z: Array) -> tuple[Array, Array]:
+    slope = array_namespace(z).astype(z > 0, z.dtype)
+    return z * slope, slope
 
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
+_ACTIVATIONS: dict[str, Callable[[Array], tuple[Array, Array]]] = {
     "tanh": _tanh,
     "sine": _sine,
     "sigmoid": _sigmoid,
@@ -182,3 +185,29 @@ class Network(nn.Module):
         if self._scale is not None:
             out = out * self._scale
         return out[..., :nx], out[..., nx:].unflatten(-1, (nx, ny))
+
+
+Layers: TypeAlias = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Weights (fan_out, fan_in) and biases (fan_out,) of each layer, in float64."""
+
+
+def layers_of(network: Network) -> Layers:
+    """A copy of the network's weights for `evaluate`."""
+    pairs = zip(network.weights, network.biases, strict=True)
+    return [(W.detach().double().numpy(), b.detach().double().numpy()) for W, b in pairs]
+
+
+def evaluate(
+    architecture: Architecture, layers: Layers, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `Network.forward` returns, in NumPy and float64: for few times far faster than torch."""
+    activation = _ACTIVATIONS[architecture.activation]
+    a, _ = architecture.features(np.asarray(t, dtype=float))
+    *hidden, (weight, bias) = layers
+    for W, b in hidden:
+        a, _ = activation(a @ W.T + b)
+    out = a @ weight.T + bias
+    if architecture.scale is not None:
+        out *= architecture.scale
+    nx, ny = architecture.nx, architecture.ny
+    return out[..., :nx], out[..., nx:].reshape(*out.shape[:-1], nx, ny)

@@ -327,12 +327,19 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def substeps(
-    system: System, t0: float, t1: float, x: Array, u0: Array | None, u1: Array | None
+    system: System,
+    t0: float,
+    t1: float,
+    x: Array,
+    u0: Array | None,
+    u1: Array | None,
+    longest: float = np.inf,
 ) -> Iterator[tuple[Array, float, Array]]:
     """Yield, for each Runge-Kutta step of `model_step` from t0 to t1, the three times (s) at which
-    f is evaluated, the step, and the inputs at these times, (3, ..., nu)."""
+    f is evaluated, the step, and the inputs at these times, (3, ..., nu). No step is over
+    ``longest`` (s)."""
     xp = array_namespace(x)
-    longest = system.model_step or system.setups["benchmark"].dt
+    longest = min(longest, system.model_step or system.setups["benchmark"].dt)
     count = max(1, int(np.ceil((t1 - t0) / longest - 1e-6)))
     step = (t1 - t0) / count
     for k in range(count):

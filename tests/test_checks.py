@@ -367,15 +367,15 @@ class Mutable(EKF):
 class Offline(OfflineEstimator):
     """A sound one: the first output as the estimate of all states."""
 
-    def estimate(self, record: Record) -> np.ndarray:
+    def run(self, record: Record) -> Estimates:
         nx = self.system.nx
-        return np.repeat(np.nan_to_num(record.y[..., :1]), nx, axis=-1)
+        return Estimates(np.repeat(np.nan_to_num(record.y[..., :1]), nx, axis=-1))
 
 
 @dataclass(frozen=True)
 class OfflineCoupled(Offline):
-    def estimate(self, record: Record) -> np.ndarray:
-        return super().estimate(record) - record.y.mean()
+    def run(self, record: Record) -> Estimates:
+        return Estimates(super().run(record).xhat - record.y.mean())
 
 
 class CopiesOutput:

@@ -20,8 +20,8 @@ from pinnobs_gym.suite import record_of
 from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import Config, PinnObs, train
 from trainers.pinn_obs.config import PRESETS
-from trainers.pinn_obs.fast import fast_frequencies, points_of
-from trainers.pinn_obs.objective import Objective, Weights
+from trainers.pinn_obs.objective import Lead, Objective, Weights
+from trainers.pinn_obs.points import fast_frequencies, points_of
 
 SMALL = Config(depth=2, width=8, iterations=60, log_every=10)
 
@@ -31,7 +31,7 @@ def strung(network):
     return torch.cat([p.flatten() for pair in pairs for p in pair]).detach().numpy()
 
 
-def by_autograd(network, system, points, weights):
+def by_autograd(network, system, points, weights, lead):
     """The loss of `Objective` in torch, its gradient and the time derivative by autograd."""
     t, y, u, there = (torch.tensor(getattr(points, n)) for n in ("t", "y", "u", "there"))
     t.requires_grad_()
@@ -41,11 +41,12 @@ def by_autograd(network, system, points, weights):
     innovation = (y - system.h(xhat)) * there
     residual = torch.stack(rate, -1) - system.f(t, xhat, u) - (L @ innovation[..., None])[..., 0]
     initial = xhat[0] - torch.tensor(points.xhat0)
-    w = {n: torch.tensor(getattr(weights, n)) for n in ("initial", "equation", "output", "gain")}
+    w = {n: torch.tensor(getattr(weights, n)) for n in ("initial", "equation", "output")}
     q = torch.tensor(points.equation)
     loss = (w["initial"] * initial**2).sum() + (q[:, None] * w["equation"] * residual**2).sum()
     loss = loss + (torch.tensor(points.output) * w["output"] * innovation**2).sum()
-    loss = loss + (q[:, None, None] * w["gain"] * L**2).sum()
+    loss = loss + (torch.tensor(lead.by_L) * (L - torch.tensor(lead.L)) ** 2).sum()
+    loss = loss + (torch.tensor(lead.by_xhat) * (xhat - torch.tensor(lead.xhat)) ** 2).sum()
     loss.backward()
     pairs = zip(network.weights, network.biases, strict=True)
     return loss.item(), torch.cat([p.grad.flatten() for pair in pairs for p in pair]).numpy()
@@ -56,8 +57,10 @@ def test_the_gradient_by_hand_is_that_of_autograd(activation):
     system, rng = Mixer(), np.random.default_rng(0)
     record = random_record(system, 30)
     record.y[0, [2, 5, 5, 9], [0, 0, 1, 1]] = np.nan
-    points = points_of(system, record, 20)
-    weights = Weights(rng.random(3), rng.random(3), rng.random(2), rng.random((3, 2)))
+    points, _ = points_of(system, record, 20)
+    weights = Weights(rng.random(3), rng.random(3), rng.random(2))
+    n = len(points.t)
+    lead = Lead(*(rng.random((n, *size)) for size in ((3,), (3,), (3, 2), (3, 2))))
     architecture = Architecture(
         *(3, 2, 3, 7, activation, "float64"),
         span=(record.t[0], record.t[-1]),
@@ -66,8 +69,8 @@ def test_the_gradient_by_hand_is_that_of_autograd(activation):
         scale=tuple(rng.uniform(0.5, 2, 9)),
     )
     network = Network(architecture, torch.Generator().manual_seed(1))
-    loss, gradient = Objective(architecture, system, points, weights)(strung(network))
-    expected_loss, expected = by_autograd(network, system, points, weights)
+    loss, gradient = Objective(architecture, system, points, weights, lead)(strung(network))
+    expected_loss, expected = by_autograd(network, system, points, weights, lead)
     assert loss == pytest.approx(expected_loss, rel=1e-12)
     assert abs(expected).max() > 0.1
     np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
@@ -77,9 +80,10 @@ def test_points_lie_on_the_records_lines():
     system = Mixer(measured_input=True)
     record = random_record(system, 30)
     record.y[0, 7, 1] = np.nan
-    points = points_of(system, record, 1000)
+    points, samples = points_of(system, record, 1000)
+    assert np.array_equal(samples.t, record.t)
     assert set(record.t) <= set(points.t)
-    assert points.t[1] - points.t[0] == pytest.approx(1e-5 * np.ptp(record.t), rel=1e-6)
+    assert points.t[1] - points.t[0] == pytest.approx(0.02 * (record.t[1] - record.t[0]), rel=1e-6)
     assert points.equation.sum() == pytest.approx(1)
     np.testing.assert_allclose(points.output.sum(0), 1)
     for j in range(2):
@@ -146,7 +150,7 @@ def test_resuming_goes_on_exactly(tmp_path):
     with pytest.raises(ValueError, match="noise_std"):
         train(system, SMALL, record=record, checkpoint=path, resume=True, noise_std=0.1)
     other = replace(SMALL, gain_penalty=0.5)
-    with pytest.raises(ValueError, match=r"gain_penalty=1e-05; expected 0\.5"):
+    with pytest.raises(ValueError, match=r"gain_penalty=0\.1; expected 0\.5"):
         train(system, other, record=record, checkpoint=path, resume=True)
 
 
@@ -158,6 +162,8 @@ def test_a_file_gives_the_same_network_back(tmp_path):
     assert again.network.architecture == trained.network.architecture
     assert np.array_equal(again.xhat(record.t), trained.xhat(record.t))
     assert np.array_equal(again.gain(record.t), trained.gain(record.t))
+    assert trained.covariance is not None
+    assert np.array_equal(again.covariance(record.t), trained.covariance(record.t))
 
 
 def test_patience_and_budget_end_training():
@@ -170,11 +176,15 @@ def test_patience_and_budget_end_training():
 
 def test_a_loss_that_is_not_finite_begins_again():
     Failing.calls.clear()
-    trained = train(Failing(bad=1), replace(SMALL, seed=5), record=random_record(Failing()))
+    config = replace(SMALL, seed=5, guide=0.0)
+    trained = train(Failing(bad=1), config, record=random_record(Failing()))
     assert trained.seed == 6
     Failing.calls.clear()
     with pytest.raises(FloatingPointError, match=r"Failing .*seed 5"):
-        train(Failing(bad=10**6), replace(SMALL, seed=5), record=random_record(Failing()))
+        train(Failing(bad=10**6), config, record=random_record(Failing()))
+    Failing.calls.clear()
+    with pytest.warns(UserWarning, match="no smoother follows this record of Failing"):
+        train(Failing(bad=1), SMALL, record=random_record(Failing()))
 
 
 def test_presets_fill_what_is_not_given():

@@ -6,20 +6,39 @@ import io
 import json
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from pinnobs_gym.estimator import Estimator, OfflineEstimator, State
-from pinnobs_gym.network import Architecture, Network
+from pinnobs_gym.estimator import Estimates, Estimator, OfflineEstimator, State
+from pinnobs_gym.network import Architecture, Layers, Network, evaluate, layers_of
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import substeps
 from pinnobs_gym.system import System
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariances of a network's estimates at some times."""
+
+    t: np.ndarray
+    """Times in s, ascending, shape (num_times,)."""
+    P: np.ndarray
+    """Shape (num_times, nx, nx), in products of state units."""
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        """At other times t (...) in s, (..., nx, nx): joined by straight lines."""
+        after = np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1)
+        part = np.clip((t - self.t[after - 1]) / (self.t[after] - self.t[after - 1]), 0, 1)
+        part = part[..., None, None]
+        return (1 - part) * self.P[after - 1] + part * self.P[after]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +65,8 @@ class Trained:
     """Iterations made, of which the best is one."""
     seconds: float
     """CPU time in s that they took."""
+    covariance: Covariance | None = None
+    """Covariances of its estimates, if the recipe gives them."""
 
     def xhat(self, t: np.ndarray) -> np.ndarray:
         """The network's estimates, (..., nx) in state units, at times t (...) in s."""
@@ -57,9 +78,11 @@ class Trained:
         return self._evaluate(t)[1]
 
     def _evaluate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        with torch.inference_mode():
-            xhat, L = self.network(torch.as_tensor(t, dtype=self.network.architecture.torch_dtype))
-            return xhat.double().numpy(), L.double().numpy()
+        return evaluate(self.network.architecture, self._layers, t)
+
+    @cached_property
+    def _layers(self) -> Layers:
+        return layers_of(self.network)
 
     def save(self, path: str | Path) -> None:
         """Write it to one file: tensors, and the rest as JSON. The file holds no code.
@@ -69,9 +92,12 @@ class Trained:
         """
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
         network, t, y = (facts.pop(name) for name in ("network", "t", "y"))
+        covariance = facts.pop("covariance")
         facts["architecture"] = asdict(network.architecture)
-        weights, record = network.state_dict(), {"t": torch.tensor(t), "y": torch.tensor(y)}
-        write(path, {"facts": json.dumps(facts), "weights": weights, "record": record})
+        content = {"weights": network.state_dict(), "record": _tensors(t=t, y=y)}
+        if covariance is not None:
+            content["covariance"] = _tensors(t=covariance.t, P=covariance.P)
+        write(path, {"facts": json.dumps(facts), **content})
 
     @classmethod
     def load(cls, path: str | Path, system: System) -> Self:
@@ -88,6 +114,9 @@ class Trained:
             record = {name: saved["record"][name].numpy() for name in ("t", "y")}
             network = Network(architecture)
             network.load_state_dict(saved["weights"])
+            if "covariance" in saved:
+                known = {name: saved["covariance"][name].numpy() for name in ("t", "P")}
+                facts["covariance"] = Covariance(**known)
             trained = cls(network=network, **record, **facts)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
@@ -95,6 +124,18 @@ class Trained:
         found = {"system": trained.system, "parameters": trained.parameters}
         check_same(path, {**found, "nx": architecture.nx, "ny": architecture.ny}, identity(system))
         return trained
+
+
+def estimates_of(rows: Sequence[Trained], t: np.ndarray) -> Estimates:
+    """What networks, one per row, make of their records at times t (num_samples,) in s."""
+    xhat = np.stack([trained.xhat(t) for trained in rows])
+    known = [trained.covariance for trained in rows if trained.covariance is not None]
+    whole = len(known) == len(rows)
+    return Estimates(xhat, np.stack([covariance(t) for covariance in known]) if whole else None)
+
+
+def _tensors(**arrays: np.ndarray) -> dict[str, Tensor]:
+    return {name: torch.tensor(array) for name, array in arrays.items()}
 
 
 class _Learned(ABC):
@@ -123,6 +164,13 @@ class _Learned(ABC):
         return {"trainer": "pinn_obs", **{name: getattr(self.trained, name) for name in names}}
 
 
+STEP = 0.7
+"""Longest step of the replay over the time constant of its gain; Runge-Kutta's method is stable
+up to 2.8."""
+MOST_STEPS = 200
+"""Most steps of the replay from one sample to the next that a gain asks for."""
+
+
 @dataclass(frozen=True)
 class PinnObsReplay(_Learned, Estimator):
     """The observer x̂' = f(t, x̂, u) + L(t)(y − h(x̂)) with a learned gain L(t) (Farkane et al.,
@@ -130,12 +178,13 @@ class PinnObsReplay(_Learned, Estimator):
     Training and Testing").
 
     Between samples by the classical Runge-Kutta method in equal steps of at most the system's
-    `System.model_step`. Outputs and measured inputs are joined by straight lines from one sample to
-    the next, so that x̂ at a sample uses that sample and none after it. An output that is missing
-    at either end of a line corrects nothing along it. At the first sample x̂ is the prior's mean.
+    `System.model_step`, and of at most `STEP` over the largest eigenvalue of L(t)C. Outputs and
+    measured inputs are joined by straight lines from one sample to the next, so that x̂ at a sample
+    uses that sample and none after it. An output that is missing at either end of a line corrects
+    nothing along it. At the first sample x̂ is the prior's mean.
 
     The gain was learned along one trajectory from one initial estimate; nothing in its training
-    makes the observer stable elsewhere, or even there.
+    makes the observer stable elsewhere.
     """
 
     trained: Trained = field(kw_only=True, repr=False)
@@ -167,7 +216,8 @@ class PinnObsReplay(_Learned, Estimator):
             return self.system.f(t, x, u) + innovation @ L.T
 
         x = state.xhat
-        for times, step, u_at in substeps(self.system, start, t, x, state.u, u):
+        longest = STEP / self._fastest(np.linspace(start, t, 3))
+        for times, step, u_at in substeps(self.system, start, t, x, state.u, u, longest):
             L = self.trained.gain(times)
             k1 = rate(times[0], x, u_at[0], L[0])
             k2 = rate(times[1], x + step / 2 * k1, u_at[1], L[1])
@@ -175,6 +225,13 @@ class PinnObsReplay(_Learned, Estimator):
             k4 = rate(times[2], x + step * k3, u_at[2], L[2])
             x = x + step / 6 * (k1 + 2 * (k2 + k3) + k4)
         return x
+
+    def _fastest(self, t: np.ndarray) -> float:
+        """The largest absolute eigenvalue of L(t)C (1/s) at times t (...) in s, C = ∂h/∂x at the
+        network's own estimates; not over what would take too many steps."""
+        L, H = self.trained.gain(t), self.system.h_jacobian(self.trained.xhat(t))
+        largest = abs(np.linalg.eigvals(H @ L)).max()
+        return float(np.clip(largest, 1e-9, MOST_STEPS * STEP / (t[-1] - t[0])))
 
     @classmethod
     def of(cls, system: System, trained: Trained) -> Self:
@@ -193,8 +250,8 @@ class PinnObsDirect(_Learned, OfflineEstimator):
     knows = ("model", "prior")
     needs_training = "pinn_obs"
 
-    def estimate(self, record: Record) -> np.ndarray:
-        """x̂ at every sample, shape (1, num_samples, nx).
+    def run(self, record: Record) -> Estimates:
+        """x̂ at every sample, with its covariance if the training gave one.
 
         Raises:
             ValueError: if the record is not the one that the network was trained on.
@@ -211,7 +268,7 @@ class PinnObsDirect(_Learned, OfflineEstimator):
                     f"the record's {name} is not that of the record this PINN-Obs was trained on;"
                     " train on this record, or use pinn_obs_replay"
                 )
-        return self.trained.xhat(record.t)[None]
+        return estimates_of([self.trained], record.t)
 
     @classmethod
     def of(cls, system: System, trained: Trained) -> Self:

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.estimator import OfflineEstimator
-from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.estimator import Estimates, OfflineEstimator
+from pinnobs_gym.estimators.pinn_obs import Trained, estimates_of
 from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
@@ -178,8 +178,8 @@ class PinnObs(OfflineEstimator):
         """Train on each row of the record; see `train`."""
         return [self._fit_row(record, i) for i in range(record.batch)]
 
-    def estimate(self, record: Record) -> np.ndarray:
-        return np.stack([trained.xhat(record.t) for trained in self.fit(record)])
+    def run(self, record: Record) -> Estimates:
+        return estimates_of(self.fit(record), record.t)
 
     @property
     def _told_noise(self) -> Sequence[float] | float:

@@ -22,7 +22,8 @@ PRESETS = MappingProxyType(
             "improvement": 0.02,
             "train_fraction": 1.0,
             "points": 300,
-            "gain_penalty": 1e-5,
+            "guide": 10.0,
+            "gain_penalty": 0.1,
             "dtype": "float64",
             "checkpoint_every": 200,
             "log_every": 20,
@@ -35,6 +36,7 @@ PRESETS = MappingProxyType(
             "improvement": 0.0,
             "train_fraction": 0.6,
             "points": 0,
+            "guide": 0.0,
             "gain_penalty": 0.0,
             "dtype": "float32",
             "checkpoint_every": 1000,
@@ -70,8 +72,14 @@ class Config:
     """Weight of the observer's equation in the loss."""
     w_y: float = 1.0
     """Weight of the outputs in the loss."""
+    guide: float = _PRESET
+    """Weight in the loss of x̂'s squared departure from the guide, a Kalman smoother's estimates of
+    the same record, in scaled units; the gain is then drawn towards Riccati's. With 0 there is no
+    guide. Not of Adam's."""
     gain_penalty: float = _PRESET
-    """Weight of the mean squared gain in the loss, in scaled units; not of Adam's."""
+    """Weight in the loss of the gain's squared departure from the guide's, or from zero without
+    one, over its size and ten units of state, output and time; 1e-3 is a good one without a guide.
+    Not of Adam's."""
     learning_rate: float = 1e-3
     """Step of Adam; constant."""
     optimiser: Literal["adam", "ssbroyden"] = _PRESET
@@ -107,7 +115,7 @@ class Config:
         for name in ("iterations", "patience", "checkpoint_every", "log_every"):
             _expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
         _expect(self, "seed", "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
-        for name in ("w0", "w_ode", "w_y", "gain_penalty"):
+        for name in ("w0", "w_ode", "w_y", "guide", "gain_penalty"):
             _expect(self, name, "a number of at least 0", lambda v: 0 <= v < math.inf)
         _expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
         _expect(self, "improvement", "a number of at least 0 and under 1", lambda v: 0 <= v < 1)
@@ -119,7 +127,8 @@ class Config:
             _expect(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
             _expect(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
         else:
-            _expect(self, "gain_penalty", "0 with adam", lambda v: v == 0)
+            for name in ("guide", "gain_penalty"):
+                _expect(self, name, "0 with adam", lambda v: v == 0)
 
 
 def _expect(config: Config, name: str, expected: str, fits: Callable[[Any], bool]) -> None:

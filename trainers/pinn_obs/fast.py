@@ -4,6 +4,7 @@ a quasi-Newton method, in NumPy and float64."""
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,27 +12,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.quasi_newton import QuasiNewton
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System
-from trainers.pinn_obs.objective import Objective, Points, Weights
+from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
+from trainers.pinn_obs.objective import Lead, Objective, Weights
+from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
 from trainers.pinn_obs.run import Run
 
 UNITS = 20
 """Units of time in a record; one is the paper's second."""
 NOISE = 0.01
 """Standard deviation of noise, over an output's scale, over which outputs weigh less."""
-_DECAYS = (1e-3, 1e-2)
-"""Time constants of the network's inputs, over the length of the record."""
-_LAYER = (1e-5, 0.02, 60)
-"""First and last of the points after t₀, over the length of the record, and their number."""
+_DECAYS = ((LEAVING, 2.0, 10.0), (1e-3, 1e-2))
+"""Time constants of the network's inputs, over the first interval and over the record's length."""
 _GAIN = 10.0
 """What the network's gains are multiplied by, in units of state, output and time."""
 _SLOPES = 10.0
 """Standard deviation of the first layer's weights on the time from −1 to 1."""
-_PERIODS = 20
-"""Periods in a record over which a frequency becomes an input of the network."""
 _NOISY = 5
 """How many times as many samples are looked at if they are noisy."""
 
@@ -40,21 +38,23 @@ class FastRun(Run):
     """Self-scaled Broyden steps on the loss in scaled quantities.
 
     States are counted in `System.scale`, outputs in what that does to them, and time in twentieths
-    of the record, so that the terms of the loss are of one size on any system. On the paper's
-    ReverseDuffing that is within a factor of 1.7 of the paper's own loss, and the loss that is
-    logged and returned is the paper's. A record without noise is looked at in `Config.points`
-    samples, and in further points right after t₀, where x̂ has to leave x̂₀; otherwise the network
-    jumps from x̂₀ to the trajectory where no residual is taken, and L is arbitrary. There y is
-    joined by straight lines, as in the replay. Outputs of noise σ weigh less by (0.01/σ)², σ over
-    their scale, if that is less than one, so that the equations decide and the fit does not chase
-    it.
+    of the record, so that the terms of the loss are of one size on any system; the loss that is
+    logged and returned is the paper's. A record without noise is looked at in some of its samples,
+    and in further points right after t₀, where x̂ has to leave x̂₀: otherwise the network jumps to
+    the trajectory where no residual is taken, and L is arbitrary. There y is joined by straight
+    lines, as in the replay. Outputs of noise σ weigh less by (0.01/σ)², σ over their scale, if that
+    is less than one, so that the equations decide and the fit does not chase it.
+
+    With `Config.guide` the estimates and gains are drawn towards those of `guide_of`, without it
+    the gains towards zero.
     """
 
     def _architecture(self) -> Architecture:
         config, system, t = self.config, self.system, self.record.t
         noisy = bool(self.noise_std.any())
-        self.points = points_of(system, self.record, config.points * (_NOISY if noisy else 1))
-        length = float(t[-1] - t[0])
+        most = config.points * (_NOISY if noisy else 1)
+        self.points, samples = points_of(system, self.record, most)
+        length, interval = float(t[-1] - t[0]), float(t[1] - t[0])
         unit = length / UNITS
         x_scale, y_scale = np.asarray(system.scale, float), output_scale(system, self.record)
         per_gain = x_scale[:, None] / y_scale / unit
@@ -63,8 +63,15 @@ class FastRun(Run):
             config.w0 / x_scale**2,
             config.w_ode * (unit / x_scale) ** 2,
             config.w_y * quiet / y_scale**2,
-            config.gain_penalty / per_gain**2,
         )
+        self.guide: Guide | None = None
+        if config.guide:
+            self.guide = guide_of(system, samples, self.points, self.noise_std, y_scale)
+            if self.guide is None:
+                message = f"no smoother follows this record of {type(system).__name__}"
+                warnings.warn(f"{message}; training has no guide", stacklevel=2)
+        self._lead = self._lead_of(x_scale, _GAIN * per_gain)
+        decays = [interval * part for part in _DECAYS[0]] + [length * part for part in _DECAYS[1]]
         return Architecture(
             system.nx,
             system.ny,
@@ -73,9 +80,24 @@ class FastRun(Run):
             config.activation,
             config.dtype,
             span=(float(t[0]), float(t[-1])),
-            decays=tuple(length * part for part in _DECAYS),
+            decays=tuple(decays),
             frequencies=fast_frequencies(self.record),
             scale=(*x_scale, *(_GAIN * per_gain).ravel()),
+        )
+
+    def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
+        """What the estimates and gains are drawn towards, with weights that make both relative."""
+        config, weights, n = self.config, self.points.equation, len(self.points.t)
+        xhat = np.broadcast_to(self.points.xhat0, (n, self.system.nx))
+        L = np.zeros((n, *L_scale.shape))
+        if self.guide is not None:
+            xhat, L = self.guide.xhat, self.guide.L
+        each = (weights + 1 / n)[:, None]  # points in the initial layer count as well
+        return Lead(
+            xhat,
+            config.guide * each / x_scale**2,
+            L,
+            config.gain_penalty * weights[:, None, None] / (L_scale**2 + L**2),
         )
 
     def _draw(self, generator: torch.Generator) -> None:
@@ -87,7 +109,9 @@ class FastRun(Run):
             weight[:, 0], bias[:] = slopes, -slopes * middles
         parts = [p.detach().numpy().ravel() for p in _in_order(network)]
         self._first = np.concatenate(parts)
-        self._objective = Objective(self.architecture, self.system, self.points, self._weights)
+        self._objective = Objective(
+            self.architecture, self.system, self.points, self._weights, self._lead
+        )
         self._method: QuasiNewton | None = None
 
     def step(self) -> None:
@@ -117,6 +141,16 @@ class FastRun(Run):
                 parameter.copy_(part.reshape(parameter.shape))
         return network
 
+    def covariance(self, network: Network) -> Covariance | None:
+        """The smoother's, which is Laplace's approximation for the estimates that the guide leads
+        to, and the square of how far the network is from them."""
+        if self.guide is None:
+            return None
+        t, smoothed = self.guide.t, self.guide.smoothed
+        with torch.no_grad():
+            away = network(torch.from_numpy(t))[0].numpy() - smoothed.xhat
+        return Covariance(t, smoothed.P + away[:, :, None] * away[:, None, :])
+
     def loss(self) -> float:
         assert self.best is not None
         return self.total(self._objective.terms(self.best.weights["theta"].numpy()))
@@ -138,68 +172,3 @@ def _in_order(network: Network) -> list[Tensor]:
     """The network's parameters as `Objective` strings them together."""
     pairs = zip(network.weights, network.biases, strict=True)
     return [parameter for pair in pairs for parameter in pair]
-
-
-def points_of(system: System, record: Record, most: int) -> Points:
-    """At most that many samples of a record of one episode, evenly chosen, and points between
-    samples right after t₀."""
-    t, y = record.t, record.y[0]
-    length = t[-1] - t[0]
-    chosen = np.unique(np.linspace(0, len(t) - 1, min(most, len(t))).round().astype(int))
-    first, last, number = _LAYER
-    layer = t[0] + length * np.geomspace(first, last, number)
-    times = np.unique(np.concatenate([t[chosen], layer]))
-    values = _on_lines(times, t, y)
-    there = ~np.isnan(values)
-    halves = np.diff(times) / length / 2
-    weights = np.append(halves, 0.0) + np.append(0.0, halves)
-    output = weights[:, None] * there
-    u = _on_lines(times, t, record.u[0]) if system.measured_input else system.input(times)
-    return Points(
-        times,
-        np.asarray(u),
-        np.where(there, values, 0.0),
-        there.astype(float),
-        weights,
-        output / np.maximum(output.sum(0), 1e-9),
-        record.prior.mean[0],
-    )
-
-
-def _on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (num_samples, n) at t, joined by straight lines, at times within; NaN along lines that
-    begin or end in it."""
-    after = np.clip(np.searchsorted(t, times, side="left"), 1, len(t) - 1)
-    part = ((times - t[after - 1]) / (t[after] - t[after - 1]))[:, None]
-    between = (1 - part) * values[after - 1] + part * values[after]
-    return np.where(part == 0, values[after - 1], np.where(part == 1, values[after], between))
-
-
-def output_scale(system: System, record: Record) -> np.ndarray:
-    """The size of each output (ny,): what the states' scale does to it, or else its own spread."""
-    scale, mean = np.asarray(system.scale, float), record.prior.mean[0]
-    x = mean + scale * np.array([[-1.0], [0.0], [1.0]])
-    by_model = abs(system.h_jacobian(x) * scale).max(axis=(0, 2))
-    y = np.where(np.isnan(record.y[0]), 0.0, record.y[0])
-    size = np.maximum(by_model, np.ptp(y, axis=0) * 1e-3)
-    return np.where(size > 0, size, 1.0)
-
-
-def fast_frequencies(record: Record) -> tuple[float, ...]:
-    """The angular frequency (rad/s) of the highest peak in the outputs' spectrum, if more than
-    twenty of its periods lie in the record; without it a small network cannot follow them."""
-    t = record.t
-    even = np.linspace(t[0], t[-1], len(t))
-    power = np.zeros(len(t) // 2 + 1)
-    for y in record.y[0].T:
-        there = ~np.isnan(y)
-        if there.any() and np.ptp(y[there]) > 0:
-            wave = np.interp(even, t[there], (y[there] - y[there].mean()) / y[there].std())
-            power += abs(np.fft.rfft(wave * np.hanning(len(t)))) ** 2
-    peak = int(np.argmax(power))
-    if not _PERIODS < peak < len(power) - 1:
-        return ()
-    below, here, above = np.log(power[peak - 1 : peak + 2] + 1e-300)
-    place = peak + 0.5 * (below - above) / (below - 2 * here + above)
-    cycle = (t[-1] - t[0]) * len(t) / (len(t) - 1)
-    return (float(2 * np.pi * place / cycle),)

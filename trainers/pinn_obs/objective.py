@@ -77,28 +77,47 @@ class Weights:
     """Of the squared residuals of the equations, shape (nx,)."""
     output: np.ndarray
     """Of the squared innovations, shape (ny,)."""
-    gain: np.ndarray
-    """Of the squared gains, shape (nx, ny)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """What the network is drawn towards beside the paper's loss, and how strongly."""
+
+    xhat: np.ndarray
+    """Estimates, shape (num_points, nx)."""
+    by_xhat: np.ndarray
+    """Weights of the squared departures from them, shape (num_points, nx)."""
+    L: np.ndarray
+    """Gains, shape (num_points, nx, ny)."""
+    by_L: np.ndarray
+    """Weights of the squared departures from them, shape (num_points, nx, ny)."""
 
 
 class Objective:
     """The weighted loss as a function of all weights of a network in one vector.
 
     w₀·(x̂(t₀) − x̂₀)² + w_ode·mean (dx̂/dt − f(t, x̂, u) − L(y − h(x̂)))² + w_y·mean (h(x̂) − y)²
-    + λ·mean L², summed over components, with the points' quadrature for means. The terms are those
-    of `trainers.pinn_obs.loss_terms` (equations (7), (8) and (9) of the paper).
+    summed over components, with the points' quadrature for means: the terms are those of
+    `trainers.pinn_obs.loss_terms` (equations (7), (8) and (9) of the paper). To them come the
+    weighted squares of x̂ and L less those of the lead.
 
     Args:
         architecture: the network's.
         system: the model.
         points: where the loss looks.
         weights: of the terms.
+        lead: what x̂ and L are drawn towards.
     """
 
     def __init__(
-        self, architecture: Architecture, system: System, points: Points, weights: Weights
+        self,
+        architecture: Architecture,
+        system: System,
+        points: Points,
+        weights: Weights,
+        lead: Lead,
     ) -> None:
-        self.system, self.points, self.weights = system, points, weights
+        self.system, self.points, self.weights, self.lead = system, points, weights, lead
         self.nx, self.ny = system.nx, system.ny
         self._shapes = architecture.shapes
         self._activation = _ACTIVATIONS[architecture.activation]
@@ -167,20 +186,24 @@ class Objective:
         self, xhat: np.ndarray, rate: np.ndarray, L: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """The loss, and its derivatives by x̂, by dx̂/dt and by L."""
-        points, weights, system = self.points, self.weights, self.system
+        points, weights, system, lead = self.points, self.weights, self.system, self.lead
         innovation, residual = self._defects(xhat, rate, L)
         initial = xhat[0] - points.xhat0
         by_rate = 2 * points.equation[:, None] * weights.equation * residual
         by_innovation = 2 * points.output * weights.output * innovation
-        by_L = 2 * points.equation[:, None, None] * weights.gain * L
-        loss = 0.5 * float(
-            (by_rate * residual).sum() + (by_innovation * innovation).sum() + (by_L * L).sum()
-        ) + float(weights.initial @ (initial * initial))
+        by_L = 2 * lead.by_L * (L - lead.L)
+        by_xhat = 2 * lead.by_xhat * (xhat - lead.xhat)
+        loss = float(weights.initial @ (initial * initial)) + 0.5 * float(
+            (by_rate * residual).sum()
+            + (by_innovation * innovation).sum()
+            + (by_L * (L - lead.L)).sum()
+            + (by_xhat * (xhat - lead.xhat)).sum()
+        )
         by_innovation -= np.einsum("ki,kij->kj", by_rate, L)
         by_L -= by_rate[:, :, None] * innovation[:, None, :]
         H = system.h_jacobian(xhat)
         A = system.f_jacobian(points.t, xhat, points.u)
-        by_xhat = -np.einsum("ki,kij->kj", by_rate, A)
+        by_xhat -= np.einsum("ki,kij->kj", by_rate, A)
         by_xhat -= np.einsum("ki,kij->kj", by_innovation * points.there, H)
         by_xhat[0] += 2 * weights.initial * initial
         return loss, by_xhat, by_rate, by_L

@@ -15,7 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.estimators.pinn_obs import Trained, check_same, identity, read, write
+from pinnobs_gym.estimators.pinn_obs import (
+    Covariance,
+    Trained,
+    check_same,
+    identity,
+    read,
+    write,
+)
 from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System
@@ -61,8 +68,8 @@ class Run(ABC):
         self, system: System, config: Config, record: Record, noise_std: np.ndarray
     ) -> None:
         self.config, self.system, self.record, self.noise_std = config, system, record, noise_std
-        self.architecture = self._architecture()
         self.iteration, self._earlier, self._start = 0, 0.0, time.process_time()
+        self.architecture = self._architecture()
         self._kept: Best | None = None  # of attempts that ended in a loss that is not finite
         self._begin(attempt=0)
 
@@ -101,6 +108,10 @@ class Run(ABC):
     @abstractmethod
     def loss(self) -> float:
         """The paper's loss of that network."""
+
+    def covariance(self, network: Network) -> Covariance | None:
+        """What is known of the error of that network's estimates; None unless overridden."""
+        return None
 
     @abstractmethod
     def _state(self) -> dict[str, Any]:
@@ -166,9 +177,9 @@ class Run(ABC):
                 f"the loss of PINN-Obs on {type(self.system).__name__} left the finite numbers from"
                 f" seed {self.config.seed} and the {self.attempt} after it{advice}"
             )
-        about = identity(self.system)
+        about, network = identity(self.system), self.network()
         return Trained(
-            network=self.network(),
+            network=network,
             t=self.record.t.copy(),
             y=self.record.y[0].copy(),
             system=about["system"],
@@ -178,6 +189,7 @@ class Run(ABC):
             loss=self.loss(),
             iterations=self.iteration,
             seconds=self.seconds,
+            covariance=self.covariance(network),
         )
 
     def save(self, path: Path) -> None:

@@ -1,0 +1,99 @@
+"""What guides the fast recipe: where the states most likely were, and a gain that is stable there.
+
+The loss of PINN-Obs alone fixes neither. Estimates whose unmeasured states are wrong can satisfy it
+with a gain to suit, and once the innovation has died out any gain does. Both come from the same
+samples and the same model by linear algebra: the states from an iterated Kalman smoother, the gain
+from the Riccati recursion along them. The network is drawn towards both, which leaves its loss a
+single valley, the same from every seed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.record import Record
+from pinnobs_gym.system import System
+from trainers.pinn_obs.objective import Points
+from trainers.pinn_obs.points import on_lines
+from trainers.pinn_obs.smoother import Filtered, Path, forward, smooth
+
+QUIET = 1e-4
+"""Least standard deviation of output noise, over the output's scale."""
+LEAVING = 0.5
+"""Time constant with which x̂ leaves x̂₀ for the smoothed states, over the first interval."""
+_CAUTION = 0.2
+_CLEAR = 1e-3
+"""Least innovation that tells something, over the output's scale."""
+_TOLD = 5.0
+"""How many times that, or the noise, the first innovation has to be to lead x̂ away at once."""
+_LAYER = 10.0
+"""How many time constants long x̂ is taken to be leaving x̂₀."""
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """What the network is drawn towards."""
+
+    xhat: np.ndarray
+    """Estimates at the points, shape (num_points, nx)."""
+    L: np.ndarray
+    """Gains there in state units per s and output unit, shape (num_points, nx, ny)."""
+    t: np.ndarray
+    """Times in s of the samples that it was made from, shape (num_samples,)."""
+    smoothed: Path
+    """The states at these samples, given all of them."""
+
+
+def guide_of(
+    system: System, samples: Record, points: Points, noise: np.ndarray, y_scale: np.ndarray
+) -> Guide | None:
+    """The guide of a record of one episode; None if the smoother leaves the finite numbers.
+
+    x̂ has to begin at x̂₀. Where the first innovation tells more than noise, a finite gain can lead
+    it away from there at once: it goes to the smoothed states within the first interval, and the
+    gain that this takes is added to Riccati's. Otherwise it has to wait for the outputs to show
+    what is wrong, and goes with the filter.
+
+    Args:
+        system: the model.
+        samples: those samples of the record that the filters see.
+        points: where the guide is wanted.
+        noise: standard deviations of the output noise, shape (ny,), in output units.
+        y_scale: sizes of the outputs, shape (ny,).
+    """
+    told = np.maximum(noise, QUIET * y_scale)
+    try:
+        with np.errstate(all="ignore"):
+            smoothed = smooth(system, samples, told, _CAUTION)
+            along = forward(system, samples, told, about=smoothed.xhat, caution=_CAUTION)
+    except np.linalg.LinAlgError:  # a covariance that is singular or not finite
+        return None
+    if not all(np.isfinite(part).all() for part in (smoothed.xhat, smoothed.P, along.K)):
+        return None
+    t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
+    L = on_lines(t, samples.t, observer_gain(samples.t, along))
+    first = abs(points.y[0] - system.h(points.xhat0)) * points.there[0]
+    if not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
+        return Guide(on_lines(t, samples.t, along.xhat), L, samples.t, smoothed)
+    left = np.exp((t[0] - t) / tau)[:, None]
+    goal = on_lines(t, samples.t, smoothed.xhat)
+    xhat = left * points.xhat0 + (1 - left) * goal
+    rate = (1 - left) * np.gradient(goal, t, axis=0) + left / tau * (goal - points.xhat0)
+    innovation = (points.y - system.h(xhat)) * points.there / y_scale
+    residual = rate - system.f(t, xhat, points.u)
+    residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
+    floor = max(_CLEAR, 3 * float((noise / y_scale).max()))
+    share = (innovation / y_scale) / ((innovation**2).sum(-1, keepdims=True) + floor**2)
+    inside = (t < t[0] + _LAYER * tau)[:, None, None]
+    return Guide(xhat, L + inside * residual[:, :, None] * share[:, None, :], samples.t, smoothed)
+
+
+def observer_gain(t: np.ndarray, filtered: Filtered) -> np.ndarray:
+    """Gains L (num_samples, nx, ny) with which an observer, over the interval that ends at a
+    sample, takes away as much of that output's innovation as the filter does at the sample."""
+    taken = np.clip(np.einsum("kji,kij->kj", filtered.H, filtered.K), 1e-9, 1 - 1e-9)
+    per_interval = -np.log1p(-taken) / taken
+    interval = np.diff(t, prepend=2 * t[0] - t[1])
+    return filtered.K * (per_interval / interval[:, None])[:, None, :]

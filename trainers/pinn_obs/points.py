@@ -1,0 +1,90 @@
+"""Where the fast recipe looks at a record, and the sizes by which it counts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pinnobs_gym.record import Record
+from pinnobs_gym.system import System
+from trainers.pinn_obs.objective import Points
+
+_FIRST = 30
+"""Samples at the beginning of which all are looked at."""
+_APART = 100
+"""Samples that lie ever further apart."""
+_LAYER = (0.02, 2.0, 24)
+"""First and last of the points right after t₀, over the first interval, and their number."""
+_PERIODS = 20
+"""Periods in a record over which a frequency becomes an input of the network."""
+
+
+def points_of(system: System, record: Record, most: int) -> tuple[Points, Record]:
+    """Where the loss looks at a record of one episode, and the samples among it as a record.
+
+    The samples are the first thirty, a hundred that lie ever further apart, and at most that many
+    evenly chosen; the points are these, and others within the first two intervals.
+    """
+    t, number = record.t, record.num_samples
+    apart = np.geomspace(1, number - 1, min(number, _APART))
+    even = np.linspace(0, number - 1, min(most, number))
+    first = np.arange(min(number, _FIRST))
+    chosen = np.unique(np.concatenate([first, apart.round(), even.round()]).astype(int))
+    layer = t[0] + (t[1] - t[0]) * np.geomspace(*_LAYER)
+    times = np.unique(np.concatenate([t[chosen], layer]))
+    y = on_lines(times, t, record.y[0])
+    there = ~np.isnan(y)
+    halves = np.diff(times) / (t[-1] - t[0]) / 2
+    weights = np.append(halves, 0.0) + np.append(0.0, halves)
+    output = weights[:, None] * there
+    u = on_lines(times, t, record.u[0]) if system.measured_input else system.input(times)
+    points = Points(
+        times,
+        np.asarray(u),
+        np.where(there, y, 0.0),
+        there.astype(float),
+        weights,
+        output / np.maximum(output.sum(0), 1e-9),
+        record.prior.mean[0],
+    )
+    samples = Record(t[chosen], record.y[:, chosen], record.u[:, chosen], record.prior)
+    return points, samples
+
+
+def on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (num_samples, ...) at t, joined by straight lines, at times within; NaN along lines
+    that begin or end in it."""
+    after = np.clip(np.searchsorted(t, times, side="left"), 1, len(t) - 1)
+    part = (times - t[after - 1]) / (t[after] - t[after - 1])
+    part = part.reshape(-1, *[1] * (values.ndim - 1))
+    between = (1 - part) * values[after - 1] + part * values[after]
+    return np.where(part == 0, values[after - 1], np.where(part == 1, values[after], between))
+
+
+def output_scale(system: System, record: Record) -> np.ndarray:
+    """The size of each output (ny,): what the states' scale does to it, or else its own spread."""
+    scale, mean = np.asarray(system.scale, float), record.prior.mean[0]
+    x = mean + scale * np.array([[-1.0], [0.0], [1.0]])
+    by_model = abs(system.h_jacobian(x) * scale).max(axis=(0, 2))
+    y = np.where(np.isnan(record.y[0]), 0.0, record.y[0])
+    size = np.maximum(by_model, np.ptp(y, axis=0) * 1e-3)
+    return np.where(size > 0, size, 1.0)
+
+
+def fast_frequencies(record: Record) -> tuple[float, ...]:
+    """The angular frequency (rad/s) of the highest peak in the outputs' spectrum, if more than
+    twenty of its periods lie in the record; without it a small network cannot follow them."""
+    t = record.t
+    even = np.linspace(t[0], t[-1], len(t))
+    power = np.zeros(len(t) // 2 + 1)
+    for y in record.y[0].T:
+        there = ~np.isnan(y)
+        if there.any() and np.ptp(y[there]) > 0:
+            wave = np.interp(even, t[there], (y[there] - y[there].mean()) / y[there].std())
+            power += abs(np.fft.rfft(wave * np.hanning(len(t)))) ** 2
+    peak = int(np.argmax(power))
+    if not _PERIODS < peak < len(power) - 1:
+        return ()
+    below, here, above = np.log(power[peak - 1 : peak + 2] + 1e-300)
+    place = peak + 0.5 * (below - above) / (below - 2 * here + above)
+    cycle = (t[-1] - t[0]) * len(t) / (len(t) - 1)
+    return (float(2 * np.pi * place / cycle),)
