@@ -218,7 +218,7 @@ class Objective:
     ) -> np.ndarray:
         """The gradient (n,) from the derivatives by the network's outputs."""
         n, nx = len(self.points.t), self.nx
-        by_z = np.zeros((len(self._scale), 2 * n))
+        by_z = np.zeros((len(self._scale), 2 * n), by_xhat.dtype)
         by_z[:nx, :n], by_z[nx:, :n] = by_xhat.T, by_L.reshape(n, -1).T
         by_z[:nx, n:] = by_rate.T
         by_z *= self._scale
