@@ -76,6 +76,9 @@ class Config:
     """Weight in the loss of x̂'s squared departure from the guide, a Kalman smoother's estimates of
     the same record, in scaled units; the gain is then drawn towards Riccati's. With 0 there is no
     guide. Not of Adam's."""
+    transfer: bool = False
+    """Whether the gain is meant for other records, too: x̂ then leaves x̂₀ as fast as Riccati's gain
+    takes it, and not by a gain that fits this record alone. Needs the guide."""
     gain_penalty: float = _PRESET
     """Weight in the loss of the gain's squared departure from the guide's, or from zero without
     one, over its size and ten units of state, output and time; 1e-3 is a good one without a guide.
@@ -126,7 +129,9 @@ class Config:
             _expect(self, "points", "a whole number of at least 10", lambda v: v == int(v) >= 10)
             _expect(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
             _expect(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
-        else:
+        if not self.guide:
+            _expect(self, "transfer", "False without a guide", lambda v: v is False)
+        if self.optimiser == "adam":
             for name in ("guide", "gain_penalty"):
                 _expect(self, name, "0 with adam", lambda v: v == 0)
 

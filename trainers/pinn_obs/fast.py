@@ -66,7 +66,8 @@ class FastRun(Run):
         )
         self.guide: Guide | None = None
         if config.guide:
-            self.guide = guide_of(system, samples, self.points, self.noise_std, y_scale)
+            about = (system, samples, self.points, self.noise_std, y_scale)
+            self.guide = guide_of(*about, config.transfer)
             if self.guide is None:
                 message = f"no smoother follows this record of {type(system).__name__}"
                 warnings.warn(f"{message}; training has no guide", stacklevel=2)
@@ -97,7 +98,7 @@ class FastRun(Run):
             xhat,
             config.guide * each / x_scale**2,
             L,
-            config.gain_penalty * weights[:, None, None] / (L_scale**2 + L**2),
+            config.gain_penalty * each[..., None] / (L_scale**2 + L**2),
         )
 
     def _draw(self, generator: torch.Generator) -> None:

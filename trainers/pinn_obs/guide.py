@@ -47,14 +47,19 @@ class Guide:
 
 
 def guide_of(
-    system: System, samples: Record, points: Points, noise: np.ndarray, y_scale: np.ndarray
+    system: System,
+    samples: Record,
+    points: Points,
+    noise: np.ndarray,
+    y_scale: np.ndarray,
+    transfer: bool = False,
 ) -> Guide | None:
     """The guide of a record of one episode; None if the smoother leaves the finite numbers.
 
     x̂ has to begin at x̂₀. Where the first innovation tells more than noise, a finite gain can lead
     it away from there at once: it goes to the smoothed states within the first interval, and the
-    gain that this takes is added to Riccati's. Otherwise it has to wait for the outputs to show
-    what is wrong, and goes with the filter.
+    gain that this takes, good for this record alone, is added to Riccati's. Otherwise it has to
+    wait for the outputs to show what is wrong, and goes with the filter.
 
     Args:
         system: the model.
@@ -62,6 +67,8 @@ def guide_of(
         points: where the guide is wanted.
         noise: standard deviations of the output noise, shape (ny,), in output units.
         y_scale: sizes of the outputs, shape (ny,).
+        transfer: go with the filter whatever the first innovation tells, so that the gain is
+            Riccati's alone.
     """
     told = np.maximum(noise, QUIET * y_scale)
     try:
@@ -75,7 +82,7 @@ def guide_of(
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
     L = on_lines(t, samples.t, observer_gain(samples.t, along))
     first = abs(points.y[0] - system.h(points.xhat0)) * points.there[0]
-    if not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
+    if transfer or not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
         return Guide(on_lines(t, samples.t, along.xhat), L, samples.t, smoothed)
     left = np.exp((t[0] - t) / tau)[:, None]
     goal = on_lines(t, samples.t, smoothed.xhat)
