@@ -84,8 +84,11 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["evaluate", "--system", "Academic", "--checkpoint", "x"], "is not one that is trained"),
         (["evaluate", "--system", "Academic", "--out", "file/x"], "cannot write"),
         (["systems", "Duffing"], "unknown system 'Duffing'"),
-        (["train"], "name a trainer first: pinnobs train pinn_obs"),
-        (["train", "gpt", "--system", "Academic"], "unknown trainer 'gpt'; known are pinn_obs"),
+        (["train"], "name a trainer first: pinnobs train pinn_gain | pinn_obs"),
+        (
+            ["train", "gpt", "--system", "Academic"],
+            "unknown trainer 'gpt'; known are pinn_gain, pinn_obs",
+        ),
         (["leaderboard", "--out", "file/x"], "cannot write to folder file/x"),
         (["leaderboard", "--jobs", "0"], "jobs=0"),
         (["leaderboard", "--condition", "load_step"], "needs a plant with a load torque"),
