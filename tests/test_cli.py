@@ -210,6 +210,19 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert "is damaged or no file of saved weights" in capsys.readouterr().err
 
 
+def test_a_gain_is_trained_on_several_episodes_and_told_the_noise(folder, capsys):
+    small = ["--episodes", "8", "--held-out", "2", "--iterations", "3", "--streams", "4"]
+    where = ["--system", "Academic", "--out", "tr"]
+    assert run("train", "pinn_gain", *where, *small) == 0
+    assert "pinn_gain on own record" in capsys.readouterr().out
+    (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
+    scored = ["evaluate", "--estimator", "pinn_gain", "--checkpoint", trained, "--out", "ev"]
+    for condition in ("nominal", "noise5"):
+        more = ["--system", "Academic", "--episodes", "2", "--condition", condition]
+        assert run(*scored, *more) == 0
+    assert len({row["config_hash"] for row in rows.read(folder / "ev" / "rows.jsonl")}) == 2
+
+
 def test_an_estimators_fault_is_one_line(folder, capsys):
     (folder / "faulty_module.py").write_text(
         "from pinnobs_gym.estimators.ekf import EKF\n"

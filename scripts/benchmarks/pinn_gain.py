@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from benchmarks import Figure, at_most, cpu_seconds
 from pinnobs_gym import env_id, evaluate
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.pinn_gain import PinnGain
+from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.rows import Row
 from pinnobs_gym.suite import TRAINING_SEED, record_of
 from pinnobs_gym.systems import SYSTEMS
@@ -33,36 +31,40 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def of_system(name: str, repeats: int) -> Iterator[Figure]:
-    """The figures of all training seeds on one system, then their medians."""
-    env, ratios = env_id(name), {}
-    config = Config()
-    system, setup, record = record_of(env, "benchmark", "nominal", TRAINING_SEED, config.episodes)
+    """The figures of all training seeds on one system, their medians, and its speed."""
+    ratios: dict[tuple[str, str], list[float]] = {}
+    trainings = []
     for seed in range(SEEDS):
-        start = time.process_time()
-        trained = train(
-            system, replace(config, seed=seed), record=record, noise_std=setup.noise_std
-        )
-        yield at_most(
-            f"training of {name}, seed {seed}", time.process_time() - start, "CPU s", 600.0
-        )
+        trainings.append(trained_on(name, seed))
+        yield at_most(f"training of {name}, seed {seed}", trainings[-1].seconds, "CPU s", 600.0)
         for condition in CONDITIONS:
-            told = record_of(env, "benchmark", condition, 0)[1].noise_std
-            gain = PinnGain(system, told, trained=trained)
-            ekf = EKF(system, told)
-            scores = [evaluate(e, env, episodes=EPISODES, condition=condition) for e in (ekf, gain)]
-            for what, value in summary(*scores).items():
+            for what, value in compared(name, condition, trainings[-1]).items():
                 ratios.setdefault((condition, what), []).append(value)
                 yield Figure(f"{what}, {name}, {condition}, seed {seed}", value, "", "", None)
     for (condition, what), values in ratios.items():
         bound = asked(name, condition, what, ratios)
-        median = float(np.median(values))
         title = f"{what}, {name}, {condition}, median of {SEEDS} seeds"
-        yield (
-            Figure(title, median, "", "", None)
-            if bound is None
-            else at_most(title, median, "", bound)
-        )
-    yield from speed(name, gain, repeats)
+        median = float(np.median(values))
+        known = bound is not None
+        yield at_most(title, median, "", bound) if known else Figure(title, median, "", "", None)
+    yield from speed(name, trainings[-1], repeats)
+
+
+def trained_on(name: str, seed: int) -> TrainedGain:
+    """A gain trained by the default recipe."""
+    config = Config(seed=seed)
+    place = (env_id(name), "benchmark", "nominal", TRAINING_SEED)
+    system, setup, record = record_of(*place, config.episodes)
+    return train(system, config, record=record, noise_std=setup.noise_std)
+
+
+def compared(name: str, condition: str, trained: TrainedGain) -> dict[str, float]:
+    """The scores of a gain and of the EKF, both told the noise; see `summary`."""
+    env = env_id(name)
+    system, setup, _ = record_of(env, "benchmark", condition, 0)
+    ekf, gain = EKF(system, setup.noise_std), PinnGain(system, setup.noise_std, trained=trained)
+    scores = (evaluate(e, env, episodes=EPISODES, condition=condition) for e in (ekf, gain))
+    return summary(*scores)
 
 
 def summary(ekf: list[Row], gain: list[Row]) -> dict[str, float]:
@@ -79,7 +81,7 @@ def summary(ekf: list[Row], gain: list[Row]) -> dict[str, float]:
         ("settling median", "settling", 0.5),
         ("settling 90th percentile", "settling", 0.9),
     ):
-        # inf stands for an episode that never settles; interpolation between two would be nan
+        # Episodes that never settle count as infinite, between which nothing can be interpolated.
         own, peer = (
             np.quantile([r[key] for r in rows], part, method="higher") for rows in (gain, ekf)
         )
@@ -104,13 +106,13 @@ def asked(
     return None
 
 
-def speed(name: str, gain: PinnGain, repeats: int) -> Iterator[Figure]:
+def speed(name: str, trained: TrainedGain, repeats: int) -> Iterator[Figure]:
     """Time per step and episode of a batch of 256."""
-    record = record_of(env_id(name), "benchmark", "nominal", 0, 256)[2]
+    system, setup, record = record_of(env_id(name), "benchmark", "nominal", 0, 256)
     steps = record.batch * record.num_samples
-    for label, estimator in (("EKF", EKF(gain.system, gain.noise_std)), ("gain", gain)):
+    gain = PinnGain(system, setup.noise_std, trained=trained)
+    for label, estimator in (("EKF", EKF(system, setup.noise_std)), ("gain", gain)):
         seconds = [cpu_seconds(lambda e=estimator: e.run(record)) for _ in range(repeats)]
         value = float(np.median(seconds)) / steps * 1e6
-        yield Figure(
-            f"{label} of 256 episodes of {name}, per step and episode", value, "µs", "", None
-        )
+        title = f"{label} of 256 episodes of {name}, per step and episode"
+        yield Figure(title, value, "µs", "", None)

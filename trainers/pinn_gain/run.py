@@ -45,8 +45,11 @@ class Best:
     """The weights of the least held-out loss so far."""
 
     loss: float
+    """See `HeldOut.loss`."""
     iteration: int
+    """The iteration after which they were found; 0 is the EKF itself."""
     seed: int
+    """What these weights began from."""
     layers: Layers
 
 
