@@ -19,6 +19,7 @@ from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
 from pinnobs_gym.training import bar, interruption
+from trainers.pinn_gain.checkpoint import restore, save
 from trainers.pinn_gain.config import Config
 from trainers.pinn_gain.run import Run
 
@@ -71,7 +72,7 @@ def train(
     told = system.setups["benchmark"].noise_std if noise_std is None else noise_std
     run = Run(system, config, record, vector(told, system.ny, "noise_std"))
     if resume and checkpoint is not None:
-        run.restore(checkpoint)
+        restore(run, checkpoint)
     try:
         with bar(config.iterations if progress else None) as show, interruption() as stopped:
             while not run.finished() and not stopped:
@@ -80,9 +81,9 @@ def train(
                     _log(log, run)
                     show(run.iteration, f"loss {run.value:.3g} held out {run.latest:.3f} of EKF's")
                 if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
-                    run.save(checkpoint)
+                    save(run, checkpoint)
         if checkpoint is not None:
-            run.save(checkpoint)
+            save(run, checkpoint)
     except KeyboardInterrupt:  # amid a step: the last checkpoint stays as it is
         pass
     trained = run.result()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from pinnobs_gym.estimator import output_scale
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.gain_network import memory_size, shapes
 from pinnobs_gym.estimators.pinn_gain import Layers, TrainedGain
-from pinnobs_gym.estimators.pinn_obs import check_same, identity, read, write
+from pinnobs_gym.estimators.pinn_obs import identity
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
 from trainers.pinn_gain.config import Config
@@ -34,10 +32,10 @@ _WARM_UP = 20
 """Iterations over which Adam's step grows to its full size."""
 _AVERAGE = 0.98
 """What the moving average of the weights keeps from one iteration to the next."""
+_SLOW = 5.0
+"""Weight w of the size of scaled errors beside their logarithm."""
 _RESOLUTION = 1e-3
 """Scaled error below which an error is hardly made smaller."""
-_FREE = ("iterations", "budget", "checkpoint_every", "log_every")
-"""Settings that may change when training is resumed: they decide nothing but when it ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +85,7 @@ class Run:
         self.held_out = HeldOut(self.model, Data.of(system, record, smoothed, held), self.noise_std)
         self.best: Best | None = None
         self.iteration, self.stuck = 0, False
-        self.value, self.gradient = math.nan, math.nan
+        self.value, self.gradient, self.latest = math.nan, math.nan, math.nan
         self._begin(attempt=0)
 
     @property
@@ -153,10 +151,11 @@ class Run:
             self.look()
 
     def _loss(self, covariances: list[Tensor], errors: Tensor) -> Tensor:
-        """The mean over streams of the logarithm of a chunk's root mean square scaled error; and of
-        the likelihood of the errors under the covariance's diagonal, its tails made heavy."""
-        square = errors.square().mean((0, 1)) + _RESOLUTION**2
-        loss = square.log().mean() / 2
+        """The mean over streams of log e + we, e the root mean square scaled error of a chunk, where
+        the first counts all streams alike and the second those that are slow to settle; and of the
+        likelihood of the errors under the covariance's diagonal, its tails made heavy."""
+        size = (errors.square().mean((0, 1)) + _RESOLUTION**2).sqrt()
+        loss = (size.log() + _SLOW * size).mean()
         if self.config.variant == "gru" or not self.config.consistency:
             return loss
         variance = torch.stack([torch.diagonal(P).T for P in covariances])
@@ -215,64 +214,36 @@ class Run:
             seconds=self.seconds,
         )
 
-    def save(self, path: Path) -> None:
-        """Write all that `restore` needs to go on exactly."""
-        assert self.best is not None
+    def state(self) -> dict[str, Any]:
+        """All that changes, but for the best weights: tensors, and plain values in ``facts``."""
         streams = self.streams.state()
-        best = {"loss": self.best.loss, "iteration": self.best.iteration, "seed": self.best.seed}
-        facts = {**self._expected(), "best": best, "rng": streams["rng"], "seconds": self.seconds}
-        facts |= {name: getattr(self, name) for name in _COUNTS}
-        content = {
-            "record": self._record(),
+        facts = {name: getattr(self, name) for name in _COUNTS}
+        return {
+            "facts": {**facts, "rng": streams["rng"], "seconds": self.seconds},
             "streams": streams["arrays"],
             "parameters": [p.detach() for p in self.parameters],
             "average": self.average,
             "optimiser": self._optimiser.state_dict(),
-            "best": [[torch.tensor(a) for a in layer] for layer in self.best.layers],
         }
-        write(path, {"facts": json.dumps(facts), **content})
 
-    def restore(self, path: Path) -> None:
-        """Take up the training of a checkpoint.
-
-        Raises:
-            ValueError: in one line, if it cannot be read or belongs to another training.
-        """
-        saved = read(path)
-        try:
-            facts = json.loads(saved["facts"])
-            check_same(path, facts, self._expected())
-            for name, value in self._record().items():
-                if not torch.equal(saved["record"][name].nan_to_num(), value.nan_to_num()):
-                    raise ValueError(f"{path} was trained on another record: its {name} differs")
-            self._begin(facts["attempt"])
-            layers = tuple((W.numpy(), b.numpy()) for W, b in saved["best"])
-            self.best = Best(**facts["best"], layers=layers)
-            for name in _COUNTS:
-                setattr(self, name, facts[name])
-            with torch.no_grad():
-                for mine, kept in zip(self.parameters, saved["parameters"], strict=True):
-                    mine.copy_(kept)
-            self.average = saved["average"]
-            self._optimiser.load_state_dict(saved["optimiser"])
-            self.streams.take_up({"arrays": saved["streams"], "rng": facts["rng"]})
-            self._earlier += facts["seconds"]
-        except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path} is not a checkpoint of this trainer: {reason}") from None
-
-    def _expected(self) -> dict[str, Any]:
-        """What a checkpoint must agree with."""
-        config = {k: v for k, v in asdict(self.config).items() if k not in _FREE}
-        return {**identity(self.system), "config": config, "noise_std": self.noise_std.tolist()}
-
-    def _record(self) -> Mapping[str, Tensor]:
-        record = self.record
-        parts = {"t": record.t, "y": record.y, "u": record.u, "xhat0": record.prior.mean}
-        return {name: torch.tensor(np.ascontiguousarray(a)) for name, a in parts.items()}
+    def take_up(self, state: Mapping[str, Any], best: Best) -> None:
+        """Go on exactly from what `state` gave."""
+        facts = state["facts"]
+        self._begin(facts["attempt"])
+        self.best = best
+        for name in _COUNTS:
+            setattr(self, name, facts[name])
+        with torch.no_grad():
+            for mine, kept in zip(self.parameters, state["parameters"], strict=True):
+                mine.copy_(kept)
+        self.average = state["average"]
+        self._optimiser.load_state_dict(state["optimiser"])
+        self.streams.take_up({"arrays": state["streams"], "rng": facts["rng"]})
+        self._earlier += facts["seconds"]
 
 
-_COUNTS = ("iteration", "attempt", "failures", "since", "stuck")
+_COUNTS = ("iteration", "attempt", "failures", "since", "stuck", "latest")
+"""What is counted, and the latest held-out loss."""
 
 
 def layers_of(parameters: list[Tensor]) -> Layers:

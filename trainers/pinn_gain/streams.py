@@ -20,7 +20,7 @@ NOISE = (0.3, 8.0)
 """Range of the noise of the others, over that; its logarithm is uniform."""
 MIDDLE = 0.05
 """Part of the new streams that begin amid a record, at a draw from N(x, P₀)."""
-RESTART = 0.35
+RESTART = 0.5
 """Probability that a stream begins anew after a chunk."""
 _FAR = 5.0
 """Scaled error of an estimate over which its stream begins anew."""
