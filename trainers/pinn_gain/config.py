@@ -22,13 +22,13 @@ class Config:
     """Records that only decide which weights are kept."""
     width: int = 32
     """Neurons in each of the two hidden layers, or in the recurrent unit."""
-    iterations: int = 200
+    iterations: int = 350
     """Most iterations, each one chunk of all streams."""
     streams: int = 128
     """Streams that are run side by side."""
     chunk: int = 50
     """Samples over which errors are propagated back."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 3e-3
     """Step of Adam, after a short warm-up constant; the weights that count are a moving average."""
     consistency: float = 0.1
     """Weight of the likelihood of the errors under the covariance, beside their size."""
