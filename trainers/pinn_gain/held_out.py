@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pinnobs_gym.estimator import State
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.gain_network import shapes
+from pinnobs_gym.estimators.gain_network import Variant, shapes
 from pinnobs_gym.estimators.pinn_gain import Layers, PinnGain, TrainedGain
 from pinnobs_gym.record import Prior
 from trainers.pinn_gain.rollout import Model
@@ -19,7 +18,13 @@ _LOST = 10.0
 
 
 class HeldOut:
-    """Smoothed records, measured anew at each of `LEVELS`, always with the same noise."""
+    """Smoothed records, measured anew at each of `LEVELS`, always with the same noise.
+
+    Args:
+        model: what is rolled out.
+        data: the records.
+        noise_std: standard deviations of the output noise that training is told, shape (ny,).
+    """
 
     def __init__(self, model: Model, data: Data, noise_std: np.ndarray) -> None:
         self._model, self._data = model, data
@@ -42,18 +47,16 @@ class HeldOut:
         ratio = self._errors(layers, self._model.variant) / self._ekf
         return float(np.exp(np.log(ratio).mean()))
 
-    def _errors(self, layers: Layers, variant: str) -> np.ndarray:
+    def _errors(self, layers: Layers, variant: Variant) -> np.ndarray:
         """Root mean square scaled errors (windows, rows)."""
         data, rows = self._data, self._rows
-        facts = {"system": "", "parameters": {}, "noise_std": self._told, "config": {}}
-        counts = {"seed": 0, "loss": 1.0, "iterations": 0, "seconds": 0.0}
-        trained = TrainedGain(layers=layers, variant=variant, **facts, **counts)  # pyright: ignore
+        trained = TrainedGain(layers, variant, "", {}, self._told, {}, 0, 1.0, 0, 0.0)
         gain = PinnGain(self._model.system, self._told, trained=trained)
         state = gain.begin(Prior(data.mean[rows], data.cov[rows]), self._std**2)
         square = np.empty((len(data.t), len(rows)))
         with np.errstate(all="ignore"):
             for k, t in enumerate(data.t):
-                state: State = gain.update(state, float(t), self._y[:, k], data.u[rows, k])
+                state = gain.update(state, float(t), self._y[:, k], data.u[rows, k])
                 square[k] = (((state.xhat - data.x[rows, k]) / self._scale) ** 2).mean(axis=-1)
         square = np.where(np.isfinite(square), np.minimum(square, _LOST**2), _LOST**2)
         tail = square[-max(1, len(square) // 4) :]

@@ -118,8 +118,8 @@ class Streams:
 
     def _advance(self, moment: Moment, now: np.ndarray, first: bool) -> Moment:
         """The prediction to samples now (batch,); a new stream is at its own already."""
-        before = np.maximum(now - 1, 0)
-        after = before + 1 if len(self.data.t) > 1 else before
+        before = np.maximum(now - 1, 0)  # what comes of a new stream's step is dropped
+        after = before + 1
         t, u = self.data.t, self.data.u
         inputs = u[self.record, before], u[self.record, after]
         predicted = predict(self.model, moment, (t[before], t[after]), inputs)
