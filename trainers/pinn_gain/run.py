@@ -151,8 +151,8 @@ class Run:
             self.look()
 
     def _loss(self, covariances: list[Tensor], errors: Tensor) -> Tensor:
-        """The mean over streams of log e + we, e the root mean square scaled error of a chunk, where
-        the first counts all streams alike and the second those that are slow to settle; and of the
+        """The mean over streams of log e + we, e the root mean square scaled error of a chunk: the
+        first counts all streams alike, the second those that are slow to settle. And that of the
         likelihood of the errors under the covariance's diagonal, its tails made heavy."""
         size = (errors.square().mean((0, 1)) + _RESOLUTION**2).sqrt()
         loss = (size.log() + _SLOW * size).mean()
