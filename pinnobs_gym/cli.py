@@ -120,7 +120,7 @@ class Evaluate:
         options = parse_settings(cls, self.set)
         source = make_vector_env(name, 1, self.setup, self.condition).source
         if self.checkpoint is not None:
-            estimator = suite.load(cls, self.checkpoint, source.system)
+            estimator = suite.load(cls, self.checkpoint, source.system, source.setup)
         episodes = 1 if source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
@@ -282,7 +282,7 @@ ConfigType = TypeVar("ConfigType")
 
 @dataclass(frozen=True)
 class Train(Generic[ConfigType]):
-    """Train an estimator on one episode of a system."""
+    """Train an estimator on episodes of a system, as many as its recipe says."""
 
     system: str
     """Name or module:Class of the system."""
@@ -293,7 +293,7 @@ class Train(Generic[ConfigType]):
     condition: str = "nominal"
     """Condition, such as load_step."""
     episode: int = suite.TRAINING_SEED
-    """Seed of the episode whose record is learned from."""
+    """Seed of the episode that is learned from, or of the first of several."""
     out: Path = Path("runs/train")
     """Folder of checkpoints, trained files, pictures and TensorBoard log."""
     resume: bool = False
@@ -307,7 +307,7 @@ def train(name: str, arguments: Sequence[str]) -> int:
     check_writable(chosen.out)
     env = env_id(chosen.system)
     played = (env, chosen.setup, chosen.condition, chosen.episode)
-    system, setup, record = suite.record_of(*played)
+    system, setup, record = suite.record_of(*played, chosen.config.episodes)
     title = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
     stem = chosen.out / f"{title}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
@@ -334,7 +334,7 @@ def train(name: str, arguments: Sequence[str]) -> int:
     )
     for label, cls in ESTIMATORS.classes().items():
         if cls.needs_training == name:
-            estimator = suite.load(cls, path, system)
+            estimator = suite.load(cls, path, system, setup)
             example = _report_training(label, estimator, played, result.loss)
             picture = stem.with_name(f"{stem.name}-{label}.png")
             write_figure(picture, state_figure(system, title=f"{label}: {title}", **example))
@@ -498,7 +498,7 @@ USAGE = """usage: pinnobs COMMAND ...
 
   systems [NAME]        list the systems, or print the page of one
   estimators [NAME]     list the estimators, or print what one is
-  train TRAINER ...     train an estimator on one episode
+  train TRAINER ...     train an estimator
   evaluate ...          score one estimator on one system
   leaderboard ...       run every estimator on every system
   estimate ...          estimate the states behind a sensor log

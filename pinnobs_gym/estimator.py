@@ -116,17 +116,13 @@ class Estimator(ABC):
     def output_variance(self) -> np.ndarray:
         """Diagonal of R, shape (ny,), in squared output units.
 
-        Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; the
-        scale of an output is that of the state with the largest influence on it at x̂₀, or one if
-        none has any there.
+        Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; see
+        `output_scale`.
         """
         benchmark = self.system.setups["benchmark"].noise_std
         told = benchmark if self.noise_std is None else self.noise_std
         std = vector(told, self.system.ny, "noise_std")
-        scale = vector(self.system.scale, self.system.nx, "scale")
-        H = self.system.h_jacobian(vector(self.system.setups["benchmark"].xhat0, len(scale), ""))
-        size = abs(H * scale).max(axis=-1)
-        return np.maximum(std, NOISE_FLOOR * np.where(size > 0, size, 1.0)) ** 2
+        return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
 
     @property
     def label(self) -> str:
@@ -147,6 +143,15 @@ class Estimator(ABC):
 
 NOISE_FLOOR = 1e-3
 """Least standard deviation of output noise in R, over the output's scale."""
+
+
+def output_scale(system: System) -> np.ndarray:
+    """The scale of each output, (ny,), in its unit: that of the state with the largest influence on
+    it at the benchmark's x̂₀, or one if none has any there."""
+    scale = vector(system.scale, system.nx, "scale")
+    H = system.h_jacobian(vector(system.setups["benchmark"].xhat0, system.nx, "xhat0"))
+    size = abs(H * scale).max(axis=-1)
+    return np.where(size > 0, size, 1.0)
 
 
 @dataclass(frozen=True)

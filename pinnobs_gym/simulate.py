@@ -264,10 +264,11 @@ def rows_of(system: System, rows: np.ndarray) -> System:
 
 
 def model_step(
-    system: System, t0: float, t1: float, x: Array, u0: Array | None = None, u1: Array | None = None
+    system: System, t0: Array, t1: Array, x: Array, u0: Array | None = None, u1: Array | None = None
 ) -> Array:
     """The state (..., nx) at t1 of the model that is in x at t0 (s), by the classical Runge-Kutta
-    method in equal steps of at most the system's `System.model_step`.
+    method in equal steps of at most the system's `System.model_step`. Rows (batch, nx) of x may
+    each have a time of their own, t0 and t1 then being (batch,), with the same t1 − t0 for all.
 
     ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1; they are used, joined by a
     straight line, only if the system's input is a measured one.
@@ -283,8 +284,8 @@ def model_step(
 
 def model_step_jacobian(
     system: System,
-    t0: float,
-    t1: float,
+    t0: float | np.ndarray,
+    t1: float | np.ndarray,
     x: np.ndarray,
     u0: np.ndarray | None = None,
     u1: np.ndarray | None = None,
@@ -305,8 +306,12 @@ def model_step_jacobian(
         k4 = system.f(t[2], points[3], u[2])
         x = x + (step / 6) * (k1 + 2 * (k2 + k3) + k4)
         # The variational equation Φ' = A(t)Φ, by the same method along the same stages.
-        stage_times = t[[0, 1, 1, 2], None]
-        A = system.f_jacobian(stage_times, points, u[[0, 1, 1, 2], None])
+        stage_times, stage_inputs = t[[0, 1, 1, 2]], u[[0, 1, 1, 2]]
+        if t.ndim == 1:
+            stage_times = stage_times[:, None]
+        if u.ndim == 2:
+            stage_inputs = stage_inputs[:, None]
+        A = system.f_jacobian(stage_times, points, stage_inputs)
         A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
         K1 = A[0]
         K2 = A[1] + product(A[1], (step / 2) * K1)
@@ -328,8 +333,8 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def substeps(
     system: System,
-    t0: float,
-    t1: float,
+    t0: Array,
+    t1: Array,
     x: Array,
     u0: Array | None,
     u1: Array | None,
@@ -337,18 +342,25 @@ def substeps(
 ) -> Iterator[tuple[Array, float, Array]]:
     """Yield, for each Runge-Kutta step of `model_step` from t0 to t1, the three times (s) at which
     f is evaluated, the step, and the inputs at these times, (3, ..., nu). No step is over
-    ``longest`` (s)."""
+    ``longest`` (s).
+
+    The times are (3,) or, where t0 is an array (batch,) of a time for each row, (3, batch); all
+    rows are then taken on by the same t1 − t0.
+    """
     xp = array_namespace(x)
     longest = min(longest, system.model_step or system.setups["benchmark"].dt)
-    count = max(1, int(np.ceil((t1 - t0) / longest - 1e-6)))
-    step = (t1 - t0) / count
+    whole = float(np.max(t1 - t0))
+    count = max(1, int(np.ceil(whole / longest - 1e-6)))
+    step = whole / count
     for k in range(count):
-        start = t0 + k * step
-        t = xp.asarray([start, start + step / 2, start + step], dtype=x.dtype)
+        start = k * step
+        after = xp.asarray([start, start + step / 2, start + step], dtype=x.dtype)
+        after = after.reshape(3, *([1] * np.ndim(t0)))
+        t = t0 + after
         if system.measured_input:
             if u0 is None or u1 is None:
                 raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
-            weight = ((t - t0) / (t1 - t0)).reshape(3, *([1] * u0.ndim))
+            weight = (after / whole).reshape(3, *([1] * u0.ndim))
             u = (1 - weight) * u0 + weight * u1
         else:
             u = system.input(t)

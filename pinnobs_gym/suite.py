@@ -33,7 +33,8 @@ from pinnobs_gym.system import Setup, System
 from pinnobs_gym.systems import SYSTEMS
 
 TRAINING_SEED = 10**6
-"""Seed of the episode that an estimator trained beforehand learns from; none is scored on it."""
+"""Seed of the first episode that an estimator trained beforehand learns from; further ones have the
+seeds after it, as many as its trainer's Config says (``episodes``). None is scored on them."""
 
 
 @dataclass(frozen=True)
@@ -183,11 +184,11 @@ def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
 
 
 def trained(cls: type[Estimator], job: Job) -> Estimator:
-    """The estimator trained on one episode that is never scored, loaded if that was done before."""
+    """The estimator trained on episodes that are never scored, loaded if that was done before."""
     module = trainer(str(cls.needs_training))
     recipe = module.Config(**job.training)
     place = (env_id(job.system), job.setup, job.condition, TRAINING_SEED)
-    system, setup, record = record_of(*place)
+    system, setup, record = record_of(*place, recipe.episodes)
     label = f"{_played(job)}-{cls.needs_training}-{_digest(recipe)}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
@@ -195,7 +196,7 @@ def trained(cls: type[Estimator], job: Job) -> Estimator:
             told = setup.noise_std
             result = module.train(system, recipe, record=record, noise_std=told, log=log)
         result.save(path)
-    return load(cls, path, system)
+    return load(cls, path, system, setup)
 
 
 def _played(job: Job) -> str:
@@ -208,8 +209,8 @@ def _digest(recipe: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
-def load(cls: type[Estimator], path: Path, system: System) -> Estimator:
-    """The trained estimator in a file.
+def load(cls: type[Estimator], path: Path, system: System, setup: Setup) -> Estimator:
+    """The trained estimator in a file, told what a setup says of the noise.
 
     Raises:
         ValueError: in one line, if it cannot be read or belongs to another system.
@@ -217,12 +218,15 @@ def load(cls: type[Estimator], path: Path, system: System) -> Estimator:
     if cls.needs_training is None:
         raise ValueError(f"estimator {ESTIMATORS.name_of(cls)!r} is not one that is trained first")
     trained_cls: Any = cls
-    return trained_cls.load(path, system)
+    estimator = trained_cls.load(path, system)
+    return replace(estimator, noise_std=setup.noise_std) if "noise" in cls.knows else estimator
 
 
-def record_of(name: str, setup: str, condition: str, seed: int) -> tuple[System, Setup, Record]:
-    """An env's model, what estimators are told of the setup, and the record of its episode of that
-    seed."""
-    env = make_vector_env(name, 1, setup, condition)
+def record_of(
+    name: str, setup: str, condition: str, seed: int, episodes: int = 1
+) -> tuple[System, Setup, Record]:
+    """An env's model, what estimators are told of the setup, and the record of its episodes of the
+    seeds from seed on."""
+    env = make_vector_env(name, episodes, setup, condition)
     env.reset(seed=seed)
     return env.source.system, env.source.setup, env.record()

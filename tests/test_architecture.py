@@ -24,7 +24,10 @@ ALLOWED = {
     "systems": {"system", "registry"},
     "network": {"system"},
     "quasi_newton": set(),
-    "estimators": {"estimator", "record", "simulate", "system", "network", "registry"},
+    "estimators": {
+        *{"estimators", "estimator", "record", "simulate", "system", "network", "registry"}
+    },
+    "training": set(),
 }
 """What a module or subpackage may import of ours; itself is a case of its own below."""
 FORBIDDEN = {

@@ -84,8 +84,11 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["evaluate", "--system", "Academic", "--checkpoint", "x"], "is not one that is trained"),
         (["evaluate", "--system", "Academic", "--out", "file/x"], "cannot write"),
         (["systems", "Duffing"], "unknown system 'Duffing'"),
-        (["train"], "name a trainer first: pinnobs train pinn_obs"),
-        (["train", "gpt", "--system", "Academic"], "unknown trainer 'gpt'; known are pinn_obs"),
+        (["train"], "name a trainer first: pinnobs train pinn_gain | pinn_obs"),
+        (
+            ["train", "gpt", "--system", "Academic"],
+            "unknown trainer 'gpt'; known are pinn_gain, pinn_obs",
+        ),
         (["leaderboard", "--out", "file/x"], "cannot write to folder file/x"),
         (["leaderboard", "--jobs", "0"], "jobs=0"),
         (["leaderboard", "--condition", "load_step"], "needs a plant with a load torque"),
@@ -205,6 +208,19 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     trained.write_bytes(trained.read_bytes()[:100])
     assert run(*scored, "--system", "ReverseDuffing", "--episodes", "2") == 2
     assert "is damaged or no file of saved weights" in capsys.readouterr().err
+
+
+def test_a_gain_is_trained_on_several_episodes_and_told_the_noise(folder, capsys):
+    small = ["--episodes", "8", "--held-out", "2", "--iterations", "3", "--streams", "4"]
+    where = ["--system", "Academic", "--out", "tr"]
+    assert run("train", "pinn_gain", *where, *small) == 0
+    assert "pinn_gain on own record" in capsys.readouterr().out
+    (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
+    scored = ["evaluate", "--estimator", "pinn_gain", "--checkpoint", trained, "--out", "ev"]
+    for condition in ("nominal", "noise5"):
+        more = ["--system", "Academic", "--episodes", "2", "--condition", condition]
+        assert run(*scored, *more) == 0
+    assert len({row["config_hash"] for row in rows.read(folder / "ev" / "rows.jsonl")}) == 2
 
 
 def test_an_estimators_fault_is_one_line(folder, capsys):

@@ -1,1 +1,2 @@
-"""Trainers of learned estimators, one file each: a Config and `train`."""
+"""Trainers of learned estimators, a module or package each: a Config, whose ``episodes`` says how
+many episodes the training takes, and `train`."""

@@ -6,10 +6,7 @@ Nonlinear Dynamical Systems". Equation numbers are the paper's.
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,10 +18,11 @@ from pinnobs_gym.estimators.pinn_obs import Trained, estimates_of
 from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
+from pinnobs_gym.training import bar, interruption
 from trainers.pinn_obs.config import Config
 from trainers.pinn_obs.fast import FastRun
 from trainers.pinn_obs.paper import PaperRun, Samples, loss_terms
-from trainers.pinn_obs.progress import bar, gain_figure, log_end, log_held_out, log_terms
+from trainers.pinn_obs.progress import described, gain_figure, log_end, log_held_out, log_terms
 from trainers.pinn_obs.run import Run
 
 __all__ = ["Config", "PinnObs", "Samples", "gain_figure", "loss_terms", "train"]
@@ -76,7 +74,7 @@ def train(
     if resume and checkpoint is not None:
         run.restore(checkpoint)
     try:
-        with bar(config.iterations if progress else None) as show, _interruption() as stopped:
+        with bar(config.iterations if progress else None) as show, interruption() as stopped:
             while not run.finished() and not (stopped and run.best):
                 _iterate(run, log, checkpoint, show if progress else None)
         if checkpoint is not None and run.best is not None:
@@ -89,30 +87,8 @@ def train(
     return trained
 
 
-@contextmanager
-def _interruption() -> Iterator[list[bool]]:
-    """A list that Ctrl-C puts something into, so that training ends between two iterations; a
-    second Ctrl-C ends it at once. Elsewhere than in the main thread Ctrl-C is as ever."""
-    stopped: list[bool] = []
-    ours = threading.current_thread() is threading.main_thread()
-    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield stopped
-        return
-
-    def stop(number: int, frame: object) -> None:
-        if stopped:
-            raise KeyboardInterrupt
-        stopped.append(True)
-
-    signal.signal(signal.SIGINT, stop)
-    try:
-        yield stopped
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _iterate(
-    run: Run, log: Log, checkpoint: Path | None, show: Callable[[Run], None] | None
+    run: Run, log: Log, checkpoint: Path | None, show: Callable[[int, str], None] | None
 ) -> None:
     """One iteration, and what is to be shown and kept of it."""
     config = run.config
@@ -123,7 +99,7 @@ def _iterate(
     if told:
         log_terms(log, run)
         if show is not None:
-            show(run)
+            show(run.iteration, described(run))
     if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
         run.save(checkpoint)
 

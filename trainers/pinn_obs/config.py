@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
 from pinnobs_gym.network import Activation, Architecture, Precision
+from pinnobs_gym.training import expect
 
 Preset: TypeAlias = Literal["fast", "paper"]
 
@@ -57,6 +57,9 @@ class Config:
     Settings that are not given are those of the preset: ``Config("paper", width=30)``. To change
     the preset of a config that is there, make a new one: its other settings are no longer open.
     """
+
+    episodes: ClassVar[int] = 1
+    """How many episodes it is trained on."""
 
     preset: Preset = "fast"
     """Where the other settings come from: the paper's recipe, or a fast one."""
@@ -110,37 +113,27 @@ class Config:
     """Iterations from one point of the logged curves to the next."""
 
     def __post_init__(self) -> None:
-        _expect(self, "preset", " or ".join(get_args(Preset)), lambda v: v in PRESETS)
+        expect(self, "preset", " or ".join(get_args(Preset)), lambda v: v in PRESETS)
         for name, value in PRESETS[self.preset].items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
         Architecture(1, 1, self.depth, self.width, self.activation, self.dtype)
         for name in ("iterations", "patience", "checkpoint_every", "log_every"):
-            _expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
-        _expect(self, "seed", "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
+            expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
+        expect(self, "seed", "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
         for name in ("w0", "w_ode", "w_y", "guide", "gain_penalty"):
-            _expect(self, name, "a number of at least 0", lambda v: 0 <= v < math.inf)
-        _expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
-        _expect(self, "improvement", "a number of at least 0 and under 1", lambda v: 0 <= v < 1)
-        _expect(self, "train_fraction", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
-        _expect(self, "optimiser", "adam or ssbroyden", lambda v: v in ("adam", "ssbroyden"))
-        _expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
+            expect(self, name, "a number of at least 0", lambda v: 0 <= v < math.inf)
+        expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
+        expect(self, "improvement", "a number of at least 0 and under 1", lambda v: 0 <= v < 1)
+        expect(self, "train_fraction", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
+        expect(self, "optimiser", "adam or ssbroyden", lambda v: v in ("adam", "ssbroyden"))
+        expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
         if self.optimiser == "ssbroyden":
-            _expect(self, "points", "a whole number of at least 10", lambda v: v == int(v) >= 10)
-            _expect(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
-            _expect(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
+            expect(self, "points", "a whole number of at least 10", lambda v: v == int(v) >= 10)
+            expect(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
+            expect(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
         if not self.guide:
-            _expect(self, "transfer", "False without a guide", lambda v: v is False)
+            expect(self, "transfer", "False without a guide", lambda v: v is False)
         if self.optimiser == "adam":
             for name in ("guide", "gain_penalty"):
-                _expect(self, name, "0 with adam", lambda v: v == 0)
-
-
-def _expect(config: Config, name: str, expected: str, fits: Callable[[Any], bool]) -> None:
-    value = getattr(config, name)
-    try:
-        good = fits(value)
-    except (TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
-        raise ValueError(f"{name}={value!r}; expected {expected}")
+                expect(self, name, "0 with adam", lambda v: v == 0)

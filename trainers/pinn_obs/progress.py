@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,27 +63,9 @@ def gain_figure(t: np.ndarray, L: np.ndarray) -> Figure:
     return figure
 
 
-@contextmanager
-def bar(total: int | None) -> Iterator[Callable[[Run], None]]:
-    """A progress bar in the terminal, as a function that renews it; nothing without a total."""
-    if total is None:
-        yield lambda run: None
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.completed}/{task.total}"),
-        BarColumn(bar_width=20),
-        TextColumn("{task.description}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns) as shown:
-        task = shown.add_task("", total=total)
-
-        def show(run: Run) -> None:
-            parts = zip(_TERMS, run.terms().tolist(), strict=True)
-            text = " ".join(f"{name} {value:.2e}" for name, value in parts)
-            best = f"{run.best.loss:.2e}" if run.best else "none"
-            shown.update(task, completed=run.iteration, description=f"{text} best {best}")
-
-        yield show
+def described(run: Run) -> str:
+    """The terms of the loss and the best so far, in a line."""
+    parts = zip(_TERMS, run.terms().tolist(), strict=True)
+    text = " ".join(f"{name} {value:.2e}" for name, value in parts)
+    best = f"{run.best.loss:.2e}" if run.best else "none"
+    return f"{text} best {best}"

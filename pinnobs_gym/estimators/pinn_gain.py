@@ -1,0 +1,187 @@
+"""A gain shared by all episodes, trained beforehand from outputs and equations alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from pinnobs_gym.estimator import Estimator, State, output_scale
+from pinnobs_gym.estimators.ekf import EKF, innovated, kalman_gain, predicted, update_with
+from pinnobs_gym.estimators.gain_network import (
+    Variant,
+    corrected_gain,
+    memory_size,
+    recurrent_gain,
+    remembered,
+    shapes,
+)
+from pinnobs_gym.estimators.pinn_obs import check_same, identity, read, write
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step
+from pinnobs_gym.system import System, vector
+
+Layers = tuple[tuple[np.ndarray, np.ndarray], ...]
+"""Weights (rows, columns) and biases (rows,) of each layer."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedGain:
+    """A network that gives gains, and how its training went."""
+
+    layers: Layers
+    """Weights and biases; those of the least held-out loss."""
+    variant: Variant
+    """``kalman`` corrects a Kalman gain; ``gru`` is a recurrent network alone."""
+    system: str
+    """Class name of the system."""
+    parameters: Mapping[str, Any]
+    """The system's physical parameters, as JSON holds them."""
+    noise_std: tuple[float, ...]
+    """Standard deviations of the output noise that training was told, in output units."""
+    config: Mapping[str, Any]
+    """The trainer's settings."""
+    seed: int
+    """What the weights were drawn from; it is not the config's if training had to restart."""
+    loss: float
+    """The error on held-out episodes, over the EKF's; see the trainer."""
+    iterations: int
+    """Iterations made, of which the best is one."""
+    seconds: float
+    """CPU time in s that they took."""
+
+    @property
+    def width(self) -> int:
+        """Neurons in a hidden layer."""
+        return self.layers[-1][0].shape[1]
+
+    def save(self, path: str | Path) -> None:
+        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
+
+        Raises:
+            ValueError: in one line, if the file cannot be written.
+        """
+        facts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "layers"}
+        layers = [[torch.tensor(a) for a in layer] for layer in self.layers]
+        write(path, {"facts": json.dumps(facts), "layers": layers})
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """Read what `save` wrote, for the system it was trained on.
+
+        Raises:
+            ValueError: in one line, if there is no such file, if it is something else or damaged,
+                or if it belongs to another system, other parameters or other sizes.
+        """
+        saved = read(path)
+        try:
+            facts = json.loads(saved["facts"])
+            facts["noise_std"] = tuple(facts["noise_std"])
+            layers = tuple((W.numpy(), b.numpy()) for W, b in saved["layers"])
+            trained = cls(layers=layers, **facts)
+            found = {"system": trained.system, "parameters": trained.parameters}
+            check_same(path, found, {n: identity(system)[n] for n in found})
+            sizes = [W.shape for W, b in layers if b.shape == W.shape[:1]]
+            expected = shapes(trained.variant, system.nx, system.ny, trained.width)
+        except (KeyError, TypeError, IndexError, AttributeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path} is not a saved gain: {reason}") from None
+        check_same(
+            path, {"sizes": [list(s) for s in sizes]}, {"sizes": [list(s) for s in expected]}
+        )
+        return trained
+
+
+@dataclass(frozen=True)
+class PinnGain(Estimator):
+    """A Kalman filter whose gain a small network corrects, one network for all episodes; it is
+    trained beforehand on outputs and the model's equations and never sees a true state.
+
+    Prediction, default tuning and covariance are those of the `EKF`. At a sample the network sees
+    the prediction, its covariance, the innovation and how large innovations were of late, and
+    multiplies and shifts the Kalman gain, within bounds and less the smaller P
+    (`gain_network.corrected_gain`); P follows in Joseph's form with the gain that is used. The
+    network is told the noise through R, so that it can be run at another noise than it was trained
+    at. The form is near that of Recursive KalmanNet (Mortada et al. 2025) and KalmanNet (Revach et
+    al. 2022), which learn from true states.
+
+    The variant ``gru`` is a recurrent network that gives the gain of x̂ = x̂⁻ + K(y − h(x̂⁻)) alone;
+    it has no covariance.
+    """
+
+    trained: TrainedGain = field(kw_only=True, repr=False)
+    """The trained network."""
+    process_noise: float = 1e-4
+    """Standard deviation of the process noise per sample, over the state's scale."""
+
+    name = "pinn_gain"
+    needs_training = "pinn_gain"
+
+    def reset(self, prior: Prior) -> State:
+        return self.begin(prior, self.output_variance[:, None])
+
+    def begin(self, prior: Prior, variance: np.ndarray) -> State:
+        """What `reset` does, told variances of the output noise that may differ from row to row:
+        shape (ny, batch or 1)."""
+        batch = len(prior.mean)
+        scale = vector(self.system.scale, self.system.nx, "scale")[:, None]
+        size = memory_size(self.trained.variant, self.system.ny, self.trained.width)
+        if self.trained.variant == "gru":
+            fixed = scale, output_scale(self.system)[:, None], np.sqrt(variance)
+            return State(prior.mean, memory=(fixed, np.zeros((size, batch))))
+        Q, _ = EKF(self.system, self.noise_std, self.process_noise).tuning()
+        R = np.eye(self.system.ny)[..., None] * variance
+        return State(prior.mean, P=prior.cov, memory=((scale, Q, R), np.ones((size, batch))))
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        if self.trained.variant == "gru":
+            return self._recurrent(state, t, y, u)
+        fixed, memory = state.memory
+        scale, Q, R = fixed
+        xhat, P = predicted(self.system, state, t, u, Q)
+        innovation, H = innovated(self.system, xhat, y)
+        K, S = kalman_gain(P, H, R)
+        e, variance = np.ascontiguousarray(innovation.T), np.einsum("iib->ib", S)
+        share = np.maximum(1 - np.einsum("iib->ib", R) / variance, 0.0)
+        x = np.ascontiguousarray(xhat.T)
+        layers = self.trained.layers
+        K = corrected_gain(layers, scale, x, P, e, variance, K, share, memory)
+        memory = remembered(memory, e, variance, ~np.isnan(y).T)
+        xhat, P = update_with(K, xhat, P, innovation, H, R)
+        P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
+        return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), (fixed, memory))
+
+    def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        fixed, memory = state.memory
+        scale, size, std = fixed
+        xhat = state.xhat
+        if state.t is not None:
+            xhat = model_step(self.system, state.t, t, xhat, state.u, u)
+        innovation = np.where(np.isnan(y), 0.0, y - self.system.h(xhat))
+        x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
+        told = np.broadcast_to(std, e.shape)
+        K, memory = recurrent_gain(self.trained.layers, scale, size, x, e, told, memory)
+        xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
+        return State(xhat, t, u, innovation=innovation, memory=(fixed, memory))
+
+    def save(self, path: str | Path) -> None:
+        """Write the trained network to a file; see `TrainedGain.save`."""
+        self.trained.save(path)
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """The estimator with the network in a file, told the noise of its training; see
+        `TrainedGain.load`."""
+        trained = TrainedGain.load(path, system)
+        return cls(system, trained.noise_std, trained=trained)
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How the network was trained."""
+        names = ("seed", "loss", "iterations", "seconds", "config")
+        return {"trainer": "pinn_gain", **{name: getattr(self.trained, name) for name in names}}

@@ -1,0 +1,118 @@
+"""The shared gain against the EKF on episodes that neither has seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks import Figure, at_most, cpu_seconds
+from pinnobs_gym import env_id, evaluate
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
+from pinnobs_gym.rows import Row
+from pinnobs_gym.suite import TRAINING_SEED, record_of
+from pinnobs_gym.systems import SYSTEMS
+from trainers.pinn_gain import Config, train
+
+SEEDS = 3
+"""Training seeds, of which the median counts."""
+EPISODES = 100
+"""Episodes of seeds 0, 1, ..."""
+CONDITIONS = ("nominal", "noise5")
+WHOLE = {"ReverseDuffing": 0.8, "InductionMotor": 0.8}
+"""Asked of the whole window's NRMSE over the EKF's; one elsewhere."""
+
+
+def figures(repeats: int) -> Iterator[Figure]:
+    """The shared gain, system by system."""
+    for name in SYSTEMS.classes():
+        yield from of_system(name, repeats)
+
+
+def of_system(name: str, repeats: int) -> Iterator[Figure]:
+    """The figures of all training seeds on one system, their medians, and its speed."""
+    ratios: dict[tuple[str, str], list[float]] = {}
+    trainings = []
+    for seed in range(SEEDS):
+        trainings.append(trained_on(name, seed))
+        yield at_most(f"training of {name}, seed {seed}", trainings[-1].seconds, "CPU s", 600.0)
+        for condition in CONDITIONS:
+            for what, value in compared(name, condition, trainings[-1]).items():
+                ratios.setdefault((condition, what), []).append(value)
+                yield Figure(f"{what}, {name}, {condition}, seed {seed}", value, "", "", None)
+    for (condition, what), values in ratios.items():
+        bound = asked(name, condition, what, ratios)
+        title = f"{what}, {name}, {condition}, median of {SEEDS} seeds"
+        median = float(np.median(values))
+        known = bound is not None
+        yield at_most(title, median, "", bound) if known else Figure(title, median, "", "", None)
+    yield from speed(name, trainings[-1], repeats)
+
+
+def trained_on(name: str, seed: int) -> TrainedGain:
+    """A gain trained by the default recipe."""
+    config = Config(seed=seed)
+    place = (env_id(name), "benchmark", "nominal", TRAINING_SEED)
+    system, setup, record = record_of(*place, config.episodes)
+    return train(system, config, record=record, noise_std=setup.noise_std)
+
+
+def compared(name: str, condition: str, trained: TrainedGain) -> dict[str, float]:
+    """The scores of a gain and of the EKF, both told the noise; see `summary`."""
+    env = env_id(name)
+    system, setup, _ = record_of(env, "benchmark", condition, 0)
+    ekf, gain = EKF(system, setup.noise_std), PinnGain(system, setup.noise_std, trained=trained)
+    scores = (evaluate(e, env, episodes=EPISODES, condition=condition) for e in (ekf, gain))
+    return summary(*scores)
+
+
+def summary(ekf: list[Row], gain: list[Row]) -> dict[str, float]:
+    """Both rates of divergence, and the gain's figures over the EKF's, all modulo states that no
+    output tells apart."""
+    found = {}
+    for label, rows in (("EKF", ekf), ("gain", gain)):
+        found[f"diverged, {label}"] = float(
+            np.mean([not r["nrmse_tail_modulo"] <= 0.2 for r in rows])
+        )
+    for what, key, part in (
+        ("tail NRMSE", "nrmse_tail_modulo", 0.5),
+        ("whole NRMSE", "nrmse_modulo", 0.5),
+        ("settling median", "settling", 0.5),
+        ("settling 90th percentile", "settling", 0.9),
+    ):
+        # Episodes that never settle count as infinite, between which nothing can be interpolated.
+        own, peer = (
+            np.quantile([r[key] for r in rows], part, method="higher") for rows in (gain, ekf)
+        )
+        found[f"{what} / EKF's"] = float(own / peer)
+    return found
+
+
+def asked(
+    name: str, condition: str, what: str, found: dict[tuple[str, str], list[float]]
+) -> float | None:
+    """What is asked of a median, if anything."""
+    if what == "diverged, gain":
+        return 0.0 if condition == "nominal" else found[condition, "diverged, EKF"][0]
+    if what == "tail NRMSE / EKF's":
+        return 1.15
+    if condition != "nominal":
+        return None
+    if what == "whole NRMSE / EKF's":
+        return WHOLE.get(name, 1.0)
+    if what == "settling 90th percentile / EKF's" and name == "ReverseDuffing":
+        return 0.5
+    return None
+
+
+def speed(name: str, trained: TrainedGain, repeats: int) -> Iterator[Figure]:
+    """Time per step and episode of a batch of 256."""
+    system, setup, record = record_of(env_id(name), "benchmark", "nominal", 0, 256)
+    steps = record.batch * record.num_samples
+    gain = PinnGain(system, setup.noise_std, trained=trained)
+    for label, estimator in (("EKF", EKF(system, setup.noise_std)), ("gain", gain)):
+        seconds = [cpu_seconds(lambda e=estimator: e.run(record)) for _ in range(repeats)]
+        value = float(np.median(seconds)) / steps * 1e6
+        title = f"{label} of 256 episodes of {name}, per step and episode"
+        yield Figure(title, value, "µs", "", None)

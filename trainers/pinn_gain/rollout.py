@@ -1,0 +1,108 @@
+"""The learned gains run over a batch of streams in torch, so that losses have gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pinnobs_gym.estimators.gain_network import (
+    Variant,
+    corrected_gain,
+    recurrent_gain,
+    remembered,
+)
+from pinnobs_gym.simulate import model_step_jacobian
+from pinnobs_gym.system import System
+
+Weights = Sequence[tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Model:
+    """What all steps of a rollout share."""
+
+    system: System
+    variant: Variant
+    scale: Tensor
+    """Shape (nx, 1)."""
+    output_scale: Tensor
+    """Shape (ny, 1)."""
+    Q: Tensor
+    """Covariance of the process noise of a sample, shape (nx, nx, 1)."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The estimates of all streams after a sample, the batch last."""
+
+    xhat: Tensor
+    """Shape (nx, batch)."""
+    P: Tensor
+    """Shape (nx, nx, batch); carried along unchanged by the variant without a covariance."""
+    memory: Tensor
+    """Shape (memory size, batch)."""
+
+
+def predict(
+    model: Model, moment: Moment, t: tuple[np.ndarray, np.ndarray], u: tuple[np.ndarray, np.ndarray]
+) -> Moment:
+    """The prediction over one sample, from times t[0] to t[1], (batch,) in s, at inputs u[0] and
+    u[1], (batch, nu).
+
+    The derivative of the step is its exact Jacobian, which the covariance needs anyway. That the
+    Jacobian itself depends on x̂ is left out of gradients: the points of linearisation are fixed.
+    """
+    at = moment.xhat.detach()
+    x = np.ascontiguousarray(at.numpy().T)
+    after, F = model_step_jacobian(model.system, t[0], t[1], x, u[0], u[1])
+    flow = torch.from_numpy(np.ascontiguousarray(F.transpose(1, 2, 0)))
+    moved = (flow * (moment.xhat - at)[None]).sum(1)
+    xhat = torch.from_numpy(np.ascontiguousarray(after.T)) + moved
+    P = _product(_product(flow, moment.P), flow.transpose(0, 1)) + model.Q
+    return Moment(xhat, P, moment.memory)
+
+
+def update(model: Model, weights: Weights, moment: Moment, y: Tensor, R: Tensor) -> Moment:
+    """The estimates after outputs y (ny, batch), with noise of covariance R (ny, ny, batch); none
+    is missing."""
+    xhat, P = moment.xhat, moment.P
+    at = xhat.detach()
+    x = at.numpy().T
+    H = np.broadcast_to(model.system.h_jacobian(x), (len(x), len(y), len(xhat)))
+    H = torch.from_numpy(np.array(H.transpose(1, 2, 0), order="C"))
+    predicted = torch.from_numpy(np.array(model.system.h(x).T, order="C"))
+    innovation = y - predicted - (H * (xhat - at)[None]).sum(1)
+    if model.variant == "gru":
+        std = torch.diagonal(R).T.sqrt()
+        sizes = model.scale, model.output_scale
+        K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, moment.memory)
+        return Moment(xhat + (K * innovation[None]).sum(1), P, memory)
+    HP = _product(H, P)
+    S = _product(HP, H.transpose(0, 1)) + R
+    K = _divide(HP.transpose(0, 1), S)
+    variance = torch.diagonal(S).T
+    share = 1 - torch.diagonal(R).T / variance
+    args = (xhat, P, innovation, variance, K, share, moment.memory)
+    K = corrected_gain(weights, model.scale, *args)
+    there = torch.ones_like(innovation, dtype=torch.bool)
+    memory = remembered(moment.memory, innovation, variance, there)
+    M = torch.eye(len(xhat), dtype=xhat.dtype)[..., None] - _product(K, H)
+    P = _product(_product(M, P), M.transpose(0, 1))
+    P = P + _product(_product(K, R), K.transpose(0, 1))
+    P = (P + P.transpose(0, 1)) / 2
+    return Moment(xhat + (K * innovation[None]).sum(1), P, memory)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """The matrix products (n, m, batch) of (n, k, batch) and (k, m, batch)."""
+    return (a[:, :, None] * b[None]).sum(1)
+
+
+def _divide(PHt: Tensor, S: Tensor) -> Tensor:
+    if len(S) == 1:
+        return PHt / S
+    return _product(PHt, torch.linalg.inv(S.permute(2, 0, 1)).permute(1, 2, 0))
