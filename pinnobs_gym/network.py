@@ -20,33 +20,28 @@ Precision: TypeAlias = Literal["float32", "float64"]
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
-def _tanh(z: Array) -> tuple[Array, Array]:
-    value = array_namespace(z).tanh(z)
-    return value, 1 - value * value
+def _tanh(z: Array) -> Array:
+    return array_namespace(z).tanh(z)
 
 
-def _sine(z: Array) -> tuple[Array, Array]:
-    xp = array_namespace(z)
-    return xp.sin(z), xp.cos(z)
+def _sine(z: Array) -> Array:
+    return array_namespace(z).sin(z)
 
 
-def _sigmoid(z: Array) -> tuple[Array, Array]:
-    value = 0.5 + 0.5 * array_namespace(z).tanh(0.5 * z)
-    return value, value * (1 - value)
+def _sigmoid(z: Array) -> Array:
+    return 0.5 + 0.5 * array_namespace(z).tanh(0.5 * z)
 
 
-def _relu(z: Array) -> tuple[Array, Array]:
-    slope = array_namespace(z).astype(z > 0, z.dtype)
-    return z * slope, slope
+def _relu(z: Array) -> Array:
+    return z * (z > 0)
 
 
-_ACTIVATIONS: dict[str, Callable[[Array], tuple[Array, Array]]] = {
+_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": _tanh,
     "sine": _sine,
     "sigmoid": _sigmoid,
     "relu": _relu,
 }
-"""Each activation and its derivative."""
 
 
 @dataclass(frozen=True)
@@ -160,25 +155,8 @@ class Network(nn.Module):
         *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
         a, _ = self.architecture.features(t)
         for W, b in hidden:
-            a, _ = self._activation(nn.functional.linear(a, W, b))
+            a = self._activation(nn.functional.linear(a, W, b))
         return self._split(nn.functional.linear(a, weight, bias))
-
-    def with_rate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What `forward` returns, and dx̂/dt (..., nx) in state units per s.
-
-        The derivative is carried along through the layers (forward-mode differentiation by hand):
-        one reverse pass then gives the gradient of a loss of all three, which is faster than
-        differentiating twice in reverse.
-        """
-        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
-        a, rate = self.architecture.features(t)
-        for W, b in hidden:
-            a, slope = self._activation(nn.functional.linear(a, W, b))
-            rate = slope * nn.functional.linear(rate, W)
-        xhat, L = self._split(nn.functional.linear(a, weight, bias))
-        nx = self.architecture.nx
-        rate = nn.functional.linear(rate, weight[:nx])
-        return xhat, L, rate if self._scale is None else rate * self._scale[:nx]
 
     def _split(self, out: Tensor) -> tuple[Tensor, Tensor]:
         nx, ny = self.architecture.nx, self.architecture.ny
@@ -205,7 +183,7 @@ def evaluate(
     a, _ = architecture.features(np.asarray(t, dtype=float))
     *hidden, (weight, bias) = layers
     for W, b in hidden:
-        a, _ = activation(a @ W.T + b)
+        a = activation(a @ W.T + b)
     out = a @ weight.T + bias
     if architecture.scale is not None:
         out *= architecture.scale

@@ -17,7 +17,11 @@ from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import truth
 from pinnobs_gym.system import Setup, System, matrix, stack
 from pinnobs_gym.systems import SYSTEMS
-from trainers.pinn_obs import Config, PinnObs, Samples, loss_terms, train
+from trainers.pinn_obs import Config, PinnObs, train
+from trainers.pinn_obs.adam import Adam
+from trainers.pinn_obs.objective import Objective, Weights
+from trainers.pinn_obs.passes import Passes, strung, unstrung
+from trainers.pinn_obs.points import samples_of
 
 
 def box(nx):
@@ -136,16 +140,26 @@ def test_the_rate_is_the_derivative_of_the_estimate(activation):
         for weight, bias in zip(network.weights, network.biases, strict=True):
             weight.mul_(2)
             bias.normal_(generator=generator)
-    t = torch.linspace(-3, 20, 7 * 4, dtype=torch.float64).reshape(7, 4).requires_grad_()
-    xhat, L, rate = network.with_rate(t)
-    plain_xhat, plain_L = network(t)
-    assert torch.equal(xhat, plain_xhat)
-    assert torch.equal(L, plain_L)
-    assert L.shape == (7, 4, 3, 2)
+    t = torch.linspace(-3, 20, 28, dtype=torch.float64).requires_grad_()
+    out, rate = Passes(network.architecture, t.detach().numpy()).forward(strung(network))
+    xhat, L = network(t)
+    assert L.shape == (28, 3, 2)
+    expected = torch.cat([xhat, L.flatten(1)], dim=1).detach().numpy()
+    np.testing.assert_allclose(out.T, expected, rtol=1e-12, atol=1e-12)
     for i in range(3):
-        (expected,) = torch.autograd.grad(plain_xhat[..., i].sum(), t, retain_graph=True)
-        assert expected.abs().max() > 1e-3
-        torch.testing.assert_close(rate[..., i], expected, rtol=1e-10, atol=1e-10)
+        (derivative,) = torch.autograd.grad(xhat[:, i].sum(), t, retain_graph=True)
+        assert derivative.abs().max() > 1e-3
+        np.testing.assert_allclose(rate[i], derivative, rtol=1e-10, atol=1e-10)
+
+
+def test_weights_in_one_vector_make_the_same_network_again():
+    network = Network(Architecture(3, 2, 2, 5), torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        for k, bias in enumerate(network.biases):
+            bias.fill_(k + 0.5)
+    again = unstrung(network.architecture, strung(network))
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
 
 
 def test_weights_are_drawn_as_glorot_and_bengio_propose():
@@ -192,8 +206,26 @@ def reference_terms(network, record, chosen, f, h, u):
     return initial @ initial, equation, output * len(y[0]) / there
 
 
+def gradient_of(network):
+    """What `backward` left, in the order of `strung`."""
+    pairs = zip(network.weights, network.biases, strict=True)
+    zero = [(W.grad, torch.zeros_like(b) if b.grad is None else b.grad) for W, b in pairs]
+    return torch.cat([torch.cat([W, b[:, None]], dim=1).flatten() for W, b in zero]).numpy()
+
+
 def mixer_f(t, x, u):
     return torch.stack([x[1] * x[2] + u[0], torch.sin(x[0]) * t - x[1], u[1] * x[0] - x[2]])
+
+
+def duffing_terms(network, record, chosen):
+    return reference_terms(
+        network,
+        record,
+        chosen,
+        lambda t, x, u: torch.stack([x[1] ** 3, -x[0]]),
+        lambda x: x[:1],
+        lambda t: None,
+    )
 
 
 @pytest.mark.parametrize("missing", [False, True])
@@ -204,7 +236,7 @@ def test_the_loss_and_its_gradient_are_those_of_autograd(missing):
         record.y[0, [2, 5, 5, 9], [0, 0, 1, 1]] = np.nan
     network = Network(Architecture(3, 2, 2, 6, dtype="float64"), torch.Generator().manual_seed(4))
     chosen = np.array([1, 2, 5, 6, 9, 11])  # t₀ is not among them
-    terms = loss_terms(network, system, Samples.of(system, record, chosen, torch.float64))
+    points, theta = samples_of(system, record, chosen), strung(network)
     expected = reference_terms(
         network,
         record,
@@ -213,24 +245,51 @@ def test_the_loss_and_its_gradient_are_those_of_autograd(missing):
         lambda x: torch.stack([x[0] * x[1], x[2] ** 2]),
         lambda t: torch.tensor([math.cos(t), t * t]),
     )
-    parameters = list(network.parameters())
-    for term, reference in zip(terms, expected, strict=True):
+    for i, reference in enumerate(expected):
+        weights = Weights(*(np.full(size, float(i == j)) for j, size in enumerate((3, 3, 2))))
+        objective = Objective(network.architecture, system, points, weights)
+        loss, gradient = objective(theta)
         assert reference.item() > 1e-3
-        torch.testing.assert_close(term, reference, rtol=1e-12, atol=0.0)
-        options = {"retain_graph": True, "materialize_grads": True}
-        ours = torch.autograd.grad(term, parameters, **options)
-        theirs = torch.autograd.grad(reference, parameters, **options)
-        for one, other in zip(ours, theirs, strict=True):
-            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+        assert loss == pytest.approx(reference.item(), rel=1e-12)
+        assert objective.terms(theta)[i] == pytest.approx(loss, rel=1e-12)
+        network.zero_grad()
+        reference.backward(retain_graph=True)
+        np.testing.assert_allclose(gradient, gradient_of(network), rtol=1e-9, atol=1e-12)
 
 
 def test_a_measured_input_is_taken_from_the_record():
     record = random_record(Mixer(), 12)
     everything = np.arange(12)
-    told = Samples.of(Mixer(measured_input=True), record, everything, torch.float64)
-    known = Samples.of(Mixer(), record, everything, torch.float64)
-    assert np.array_equal(told.u.numpy(), record.u[0])
-    assert np.allclose(known.u.numpy(), np.stack([np.cos(record.t), record.t**2], axis=-1))
+    told = samples_of(Mixer(measured_input=True), record, everything)
+    known = samples_of(Mixer(), record, everything)
+    assert np.array_equal(told.u, record.u[0])
+    assert np.allclose(known.u, np.stack([np.cos(record.t), record.t**2], axis=-1))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_adam_steps_as_torchs_does(dtype):
+    def hilly(x):
+        value = (x**4).sum() + (x * x.roll(1)).sin().sum() / 3
+        return value
+
+    def objective(x):
+        given = torch.tensor(x, requires_grad=True)
+        value = hilly(given)
+        value.backward()
+        return value.item(), given.grad.numpy()
+
+    x = np.random.default_rng(0).standard_normal(7).astype(dtype)
+    theirs = torch.nn.Parameter(torch.tensor(x))
+    optimiser = torch.optim.Adam([theirs], lr=0.01)
+    method = Adam.start(objective, x, 0.01)
+    for _ in range(200):
+        optimiser.zero_grad()
+        hilly(theirs).backward()
+        optimiser.step()
+        assert method.step(objective)
+        assert method.x.dtype == dtype
+        tolerance = 1e-4 if dtype == "float32" else 1e-12
+        np.testing.assert_allclose(method.x, theirs.detach(), rtol=tolerance, atol=tolerance)
 
 
 # Replay
@@ -407,14 +466,11 @@ def test_the_weights_of_the_loss_and_the_training_samples_are_those_asked_for():
     trained = train(system, config, record=record)
 
     def terms(chosen):
-        return loss_terms(
-            trained.network, system, Samples.of(system, record, chosen, torch.float64)
-        ).detach()
+        return np.array([term.item() for term in duffing_terms(trained.network, record, chosen)])
 
     chosen = np.sort(np.random.default_rng(0).permutation(201)[:121])  # 60 % of 201
-    expected = terms(chosen) @ torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)
-    assert trained.loss == pytest.approx(expected.item(), rel=1e-12)
-    assert trained.loss != pytest.approx(terms(np.arange(201)).sum().item(), rel=1e-3)
+    assert trained.loss == pytest.approx(terms(chosen) @ [0.5, 2.0, 3.0], rel=1e-12)
+    assert trained.loss != pytest.approx(terms(np.arange(201)).sum(), rel=1e-3)
 
 
 def test_the_seed_decides_the_weights(trained):
@@ -455,8 +511,8 @@ def test_ctrl_c_keeps_the_best_weights():
     assert trained.loss == pytest.approx(min(log.losses), rel=1e-12)
     assert trained.loss < log.losses[-1]  # so that the last weights are not the best
     chosen = np.sort(np.random.default_rng(0).permutation(201)[:121])
-    terms = loss_terms(trained.network, system, Samples.of(system, record, chosen, torch.float64))
-    assert terms.sum().item() == pytest.approx(trained.loss, rel=1e-12)
+    terms = duffing_terms(trained.network, record, chosen)
+    assert sum(term.item() for term in terms) == pytest.approx(trained.loss, rel=1e-12)
 
 
 def test_patience_and_budget_end_training():
@@ -534,15 +590,19 @@ class Failing(Spring):
         self.calls.append(1)
         return super().f(t, x, u) * (math.nan if len(self.calls) <= self.bad else 1.0)
 
+    def f_jacobian(self, t, x, u):
+        return matrix(x, [[0.0, 1.0], [-4.0, -0.3]])
+
 
 def test_a_loss_that_is_not_finite_begins_again_three_times():
     Failing.calls.clear()
-    trained = train(Failing(bad=3), replace(SMALL, seed=5), record=random_record(Failing()))
+    calls = 1 + 3  # the first iteration's terms are logged
+    trained = train(Failing(bad=calls), replace(SMALL, seed=5), record=random_record(Failing()))
     assert trained.seed == 8
     assert np.isfinite(trained.loss)
     Failing.calls.clear()
     with pytest.raises(FloatingPointError, match=r"Failing .*seed 5") as caught:
-        train(Failing(bad=4), replace(SMALL, seed=5), record=random_record(Failing()))
+        train(Failing(bad=calls + 1), replace(SMALL, seed=5), record=random_record(Failing()))
     assert "\n" not in str(caught.value)
 
 
@@ -622,18 +682,17 @@ def test_a_loss_that_leaves_the_finite_numbers_late_costs_nothing_found_before(
     monkeypatch, iterations
 ):
     """Also where it does so in the very last iteration."""
-    from trainers.pinn_obs import paper
-
     system, record = duffing()
     config = replace(SMALL, iterations=29, learning_rate=1e-2)
     before = train(system, config, record=record)
-    calls, own = [], paper.loss_terms
+    calls, own = [], Objective.__call__
 
     def sometimes(*arguments):
         calls.append(None)
-        return own(*arguments) * (math.nan if len(calls) == 30 else 1.0)
+        loss, gradient = own(*arguments)
+        return loss * (math.nan if len(calls) == 30 else 1.0), gradient
 
-    monkeypatch.setattr(paper, "loss_terms", sometimes)
+    monkeypatch.setattr(Objective, "__call__", sometimes)
     after = train(system, replace(config, iterations=iterations), record=record)
     assert after.loss <= before.loss
     if iterations == 30:

@@ -9,6 +9,7 @@ from test_pinn_obs import (
     Mixer,
     constant_gain,
     duffing,
+    gradient_of,
     random_record,
     same_weights,
 )
@@ -21,14 +22,10 @@ from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import Config, PinnObs, train
 from trainers.pinn_obs.config import PRESETS
 from trainers.pinn_obs.objective import Lead, Objective, Weights
+from trainers.pinn_obs.passes import strung
 from trainers.pinn_obs.points import fast_frequencies, points_of
 
 SMALL = Config(depth=2, width=8, iterations=60, log_every=10)
-
-
-def strung(network):
-    pairs = zip(network.weights, network.biases, strict=True)
-    return torch.cat([p.flatten() for pair in pairs for p in pair]).detach().numpy()
 
 
 def by_autograd(network, system, points, weights, lead):
@@ -48,16 +45,16 @@ def by_autograd(network, system, points, weights, lead):
     loss = loss + (torch.tensor(lead.by_L) * (L - torch.tensor(lead.L)) ** 2).sum()
     loss = loss + (torch.tensor(lead.by_xhat) * (xhat - torch.tensor(lead.xhat)) ** 2).sum()
     loss.backward()
-    pairs = zip(network.weights, network.biases, strict=True)
-    return loss.item(), torch.cat([p.grad.flatten() for pair in pairs for p in pair]).numpy()
+    return loss.item(), gradient_of(network)
 
 
+@pytest.mark.parametrize("samples", [30, 2500])
 @pytest.mark.parametrize("activation", ["tanh", "sine", "sigmoid", "relu"])
-def test_the_gradient_by_hand_is_that_of_autograd(activation):
+def test_the_gradient_by_hand_is_that_of_autograd(activation, samples):
     system, rng = Mixer(), np.random.default_rng(0)
-    record = random_record(system, 30)
+    record = random_record(system, samples)
     record.y[0, [2, 5, 5, 9], [0, 0, 1, 1]] = np.nan
-    points, _ = points_of(system, record, 20)
+    points, _ = points_of(system, record, samples - 10)
     weights = Weights(rng.random(3), rng.random(3), rng.random(2))
     n = len(points.t)
     lead = Lead(*(rng.random((n, *size)) for size in ((3,), (3,), (3, 2), (3, 2))))
@@ -74,6 +71,11 @@ def test_the_gradient_by_hand_is_that_of_autograd(activation):
     assert loss == pytest.approx(expected_loss, rel=1e-12)
     assert abs(expected).max() > 0.1
     np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
+    single = Objective(replace(architecture, dtype="float32"), system, points, weights, lead)
+    loss, gradient = single(strung(network).astype("float32"))
+    assert gradient.dtype == np.float32
+    assert loss == pytest.approx(expected_loss, rel=1e-5)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * abs(expected).max())
 
 
 def test_points_lie_on_the_records_lines():

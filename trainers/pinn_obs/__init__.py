@@ -21,11 +21,11 @@ from pinnobs_gym.system import System, vector
 from pinnobs_gym.training import bar, interruption
 from trainers.pinn_obs.config import Config
 from trainers.pinn_obs.fast import FastRun
-from trainers.pinn_obs.paper import PaperRun, Samples, loss_terms
-from trainers.pinn_obs.progress import described, gain_figure, log_end, log_held_out, log_terms
+from trainers.pinn_obs.paper import PaperRun
+from trainers.pinn_obs.progress import described, gain_figure, log_end, log_terms
 from trainers.pinn_obs.run import Run
 
-__all__ = ["Config", "PinnObs", "Samples", "gain_figure", "loss_terms", "train"]
+__all__ = ["Config", "PinnObs", "gain_figure", "train"]
 
 MIN_SAMPLES = 10
 """The shortest record that is trained on."""
@@ -93,8 +93,6 @@ def _iterate(
     """One iteration, and what is to be shown and kept of it."""
     config = run.config
     told = run.iteration % config.log_every == 0
-    if told:
-        log_held_out(log, run)
     run.step()
     if told:
         log_terms(log, run)

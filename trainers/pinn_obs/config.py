@@ -89,8 +89,8 @@ class Config:
     learning_rate: float = 1e-3
     """Step of Adam; constant."""
     optimiser: Literal["adam", "ssbroyden"] = _PRESET
-    """Method that minimises the loss: Adam in torch, on samples; or self-scaled Broyden in NumPy,
-    in scaled quantities."""
+    """Method that minimises the loss: Adam, on samples; or self-scaled Broyden, in scaled
+    quantities."""
     iterations: int = _PRESET
     """Most iterations."""
     patience: int = _PRESET

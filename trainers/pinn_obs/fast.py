@@ -3,14 +3,12 @@ a quasi-Newton method, in NumPy and float64."""
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.network import Architecture, Network
@@ -59,7 +57,7 @@ class FastRun(Run):
         x_scale, y_scale = np.asarray(system.scale, float), output_scale(system, self.record)
         per_gain = x_scale[:, None] / y_scale / unit
         quiet = np.minimum(1.0, (NOISE * y_scale / np.maximum(self.noise_std, 1e-100)) ** 2)
-        self._weights = Weights(
+        weights = Weights(
             config.w0 / x_scale**2,
             config.w_ode * (unit / x_scale) ** 2,
             config.w_y * quiet / y_scale**2,
@@ -71,9 +69,9 @@ class FastRun(Run):
             if self.guide is None:
                 message = f"no smoother follows this record of {type(system).__name__}"
                 warnings.warn(f"{message}; training has no guide", stacklevel=2)
-        self._lead = self._lead_of(x_scale, _GAIN * per_gain)
+        lead = self._lead_of(x_scale, _GAIN * per_gain)
         decays = [interval * part for part in _DECAYS[0]] + [length * part for part in _DECAYS[1]]
-        return Architecture(
+        architecture = Architecture(
             system.nx,
             system.ny,
             config.depth,
@@ -85,6 +83,8 @@ class FastRun(Run):
             frequencies=fast_frequencies(self.record),
             scale=(*x_scale, *(_GAIN * per_gain).ravel()),
         )
+        self._objective = Objective(architecture, system, self.points, weights, lead)
+        return architecture
 
     def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
         """What the estimates and gains are drawn towards, with weights that make both relative."""
@@ -101,46 +101,20 @@ class FastRun(Run):
             config.gain_penalty * each[..., None] / (L_scale**2 + L**2),
         )
 
-    def _draw(self, generator: torch.Generator) -> None:
+    def _drawn(self, generator: torch.Generator) -> Network:
         network = Network(self.architecture, generator)
         with torch.no_grad():  # neurons with their middles all over the record
             weight, bias = network.weights[0], network.biases[0]
             slopes = _SLOPES * torch.randn(len(bias), generator=generator, dtype=bias.dtype)
             middles = 2 * torch.rand(len(bias), generator=generator, dtype=bias.dtype) - 1
             weight[:, 0], bias[:] = slopes, -slopes * middles
-        parts = [p.detach().numpy().ravel() for p in _in_order(network)]
-        self._first = np.concatenate(parts)
-        self._objective = Objective(
-            self.architecture, self.system, self.points, self._weights, self._lead
-        )
-        self._method: QuasiNewton | None = None
+        return network
 
-    def step(self) -> None:
-        self.iteration += 1
-        if self._method is None:
-            self._method = QuasiNewton.start(self._objective, self._first)
-            if not math.isfinite(self._method.f):
-                self.restart()
-                return
-        else:
-            self.stuck = not self._method.step(self._objective)
-        self._found(self._method.f, {"theta": torch.from_numpy(self._method.x)})
-
-    def terms(self) -> np.ndarray:
-        theta = self._first if self._method is None else self._method.x
-        return self._objective.terms(theta)
+    def _begun(self, theta: np.ndarray) -> QuasiNewton:
+        return QuasiNewton.start(self._objective, theta)
 
     def held_out(self) -> None:
         return None
-
-    def network(self) -> Network:
-        assert self.best is not None
-        network, theta = Network(self.architecture), self.best.weights["theta"]
-        parts = theta.split([p.numel() for p in _in_order(network)])
-        with torch.no_grad():
-            for parameter, part in zip(_in_order(network), parts, strict=True):
-                parameter.copy_(part.reshape(parameter.shape))
-        return network
 
     def covariance(self, network: Network) -> Covariance | None:
         """The smoother's, which is Laplace's approximation for the estimates that the guide leads
@@ -152,24 +126,13 @@ class FastRun(Run):
             away = network(torch.from_numpy(t))[0].numpy() - smoothed.xhat
         return Covariance(t, smoothed.P + away[:, :, None] * away[:, None, :])
 
-    def loss(self) -> float:
-        assert self.best is not None
-        return self.total(self._objective.terms(self.best.weights["theta"].numpy()))
-
     def _state(self) -> dict[str, Any]:
-        assert self._method is not None
-        H = self._method.H
-        known = {} if H is None else {"H": torch.from_numpy(H.T)}
-        return {**known, "gradient": torch.from_numpy(self._method.gradient)}
+        method = self._method
+        assert isinstance(method, QuasiNewton)
+        known = {} if method.H is None else {"H": torch.from_numpy(method.H.T)}
+        return {**known, "gradient": torch.from_numpy(method.gradient)}
 
-    def _take_up(self, state: Mapping[str, Any]) -> None:
+    def _resumed(self, state: Mapping[str, Any]) -> QuasiNewton:
         assert self.best is not None
         H = state["H"].numpy().T if "H" in state else None
-        theta, gradient = self.best.weights["theta"].numpy(), state["gradient"].numpy()
-        self._method = QuasiNewton(theta, self.best.loss, gradient, H)
-
-
-def _in_order(network: Network) -> list[Tensor]:
-    """The network's parameters as `Objective` strings them together."""
-    pairs = zip(network.weights, network.biases, strict=True)
-    return [parameter for pair in pairs for parameter in pair]
+        return QuasiNewton(self.best.theta, self.best.loss, state["gradient"].numpy(), H)

@@ -1,49 +1,15 @@
-"""The loss of PINN-Obs and its gradient in NumPy, written out by hand.
-
-At a thousand points and twenty neurons torch spends its time on overhead; the same sums in NumPy,
-with the time derivative carried forward through the layers and one reverse pass, take a fraction.
-"""
+"""The loss of PINN-Obs and its gradient in NumPy, written out by hand."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
 from pinnobs_gym.network import Architecture
 from pinnobs_gym.system import System
-
-
-def _tanh(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    value = np.tanh(z)
-    slope = 1 - value * value
-    return value, slope, -2 * value * slope
-
-
-def _sine(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    value = np.sin(z)
-    return value, np.cos(z), -value
-
-
-def _sigmoid(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    value = 0.5 + 0.5 * np.tanh(0.5 * z)
-    slope = value * (1 - value)
-    return value, slope, slope * (1 - 2 * value)
-
-
-def _relu(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    slope = (z > 0).astype(float)
-    return z * slope, slope, np.zeros_like(z)
-
-
-_ACTIVATIONS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]] = {
-    "tanh": _tanh,
-    "sine": _sine,
-    "sigmoid": _sigmoid,
-    "relu": _relu,
-}
-"""Each activation with its first and second derivative."""
+from trainers.pinn_obs.passes import Passes
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +28,7 @@ class Points:
     """Quadrature weights of the equation's residuals, shape (num_points,); their sum is 1."""
     output: np.ndarray
     """Quadrature weights of the outputs, shape (num_points, ny); zero where they are missing, with
-    a sum of 1 over the points."""
+    a sum of ny over all."""
     xhat0: np.ndarray
     """Initial estimate at t₀, shape (nx,)."""
 
@@ -97,9 +63,17 @@ class Objective:
     """The weighted loss as a function of all weights of a network in one vector.
 
     w₀·(x̂(t₀) − x̂₀)² + w_ode·mean (dx̂/dt − f(t, x̂, u) − L(y − h(x̂)))² + w_y·mean (h(x̂) − y)²
-    summed over components, with the points' quadrature for means: the terms are those of
-    `trainers.pinn_obs.loss_terms` (equations (7), (8) and (9) of the paper). To them come the
-    weighted squares of x̂ and L less those of the lead.
+    summed over components, with the points' quadrature for means. These are the paper's terms:
+
+    - MSE₀ = ‖x̂(t₀) − x̂₀‖². Equation (7) writes the norm without the square. The square is taken
+      because the paper names it a mean squared error, and because a bare norm has a gradient of
+      length one however small the error, so that a constant step never settles on x̂₀.
+    - MSE_g = mean ‖dx̂/dt − f(t, x̂, u) − L(t)(y − h(x̂))‖², equations (e55) and (8), with h(x̂) for
+      the paper's Cx̂.
+    - MSE_y = mean ‖h(x̂) − y‖², equation (9).
+
+    A missing output counts as a zero innovation. To them come the weighted squares of x̂ and L less
+    those of the lead, if there is one. Everything is computed in the network's precision.
 
     Args:
         architecture: the network's.
@@ -115,63 +89,37 @@ class Objective:
         system: System,
         points: Points,
         weights: Weights,
-        lead: Lead,
+        lead: Lead | None = None,
     ) -> None:
-        self.system, self.points, self.weights, self.lead = system, points, weights, lead
-        self.nx, self.ny = system.nx, system.ny
-        self._shapes = architecture.shapes
-        self._activation = _ACTIVATIONS[architecture.activation]
-        value, rate = architecture.features(points.t)
-        self._inputs = np.concatenate([value.T, rate.T], axis=1)
-        scale = architecture.scale or (1.0,) * architecture.shapes[-1][0]
-        self._scale = np.asarray(scale)[:, None]
+        dtype = np.dtype(architecture.dtype)
+        self._passes, self.system = Passes(architecture, points.t), system
+        self.points = _laid_out(points, dtype)
+        self.lead = None if lead is None else _laid_out(lead, dtype)
+        self._initial = _inner(weights.initial, dtype)
+        self._equation = _inner(points.equation[:, None] * weights.equation, dtype)
+        self._output = _inner(points.output * weights.output, dtype)
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """The loss at weights theta (n,) and its gradient (n,)."""
         with np.errstate(all="ignore"):  # a trial step too long is told by a loss not finite
-            layers = list(self._layers(theta))
-            xhat, rate, L, tape = self._forward(layers)
-            loss, *by_output = self._terms(xhat, rate, L)
-            return loss, self._reverse(layers, tape, *by_output)
+            loss, *by_output = self._terms(*self._forward(theta))
+            return loss, self._passes.reverse(*by_output)
 
     def terms(self, theta: np.ndarray) -> np.ndarray:
         """The paper's three terms (3,) at weights theta (n,), in the system's own units."""
-        xhat, rate, L, _ = self._forward(list(self._layers(theta)))
-        points, ones = self.points, np.ones(self.nx)
-        innovation, residual = self._defects(xhat, rate, L)
+        with np.errstate(all="ignore"):
+            points, (xhat, rate, L) = self.points, self._forward(theta)
+            innovation, residual = self._defects(xhat, rate, L)
+            equation = (points.equation[:, None] * residual * residual).sum()
+            output = (points.output * innovation * innovation).sum()
         initial = xhat[0] - points.xhat0
-        return np.array(
-            [
-                initial @ initial,
-                points.equation @ (residual * residual) @ ones,
-                (points.output * innovation * innovation).sum(),
-            ]
-        )
+        return np.array([initial @ initial, equation, output], dtype=float)
 
-    def _layers(self, theta: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Weights (out, in) and biases (out,) of each layer."""
-        place = 0
-        for out, fan_in in self._shapes:
-            size = out * fan_in
-            yield theta[place : place + size].reshape(out, fan_in), theta[place + size :][:out]
-            place += size + out
-
-    def _forward(self, layers: list) -> tuple[np.ndarray, np.ndarray, np.ndarray, list]:
-        """x̂ and dx̂/dt (num_points, nx), L (num_points, nx, ny), and what the reverse pass needs.
-
-        Values and time derivatives lie side by side, (neurons, 2 · num_points).
-        """
-        a, n, tape = self._inputs, len(self.points.t), []
-        for W, b in layers[:-1]:
-            z = W @ a
-            value, slope, curvature = self._activation(z[:, :n] + b[:, None])
-            tape.append((a, z[:, n:], slope, curvature))
-            a = np.concatenate([value, slope * z[:, n:]], axis=1)
-        W, b = layers[-1]
-        tape.append((a, None, None, None))
-        out = (W @ a[:, :n] + b[:, None]) * self._scale
-        rate = (W[: self.nx] @ a[:, n:]) * self._scale[: self.nx]
-        return out[: self.nx].T, rate.T, out[self.nx :].T.reshape(n, self.nx, self.ny), tape
+    def _forward(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """x̂ and dx̂/dt (num_points, nx), and L (num_points, nx, ny)."""
+        out, rate = self._passes.forward(theta)
+        nx, ny = self.system.nx, self.system.ny
+        return out[:nx].T, rate.T, out[nx:].T.reshape(-1, nx, ny)
 
     def _defects(
         self, xhat: np.ndarray, rate: np.ndarray, L: np.ndarray
@@ -184,51 +132,53 @@ class Objective:
 
     def _terms(
         self, xhat: np.ndarray, rate: np.ndarray, L: np.ndarray
-    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """The loss, and its derivatives by x̂, by dx̂/dt and by L."""
-        points, weights, system, lead = self.points, self.weights, self.system, self.lead
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """The loss, and its derivatives by the network's outputs (nx + nx·ny, num_points) and by
+        dx̂/dt (nx, num_points)."""
+        points, system = self.points, self.system
         innovation, residual = self._defects(xhat, rate, L)
         initial = xhat[0] - points.xhat0
-        by_rate = 2 * points.equation[:, None] * weights.equation * residual
-        by_innovation = 2 * points.output * weights.output * innovation
-        by_L = 2 * lead.by_L * (L - lead.L)
-        by_xhat = 2 * lead.by_xhat * (xhat - lead.xhat)
-        loss = float(weights.initial @ (initial * initial)) + 0.5 * float(
-            (by_rate * residual).sum()
-            + (by_innovation * innovation).sum()
-            + (by_L * (L - lead.L)).sum()
-            + (by_xhat * (xhat - lead.xhat)).sum()
-        )
-        by_innovation -= np.einsum("ki,kij->kj", by_rate, L)
-        by_L -= by_rate[:, :, None] * innovation[:, None, :]
-        H = system.h_jacobian(xhat)
-        A = system.f_jacobian(points.t, xhat, points.u)
-        by_xhat -= np.einsum("ki,kij->kj", by_rate, A)
-        by_xhat -= np.einsum("ki,kij->kj", by_innovation * points.there, H)
-        by_xhat[0] += 2 * weights.initial * initial
-        return loss, by_xhat, by_rate, by_L
+        by_initial, by_rate = self._initial * initial, self._equation * residual  # halves of them
+        by_innovation = self._output * innovation
+        loss = (by_initial * initial).sum() + (by_rate * residual).sum()
+        loss += (by_innovation * innovation).sum()
+        by_innovation -= _through(by_rate, L)
+        by_innovation *= points.there
+        by_L = by_rate[:, :, None] * -innovation[:, None, :]
+        A, H = system.f_jacobian(points.t, xhat, points.u), system.h_jacobian(xhat)
+        by_xhat = _through(by_rate, -A) - _through(by_innovation, H)
+        by_xhat[0] += by_initial
+        if (lead := self.lead) is not None:
+            for value, towards, weight, by in (
+                (xhat, lead.xhat, lead.by_xhat, by_xhat),
+                (L, lead.L, lead.by_L, by_L),
+            ):
+                departure = value - towards
+                drawn = weight * departure
+                loss += (drawn * departure).sum()
+                by += drawn
+        by_out = np.concatenate([by_xhat.T, by_L.reshape(len(by_L), -1).T])
+        by_out *= 2
+        return float(loss), by_out, 2 * by_rate.T
 
-    def _reverse(
-        self,
-        layers: list,
-        tape: list,
-        by_xhat: np.ndarray,
-        by_rate: np.ndarray,
-        by_L: np.ndarray,
-    ) -> np.ndarray:
-        """The gradient (n,) from the derivatives by the network's outputs."""
-        n, nx = len(self.points.t), self.nx
-        by_z = np.zeros((len(self._scale), 2 * n), by_xhat.dtype)
-        by_z[:nx, :n], by_z[nx:, :n] = by_xhat.T, by_L.reshape(n, -1).T
-        by_z[:nx, n:] = by_rate.T
-        by_z *= self._scale
-        parts: list[np.ndarray] = []
-        for (W, _), below, here in zip(layers[:0:-1], tape[:0:-1], tape[-2::-1], strict=True):
-            parts[:0] = [(by_z @ below[0].T).ravel(), by_z[:, :n].sum(1)]
-            by_a = W.T @ by_z
-            _, z_rate, slope, curvature = here
-            by_z = np.empty_like(by_a)
-            by_z[:, n:] = by_a[:, n:] * slope
-            by_z[:, :n] = by_a[:, :n] * slope + by_a[:, n:] * z_rate * curvature
-        parts[:0] = [(by_z @ tape[0][0].T).ravel(), by_z[:, :n].sum(1)]
-        return np.concatenate(parts)
+
+def _through(by: np.ndarray, J: np.ndarray) -> np.ndarray:
+    """Derivatives by a function's value (num_points, m) taken through its Jacobian J
+    (num_points, m, n) at every point."""
+    out = by[:, :1] * J[:, 0]
+    for i in range(1, J.shape[1]):
+        out += by[:, i : i + 1] * J[:, i]
+    return out
+
+
+_Part = TypeVar("_Part", Points, Lead)
+
+
+def _laid_out(part: _Part, dtype: np.dtype) -> _Part:
+    return replace(part, **{f.name: _inner(getattr(part, f.name), dtype) for f in fields(part)})
+
+
+def _inner(array: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """The same numbers (num_points, ...) in that precision, with the points innermost in memory, so
+    that arithmetic on few components of many points is contiguous."""
+    return np.ascontiguousarray(np.asarray(array, dtype).T).T

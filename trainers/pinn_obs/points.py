@@ -1,4 +1,4 @@
-"""Where the fast recipe looks at a record, and the sizes by which it counts."""
+"""Where a loss looks at a record, and the sizes by which the fast recipe counts."""
 
 from __future__ import annotations
 
@@ -48,6 +48,29 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
     )
     samples = Record(t[chosen], record.y[:, chosen], record.u[:, chosen], record.prior)
     return points, samples
+
+
+def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:
+    """Samples of a record of one episode, of these indices (num_samples,), as points of one weight.
+
+    The first sample comes along, with no weight if it is not among them. The means of the outputs
+    are over those that are there, times ny.
+    """
+    indices = np.union1d([0], chosen)
+    t, y = record.t[indices], record.y[0, indices]
+    u = record.u[0, indices] if system.measured_input else np.asarray(system.input(t))
+    among = np.isin(indices, chosen)
+    there = ~np.isnan(y)
+    output = (there & among[:, None]).astype(float)
+    return Points(
+        t,
+        u,
+        np.where(there, y, 0.0),
+        there.astype(float),
+        among / len(chosen),
+        output * (system.ny / max(output.sum(), 1.0)),
+        record.prior.mean[0],
+    )
 
 
 def on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:

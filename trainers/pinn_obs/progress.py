@@ -19,19 +19,16 @@ _TERMS = ("initial", "equation", "output")
 
 
 def log_terms(log: Log, run: Run) -> None:
-    """The curves of the loss, its terms and the best so far."""
+    """The curves of the loss, its terms, the best so far, and the loss on samples that are not
+    trained on."""
     terms = run.terms()
     log.scalar("loss/total", run.total(terms), run.iteration)
     for name, term in zip(_TERMS, terms.tolist(), strict=True):
         log.scalar(f"loss/{name}", term, run.iteration)
     if run.best is not None:
         log.scalar("loss/best", run.best.loss, run.iteration)
-
-
-def log_held_out(log: Log, run: Run) -> None:
-    """The curve of the loss on samples that are not trained on."""
     if log.active and (loss := run.held_out()) is not None:
-        log.scalar("loss/held_out", loss, run.iteration + 1)
+        log.scalar("loss/held_out", loss, run.iteration)
 
 
 def log_end(log: Log, system: System, trained: Trained, run: Run) -> None:

@@ -9,11 +9,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pinnobs_gym.estimators.pinn_obs import (
     Covariance,
@@ -27,6 +26,8 @@ from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System
 from trainers.pinn_obs.config import Config
+from trainers.pinn_obs.objective import Objective
+from trainers.pinn_obs.passes import strung, unstrung
 
 _RESTARTS = 3
 _FREE = ("iterations", "budget", "checkpoint_every", "log_every")
@@ -43,7 +44,8 @@ class Best:
     """The iteration that found it, counted from 1."""
     seed: int
     """What these weights began from."""
-    weights: Mapping[str, Tensor]
+    theta: np.ndarray
+    """The weights in one vector (n,)."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,19 @@ class Mark:
 
     loss: float
     iteration: int
+
+
+class Method(Protocol):
+    """A minimisation in progress."""
+
+    x: np.ndarray
+    """Where it stands, shape (n,); made anew by each step."""
+    f: float
+    """The loss there."""
+
+    def step(self, objective: Objective) -> bool:
+        """One iteration; False if no lower value can be found."""
+        ...
 
 
 class Run(ABC):
@@ -68,6 +83,7 @@ class Run(ABC):
         self, system: System, config: Config, record: Record, noise_std: np.ndarray
     ) -> None:
         self.config, self.system, self.record, self.noise_std = config, system, record, noise_std
+        self._objective: Objective
         self.iteration, self._earlier, self._start = 0, 0.0, time.process_time()
         self.architecture = self._architecture()
         self._kept: Best | None = None  # of attempts that ended in a loss that is not finite
@@ -78,36 +94,57 @@ class Run(ABC):
         self.best: Best | None = None
         self.mark = Mark(math.inf, self.iteration)
         self.stuck = False
-        self._draw(torch.Generator().manual_seed(self.seed))
+        self._first = strung(self._drawn(torch.Generator().manual_seed(self.seed)))
+        self._method: Method | None = None
 
     @abstractmethod
     def _architecture(self) -> Architecture:
-        """The network's sizes."""
+        """The network's sizes; sets ``_objective``."""
 
     @abstractmethod
-    def _draw(self, generator: torch.Generator) -> None:
-        """Begin from random weights."""
+    def _drawn(self, generator: torch.Generator) -> Network:
+        """A network of random weights."""
 
     @abstractmethod
-    def step(self) -> None:
-        """One iteration: call `_found` with what it found, or `restart`."""
-
-    @abstractmethod
-    def terms(self) -> np.ndarray:
-        """The three terms of the loss (3,) at the iteration's weights, unweighted, in the system's
-        own units."""
+    def _begun(self, theta: np.ndarray) -> Method:
+        """The minimisation from weights theta (n,)."""
 
     @abstractmethod
     def held_out(self) -> float | None:
         """The loss on samples that are not trained on, if there are any."""
 
-    @abstractmethod
+    @property
+    def theta(self) -> np.ndarray:
+        """The iteration's weights (n,)."""
+        return self._first if self._method is None else self._method.x
+
+    def step(self) -> None:
+        """One iteration, of which the first only looks at the weights that were drawn."""
+        self.iteration += 1
+        if self._method is None:
+            self._method = self._begun(self._first)
+        else:
+            self.stuck = not self._method.step(self._objective)
+        loss = self._method.f
+        if not math.isfinite(loss):
+            self.restart()
+        elif self.best is None or loss < self.best.loss:
+            self._found(loss, self._method.x)
+
+    def terms(self) -> np.ndarray:
+        """The three terms of the loss (3,) at the iteration's weights, unweighted, in the system's
+        own units."""
+        return self._objective.terms(self.theta)
+
     def network(self) -> Network:
         """The network of the least loss."""
+        assert self.best is not None
+        return unstrung(self.architecture, self.best.theta)
 
-    @abstractmethod
     def loss(self) -> float:
         """The paper's loss of that network."""
+        assert self.best is not None
+        return self.total(self._objective.terms(self.best.theta))
 
     def covariance(self, network: Network) -> Covariance | None:
         """What is known of the error of that network's estimates; None unless overridden."""
@@ -118,8 +155,9 @@ class Run(ABC):
         """What the method needs to go on exactly: tensors and plain values."""
 
     @abstractmethod
-    def _take_up(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `_state` gave; called after everything else is restored."""
+    def _resumed(self, state: Mapping[str, Any]) -> Method:
+        """The minimisation that goes on from what `_state` gave; called after all else is
+        restored."""
 
     @property
     def seed(self) -> int:
@@ -135,11 +173,11 @@ class Run(ABC):
         """The paper's loss from its terms (3,)."""
         return float(terms @ [self.config.w0, self.config.w_ode, self.config.w_y])
 
-    def _found(self, loss: float, weights: Mapping[str, Tensor]) -> None:
+    def _found(self, loss: float, theta: np.ndarray) -> None:
         """Keep weights of the least loss; at once, so that Ctrl-C finds them whole."""
         if loss < (1 - self.config.improvement) * self.mark.loss:
             self.mark = Mark(loss, self.iteration)
-        self.best = Best(loss, self.iteration, self.seed, weights)
+        self.best = Best(loss, self.iteration, self.seed, theta)
 
     def restart(self) -> None:
         """Begin again from the next seed; what was best so far is kept. After the third time there
@@ -202,7 +240,8 @@ class Run(ABC):
         facts |= {"attempt": self.attempt, "stuck": self.stuck, "mark": asdict(self.mark)}
         facts |= {"best_loss": self.best.loss, "best_iteration": self.best.iteration}
         record = {k: torch.tensor(v) for k, v in self._record().items()}
-        content = {"best": dict(self.best.weights), "record": record, "state": self._state()}
+        best = torch.from_numpy(self.best.theta)
+        content = {"best": best, "record": record, "state": self._state()}
         write(path, {"facts": json.dumps(facts), **content})
 
     def restore(self, path: Path) -> None:
@@ -220,11 +259,11 @@ class Run(ABC):
                     raise ValueError(f"{path} was trained on another record: its {name} differs")
             self._begin(facts["attempt"])
             found = (facts["best_loss"], facts["best_iteration"], self.seed)
-            self.best = Best(*found, saved["best"])
+            self.best = Best(*found, saved["best"].numpy())
             self.mark, self.stuck = Mark(**facts["mark"]), facts["stuck"]
             self.iteration = facts["iteration"]
             self._earlier += facts["seconds"]
-            self._take_up(saved["state"])
+            self._method = self._resumed(saved["state"])
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"{path} is not a checkpoint of this trainer: {reason}") from None

@@ -1,0 +1,47 @@
+"""Adam (Kingma & Ba, "Adam: A Method for Stochastic Optimization", 2015), on the whole record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.quasi_newton import Objective
+
+_MEAN, _SQUARE = 0.9, 0.999
+"""β₁ and β₂, what the two averages keep of themselves in a step."""
+_EPSILON = 1e-8
+
+
+@dataclass(eq=False)
+class Adam:
+    """A minimisation in progress, in the precision of x."""
+
+    x: np.ndarray
+    """Where it stands, shape (n,)."""
+    f: float
+    """The function there."""
+    gradient: np.ndarray
+    """The gradient there, shape (n,)."""
+    learning_rate: float
+    mean: np.ndarray
+    """The running average of the gradients, shape (n,)."""
+    square: np.ndarray
+    """The running average of their squares, shape (n,)."""
+    steps: int = 0
+
+    @staticmethod
+    def start(objective: Objective, x: np.ndarray, learning_rate: float) -> Adam:
+        """A minimisation that begins at x (n,)."""
+        return Adam(x, *objective(x), learning_rate, np.zeros_like(x), np.zeros_like(x))
+
+    def step(self, objective: Objective) -> bool:
+        """One iteration; it always goes on."""
+        self.steps += 1
+        mean = _MEAN * self.mean + (1 - _MEAN) * self.gradient
+        square = _SQUARE * self.square + (1 - _SQUARE) * self.gradient**2
+        rate = self.learning_rate / (1 - _MEAN**self.steps)
+        root = np.sqrt(square) / (1 - _SQUARE**self.steps) ** 0.5
+        self.x, self.mean, self.square = self.x - rate * mean / (root + _EPSILON), mean, square
+        self.f, self.gradient = objective(self.x)
+        return True
