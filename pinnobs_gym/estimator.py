@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Protocol, Self
 
@@ -74,6 +74,8 @@ class Estimator(ABC):
     """What it is told besides the outputs and inputs."""
     needs_training: ClassVar[str | None] = None
     """Name of the trainer that must make it, if `for_setup` alone cannot."""
+    recipe: ClassVar[Mapping[str, Any]] = {}
+    """Choices in that trainer's Config that are made for it unless others are."""
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:

@@ -186,7 +186,7 @@ def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
 def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on episodes that are never scored, loaded if that was done before."""
     module = trainer(str(cls.needs_training))
-    recipe = module.Config(**job.training)
+    recipe = module.Config(**{**cls.recipe, **job.training})
     place = (env_id(job.system), job.setup, job.condition, TRAINING_SEED)
     system, setup, record = record_of(*place, recipe.episodes)
     label = f"{_played(job)}-{cls.needs_training}-{_digest(recipe)}"

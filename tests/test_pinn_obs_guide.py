@@ -11,7 +11,7 @@ from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.evaluation import make_vector_env
 from pinnobs_gym.network import Architecture, Network, evaluate, layers_of
 from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.simulate import model_step_jacobian
+from pinnobs_gym.simulate import model_step_jacobian, truth
 from pinnobs_gym.system import stack
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
@@ -166,3 +166,31 @@ def test_from_any_seed_direct_estimates_and_replay_find_the_states(name):
         error = trained.xhat(record.t) - x
         nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(P), error)[5:]
         assert 0.1 < nees.mean() / system.nx < 4
+
+
+def test_a_record_too_long_for_the_points_is_told():
+    system = Spring()
+    t = np.linspace(0, 200, 4000)
+    y = np.cos(4.0 * t)[None, :, None]  # 127 periods: 1019 samples are needed
+    prior = Prior.of(system, system.setups["benchmark"], 1)
+    record = Record(t, y, np.zeros((1, len(t), 0)), prior)
+    config = Config(iterations=1, points=300)
+    with pytest.warns(UserWarning, match=r"points=300 .* 200 s: they swing 127 times; .*=10\d\d"):
+        train(system, config, record=record)
+
+
+def test_a_gain_meant_for_other_records_beats_one_that_is_not():
+    """On ReverseDuffing's own paper record and another, with other x₀ and x̂₀."""
+    env = make_vector_env("pinnobs/ReverseDuffing-v0", 1, "paper", "nominal")
+    env.reset(seed=0)
+    record = env.record()
+    system = ReverseDuffing()
+    x = truth(system, np.array([[1.0, 1.5]]), record.t)[:, 0]
+    prior = Prior(np.zeros((1, 2)), record.prior.cov)
+    other = replace(record, y=system.h(x)[None], prior=prior)
+    rmse = []
+    for transfer in (False, True):
+        trained = train(system, Config(iterations=1000, transfer=transfer), record=record)
+        replayed = PinnObsReplay.of(system, trained).run(other).xhat[0]
+        rmse.append(np.sqrt(np.mean((replayed - x) ** 2)))
+    assert rmse[1] < 0.7 * rmse[0]

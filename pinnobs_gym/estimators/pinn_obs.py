@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -193,6 +194,7 @@ class PinnObsReplay(_Learned, Estimator):
     name = "pinn_obs_replay"
     knows = ("model", "prior")
     needs_training = "pinn_obs"
+    recipe = MappingProxyType({"transfer": True})
 
     def reset(self, prior: Prior) -> State:
         return State(prior.mean)

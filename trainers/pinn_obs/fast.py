@@ -3,6 +3,7 @@ a quasi-Newton method, in NumPy and float64."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -28,6 +29,8 @@ _GAIN = 10.0
 """What the network's gains are multiplied by, in units of state, output and time."""
 _SLOPES = 10.0
 """Standard deviation of the first layer's weights on the time from −1 to 1."""
+_PER_PERIOD = 8
+"""Samples that a period of the outputs needs."""
 _NOISY = 5
 """How many times as many samples are looked at if they are noisy."""
 
@@ -70,6 +73,8 @@ class FastRun(Run):
                 message = f"no smoother follows this record of {type(system).__name__}"
                 warnings.warn(f"{message}; training has no guide", stacklevel=2)
         lead = self._lead_of(x_scale, _GAIN * per_gain)
+        frequencies = fast_frequencies(self.record)
+        self._check_resolution(frequencies, len(samples.t), most)
         decays = [interval * part for part in _DECAYS[0]] + [length * part for part in _DECAYS[1]]
         architecture = Architecture(
             system.nx,
@@ -80,11 +85,23 @@ class FastRun(Run):
             config.dtype,
             span=(float(t[0]), float(t[-1])),
             decays=tuple(decays),
-            frequencies=fast_frequencies(self.record),
+            frequencies=frequencies,
             scale=(*x_scale, *(_GAIN * per_gain).ravel()),
         )
         self._objective = Objective(architecture, system, self.points, weights, lead)
         return architecture
+
+    def _check_resolution(self, frequencies: tuple[float, ...], samples: int, most: int) -> None:
+        """Warn of a record so long that the samples looked at do not resolve its outputs."""
+        length = float(self.record.t[-1] - self.record.t[0])
+        needed = math.ceil(max(frequencies, default=0.0) * length / (2 * math.pi) * _PER_PERIOD)
+        if samples < min(needed, self.record.num_samples):
+            points = math.ceil(needed * self.config.points / most)
+            warnings.warn(
+                f"points={self.config.points} do not resolve the outputs over {length:g} s: they swing"
+                f" {needed / _PER_PERIOD:.0f} times; take points={points} or a shorter record",
+                stacklevel=2,
+            )
 
     def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
         """What the estimates and gains are drawn towards, with weights that make both relative."""
