@@ -82,7 +82,7 @@ class FastRun(Run):
             frequencies=fast_frequencies(self.record),
             scale=(*x_scale, *(_GAIN * per_gain).ravel()),
         )
-        self._objective = Objective(architecture, system, self.points, weights, lead)
+        self.objective = Objective(architecture, system, self.points, weights, lead)
         return architecture
 
     def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
@@ -110,7 +110,7 @@ class FastRun(Run):
         return network
 
     def _begun(self, theta: np.ndarray) -> QuasiNewton:
-        return QuasiNewton.start(self._objective, theta)
+        return QuasiNewton.start(self.objective, theta)
 
     def held_out(self) -> None:
         return None
