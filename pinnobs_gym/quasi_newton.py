@@ -155,13 +155,17 @@ class QuasiNewton:
     identity if None."""
     curvature: float = CURVATURE
     """c₂ of the line search."""
+    first: float = 1.0
+    """The first step tried along a quasi-Newton direction."""
 
     @staticmethod
-    def start(objective: Objective, x: np.ndarray, curvature: float = CURVATURE) -> QuasiNewton:
+    def start(
+        objective: Objective, x: np.ndarray, curvature: float = CURVATURE, first: float = 1.0
+    ) -> QuasiNewton:
         """A minimisation that begins at x (n,)."""
         x = np.array(x, dtype=float)
         f, gradient = objective(x)
-        return QuasiNewton(x, float(f), gradient, curvature=curvature)
+        return QuasiNewton(x, float(f), gradient, curvature=curvature, first=first)
 
     def step(self, objective: Objective) -> bool:
         """One iteration; False if no lower value can be found, and nothing has changed but H.
@@ -173,7 +177,7 @@ class QuasiNewton:
             direction = self._direction()
             slope = float(self.gradient @ direction)
             here = Point(0.0, self.f, slope, self.x, self.gradient)
-            first = 1.0 if self.H is not None else first_step(slope)
+            first = self.first if self.H is not None else first_step(slope)
             found = None
             if slope < 0:
                 found = line_search(objective, here, direction, first, self.curvature)

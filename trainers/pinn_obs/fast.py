@@ -14,6 +14,7 @@ from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.quasi_newton import QuasiNewton
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
+from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
 from trainers.pinn_obs.run import Run
@@ -110,7 +111,7 @@ class FastRun(Run):
         return network
 
     def _begun(self, theta: np.ndarray) -> QuasiNewton:
-        return QuasiNewton.start(self.objective, theta)
+        return QuasiNewton.start(self.objective, theta, first=FIRST_STEP)
 
     def held_out(self) -> None:
         return None
@@ -134,4 +135,5 @@ class FastRun(Run):
     def _resumed(self, state: Mapping[str, Any]) -> QuasiNewton:
         assert self.best is not None
         H = state["H"].numpy().T if "H" in state else None
-        return QuasiNewton(self.best.theta, self.best.loss, state["gradient"].numpy(), H)
+        here = self.best.theta, self.best.loss, state["gradient"].numpy()
+        return QuasiNewton(*here, H, first=FIRST_STEP)

@@ -24,6 +24,7 @@ from pinnobs_gym.quasi_newton import (
     trials,
     update_weights,
 )
+from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Objective
 from trainers.pinn_obs.run import Run
 
@@ -142,7 +143,7 @@ class Minimisations:
                 ended.append(i)
                 continue
             self._slopes[i] = slopes[i]
-            first = first_step(slopes[i]) if self._fresh[i] else 1.0
+            first = first_step(slopes[i]) if self._fresh[i] else FIRST_STEP
             search = trials(self.f[i], slopes[i], first, CURVATURE)
             self._searches[i], self._steps[i] = search, next(search)
         return ended
