@@ -9,7 +9,7 @@ The line search is that of Nocedal & Wright, "Numerical Optimization", algorithm
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -43,6 +43,20 @@ class Point:
     """The gradient there, shape (n,)."""
 
 
+@dataclass(frozen=True)
+class Trial:
+    """What a line search sees of a place on its line."""
+
+    step: float
+    f: float
+    slope: float
+
+
+Search: TypeAlias = Generator[float, tuple[float, float], bool]
+"""Yields steps to try, is sent the function and its slope there, and returns whether the last of
+them will do."""
+
+
 def line_search(
     objective: Objective,
     start: Point,
@@ -50,9 +64,8 @@ def line_search(
     first: float = 1.0,
     curvature: float = CURVATURE,
 ) -> Point | None:
-    """A step along a direction of descent that satisfies the strong Wolfe conditions
-
-    f(a) ≤ f(0) + c₁·a·f'(0) and abs f'(a) ≤ c₂·abs f'(0), or None if rounding hides one.
+    """A step along a direction of descent that satisfies the strong Wolfe conditions, or None if
+    rounding hides one; see `trials`.
 
     Args:
         objective: the function.
@@ -61,38 +74,51 @@ def line_search(
         first: the first step tried.
         curvature: c₂; the smaller, the nearer to the minimum along the line.
     """
-
-    def at(step: float) -> Point:
+    search, point = trials(start.f, start.slope, first, curvature), start
+    step = next(search)
+    while True:
         x = start.x + step * direction
         f, gradient = objective(x)
-        f = f if math.isfinite(f) else math.inf
-        return Point(step, f, float(gradient @ direction), x, gradient)
+        point = Point(step, f, float(gradient @ direction), x, gradient)
+        try:
+            step = search.send((point.f, point.slope))
+        except StopIteration as stop:
+            return point if stop.value else None
 
-    def decreases(point: Point) -> bool:
-        return point.f <= start.f + SUFFICIENT_DECREASE * point.step * start.slope
+
+def trials(f: float, slope: float, first: float, curvature: float) -> Search:
+    """A search for a step a that satisfies the strong Wolfe conditions
+
+    f(a) ≤ f(0) + c₁·a·f'(0) and abs f'(a) ≤ c₂·abs f'(0), from f(0) and f'(0) < 0.
+    """
+    start = Trial(0.0, f, slope)
+
+    def decreases(trial: Trial) -> bool:
+        return trial.f <= start.f + SUFFICIENT_DECREASE * trial.step * start.slope
 
     low, high, step = start, None, first
     for _ in range(_TRIALS):
-        point = at(step)
-        if not decreases(point) or point.f >= low.f:
-            high = point
-        elif abs(point.slope) <= -curvature * start.slope:
-            return point
+        f, slope = yield step
+        trial = Trial(step, f if math.isfinite(f) else math.inf, slope)
+        if not decreases(trial) or trial.f >= low.f:
+            high = trial
+        elif abs(trial.slope) <= -curvature * start.slope:
+            return True
         else:
             end = math.inf if high is None else high.step
-            if point.slope * (end - point.step if high is None else end - low.step) >= 0:
+            if trial.slope * (end - trial.step if high is None else end - low.step) >= 0:
                 high = low
-            low = point
+            low = trial
         if high is None:
             step = min(10 * low.step, max(2 * low.step, _minimiser(start, low, math.inf)))
         elif abs(high.step - low.step) <= 1e-14 * max(abs(low.step), abs(high.step)):
             break
         else:
             step = _between(low, high)
-    return None
+    return False
 
 
-def _between(low: Point, high: Point) -> float:
+def _between(low: Trial, high: Trial) -> float:
     """The next trial inside an interval: by interpolation, but not too near its ends."""
     width = high.step - low.step
     middle = low.step + width / 2
@@ -101,7 +127,7 @@ def _between(low: Point, high: Point) -> float:
     return min(max(guess, inside[0]), inside[1])
 
 
-def _minimiser(one: Point, other: Point, otherwise: float) -> float:
+def _minimiser(one: Trial, other: Trial, otherwise: float) -> float:
     """The minimiser of the cubic through two points with their slopes (Nocedal & Wright, 3.59)."""
     width = other.step - one.step
     d1 = one.slope + other.slope - 3 * (other.f - one.f) / width
@@ -129,13 +155,17 @@ class QuasiNewton:
     identity if None."""
     curvature: float = CURVATURE
     """c₂ of the line search."""
+    first: float = 1.0
+    """The first step tried along a quasi-Newton direction."""
 
     @staticmethod
-    def start(objective: Objective, x: np.ndarray, curvature: float = CURVATURE) -> QuasiNewton:
+    def start(
+        objective: Objective, x: np.ndarray, curvature: float = CURVATURE, first: float = 1.0
+    ) -> QuasiNewton:
         """A minimisation that begins at x (n,)."""
         x = np.array(x, dtype=float)
         f, gradient = objective(x)
-        return QuasiNewton(x, float(f), gradient, curvature=curvature)
+        return QuasiNewton(x, float(f), gradient, curvature=curvature, first=first)
 
     def step(self, objective: Objective) -> bool:
         """One iteration; False if no lower value can be found, and nothing has changed but H.
@@ -147,7 +177,7 @@ class QuasiNewton:
             direction = self._direction()
             slope = float(self.gradient @ direction)
             here = Point(0.0, self.f, slope, self.x, self.gradient)
-            first = 1.0 if self.H is not None else min(1.0, 1 / math.sqrt(max(-slope, 1e-300)))
+            first = self.first if self.H is not None else first_step(slope)
             found = None
             if slope < 0:
                 found = line_search(objective, here, direction, first, self.curvature)
@@ -169,8 +199,8 @@ class QuasiNewton:
         """The new H: (H − wwᵀ/yᵀw + φ·vvᵀ)/τ + ssᵀ/sᵀy with w = Hy and
         v = √(yᵀw)·(s/sᵀy − w/yᵀw), written out in ssᵀ, swᵀ + wsᵀ and wwᵀ."""
         s, y = found.x - self.x, found.gradient - self.gradient
-        sy = float(s @ y)  # positive by the curvature condition
-        if not sy > 1e-14 * math.sqrt(float(s @ s) * float(y @ y)):
+        sy = float(s @ y)
+        if not curved(sy, float(s @ s), float(y @ y)):
             return
         if self.H is None:  # Nocedal & Wright, 6.20
             self.H = np.asfortranarray(np.eye(len(s)) * (sy / float(y @ y)))
@@ -179,12 +209,26 @@ class QuasiNewton:
             sBs = -found.step * float(s @ self.gradient)
         w = _symv(1.0, self.H, y, lower=1)
         yw = float(y @ w)
-        phi, tau = _scaled_broyden(sBs / sy, yw / sy, len(s))
-        ss = phi * yw / (sy * sy) / tau + 1 / sy
-        sw, ww = -phi / sy / tau, (phi - 1) / yw / tau
+        tau, ss, sw, ww = update_weights(sBs, yw, sy, len(s))
         left = np.stack([s, w], axis=1)
         right = np.stack([ss / 2 * s + sw * w, ww / 2 * w], axis=1)
         self.H = _syr2k(1.0, left, right, 1 / tau, self.H, lower=1, overwrite_c=1)
+
+
+def first_step(slope: float) -> float:
+    """The first step tried along the steepest descent, of this slope."""
+    return min(1.0, 1 / math.sqrt(max(-slope, 1e-300)))
+
+
+def curved(sy: float, ss: float, yy: float) -> bool:
+    """Whether sᵀy, which the curvature condition makes positive, is more than rounding."""
+    return sy > 1e-14 * math.sqrt(ss * yy)
+
+
+def update_weights(sBs: float, yw: float, sy: float, n: int) -> tuple[float, float, float, float]:
+    """What the update divides H by, and its weights of ssᵀ, swᵀ + wsᵀ and wwᵀ."""
+    phi, tau = _scaled_broyden(sBs / sy, yw / sy, n)
+    return tau, phi * yw / (sy * sy) / tau + 1 / sy, -phi / sy / tau, (phi - 1) / yw / tau
 
 
 def _scaled_broyden(b: float, h: float, n: int) -> tuple[float, float]:

@@ -255,7 +255,7 @@ def stack(like: Array, *components: Array | float) -> Array:
     xp = array_namespace(like)
     batch = tuple(like.shape[:-1])
     columns = [
-        xp.full(batch, component, dtype=like.dtype)
+        xp.full(batch, component, dtype=like.dtype, device=like.device)
         if isinstance(component, int | float)
         else xp.broadcast_to(component, batch)
         for component in components
@@ -272,7 +272,7 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
     xp = array_namespace(like)
     batch = tuple(like.shape[:-1])
     n, m = len(rows), len(rows[0])
-    out = xp.zeros((n, m, *batch), dtype=like.dtype)
+    out = xp.zeros((n, m, *batch), dtype=like.dtype, device=like.device)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
             if not (isinstance(entry, int | float) and entry == 0):
@@ -286,9 +286,10 @@ def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array
     import torch
 
     given = torch.as_tensor(x)
-    tensors = [torch.as_tensor(other) for other in others]
+    tensors = [torch.as_tensor(other, device=given.device) for other in others]
     nx = given.shape[-1]
-    directions = torch.eye(nx, dtype=given.dtype).reshape(nx, *([1] * (given.ndim - 1)), nx)
+    directions = torch.eye(nx, dtype=given.dtype, device=given.device)
+    directions = directions.reshape(nx, *([1] * (given.ndim - 1)), nx)
     repeated = given.expand(nx, *given.shape).clone()
     tangents = directions.expand(repeated.shape).clone()
     columns = torch.func.jvp(lambda x: function(x, *tensors), (repeated,), (tangents,))[1]

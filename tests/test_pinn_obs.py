@@ -20,7 +20,7 @@ from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import Config, PinnObs, train
 from trainers.pinn_obs.adam import Adam
 from trainers.pinn_obs.objective import Objective, Weights
-from trainers.pinn_obs.passes import Passes, strung, unstrung
+from trainers.pinn_obs.passes import Passes, inputs_of, strung, unstrung
 from trainers.pinn_obs.points import samples_of
 
 
@@ -141,7 +141,8 @@ def test_the_rate_is_the_derivative_of_the_estimate(activation):
             weight.mul_(2)
             bias.normal_(generator=generator)
     t = torch.linspace(-3, 20, 28, dtype=torch.float64).requires_grad_()
-    out, rate = Passes(network.architecture, t.detach().numpy()).forward(strung(network))
+    inputs = inputs_of(network.architecture, t.detach().numpy())
+    out, rate = Passes(network.architecture, inputs, np.ones(9)).forward(strung(network))
     xhat, L = network(t)
     assert L.shape == (28, 3, 2)
     expected = torch.cat([xhat, L.flatten(1)], dim=1).detach().numpy()

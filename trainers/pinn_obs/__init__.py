@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from pinnobs_gym.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimators.pinn_obs import Trained, estimates_of
@@ -24,8 +25,9 @@ from trainers.pinn_obs.fast import FastRun
 from trainers.pinn_obs.paper import PaperRun
 from trainers.pinn_obs.progress import described, gain_figure, log_end, log_terms
 from trainers.pinn_obs.run import Run
+from trainers.pinn_obs.stacked import advance
 
-__all__ = ["Config", "PinnObs", "gain_figure", "train"]
+__all__ = ["Config", "PinnObs", "gain_figure", "train", "train_many"]
 
 MIN_SAMPLES = 10
 """The shortest record that is trained on."""
@@ -85,6 +87,52 @@ def train(
     trained = run.result()
     log_end(log, system, trained, run)
     return trained
+
+
+def train_many(
+    system: System,
+    config: Config,
+    *,
+    record: Record,
+    noise_std: Sequence[float] | float | None = None,
+) -> list[Trained]:
+    """Train PINN-Obs on each row of a record, of one episode each, with one seed; see `train`.
+
+    With a GPU the fast recipe trains on all rows at once, each until its own patience, iterations
+    or budget end it (of the CPU seconds of all); see `Config.device`. Otherwise it is one row after
+    another, exactly as by `train`: on a CPU that is the fastest. After Ctrl-C rows keep the best
+    weights that they have, be it those of their first iteration.
+
+    Args:
+        system: the model.
+        config: the recipe.
+        record: the samples of all episodes.
+        noise_std: see `train`.
+    """
+    rows = [record.rows(slice(i, i + 1)) for i in range(record.batch)]
+    for row in rows:
+        _check(system, row, config)
+    noise = vector(0.0 if noise_std is None else noise_std, system.ny, "noise_std")
+    device, kind = _device(config), _RUNS[config.optimiser]
+    with interruption() as stopped:
+        if device != "cpu" and config.optimiser == "ssbroyden":
+            runs = [kind(system, config, row, noise) for row in rows]
+            advance(runs, device, stopped)
+            return [run.result() for run in runs]
+        found = []
+        for row in rows:
+            run = kind(system, config, row, noise)
+            while not run.finished() and not (stopped and run.best):
+                run.step()
+            found.append(run.result())
+        return found
+
+
+def _device(config: Config) -> str:
+    there = torch.cuda.is_available()
+    if config.device == "cuda" and not there:
+        raise ValueError("device='cuda'; torch finds no GPU here")
+    return "cuda" if there and config.device != "cpu" else "cpu"
 
 
 def _iterate(
@@ -149,8 +197,12 @@ class PinnObs(OfflineEstimator):
         return {**facts, "config": asdict(self.config)}
 
     def fit(self, record: Record) -> list[Trained]:
-        """Train on each row of the record; see `train`."""
-        return [self._fit_row(record, i) for i in range(record.batch)]
+        """Train on each row of the record: by `train` if it is kept in a folder, or else by
+        `train_many`."""
+        if self.folder is None:
+            told = self._told_noise
+            return train_many(self.system, self.config, record=record, noise_std=told)
+        return [self._fit_row(record, i, self.folder / f"row-{i}") for i in range(record.batch)]
 
     def run(self, record: Record) -> Estimates:
         return estimates_of(self.fit(record), record.t)
@@ -160,18 +212,13 @@ class PinnObs(OfflineEstimator):
         benchmark = self.system.setups["benchmark"].noise_std
         return benchmark if self.noise_std is None else self.noise_std
 
-    def _fit_row(self, record: Record, i: int) -> Trained:
-        row = record.rows(slice(i, i + 1))
-        told = self._told_noise
-        if self.folder is None:
-            return train(self.system, self.config, record=row, noise_std=told)
-        folder = self.folder / f"row-{i}"
+    def _fit_row(self, record: Record, i: int, folder: Path) -> Trained:
         with Log(folder) as log:
             trained = train(
                 self.system,
                 self.config,
-                record=row,
-                noise_std=told,
+                record=record.rows(slice(i, i + 1)),
+                noise_std=self._told_noise,
                 log=log,
                 checkpoint=folder / "checkpoint.pt",
             )

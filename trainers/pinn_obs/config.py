@@ -11,6 +11,7 @@ from pinnobs_gym.network import Activation, Architecture, Precision
 from pinnobs_gym.training import expect
 
 Preset: TypeAlias = Literal["fast", "paper"]
+Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 PRESETS = MappingProxyType(
     {
@@ -103,6 +104,9 @@ class Config:
     """Most samples that self-scaled Broyden looks at, five times as many if they are noisy."""
     dtype: Precision = _PRESET
     """Precision."""
+    device: Device = "auto"
+    """Where self-scaled Broyden trains on many records: at once on a GPU, or one after another on
+    the CPU; ``auto`` takes a GPU if there is one. A single record is always trained on the CPU."""
     seed: int = 0
     """What the initial weights and the training samples are drawn from."""
     budget: float | None = None
@@ -127,6 +131,7 @@ class Config:
         expect(self, "improvement", "a number of at least 0 and under 1", lambda v: 0 <= v < 1)
         expect(self, "train_fraction", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
         expect(self, "optimiser", "adam or ssbroyden", lambda v: v in ("adam", "ssbroyden"))
+        expect(self, "device", "auto, cpu or cuda", lambda v: v in get_args(Device))
         expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
         if self.optimiser == "ssbroyden":
             expect(self, "points", "a whole number of at least 10", lambda v: v == int(v) >= 10)

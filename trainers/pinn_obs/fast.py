@@ -15,6 +15,7 @@ from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.quasi_newton import QuasiNewton
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
+from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
 from trainers.pinn_obs.run import Run
@@ -88,7 +89,7 @@ class FastRun(Run):
             frequencies=frequencies,
             scale=(*x_scale, *(_GAIN * per_gain).ravel()),
         )
-        self._objective = Objective(architecture, system, self.points, weights, lead)
+        self.objective = Objective(architecture, system, self.points, weights, lead)
         return architecture
 
     def _check_resolution(self, frequencies: tuple[float, ...], samples: int, most: int) -> None:
@@ -97,11 +98,10 @@ class FastRun(Run):
         needed = math.ceil(max(frequencies, default=0.0) * length / (2 * math.pi) * _PER_PERIOD)
         if samples < min(needed, self.record.num_samples):
             points = math.ceil(needed * self.config.points / most)
-            warnings.warn(
-                f"points={self.config.points} do not resolve the outputs over {length:g} s: they swing"
-                f" {needed / _PER_PERIOD:.0f} times; take points={points} or a shorter record",
-                stacklevel=2,
-            )
+            told = f"points={self.config.points} do not resolve the outputs over {length:g} s"
+            swings = f"they swing {needed / _PER_PERIOD:.0f} times"
+            message = f"{told}: {swings}; take points={points} or a shorter record"
+            warnings.warn(message, stacklevel=2)
 
     def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
         """What the estimates and gains are drawn towards, with weights that make both relative."""
@@ -128,7 +128,7 @@ class FastRun(Run):
         return network
 
     def _begun(self, theta: np.ndarray) -> QuasiNewton:
-        return QuasiNewton.start(self._objective, theta)
+        return QuasiNewton.start(self.objective, theta, first=FIRST_STEP)
 
     def held_out(self) -> None:
         return None
@@ -152,4 +152,5 @@ class FastRun(Run):
     def _resumed(self, state: Mapping[str, Any]) -> QuasiNewton:
         assert self.best is not None
         H = state["H"].numpy().T if "H" in state else None
-        return QuasiNewton(self.best.theta, self.best.loss, state["gradient"].numpy(), H)
+        here = self.best.theta, self.best.loss, state["gradient"].numpy()
+        return QuasiNewton(*here, H, first=FIRST_STEP)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
+import torch
+from array_api_compat import array_namespace
 
 from pinnobs_gym.network import Architecture
-from pinnobs_gym.system import System
-from trainers.pinn_obs.passes import Passes
+from pinnobs_gym.system import Array, System
+from trainers.pinn_obs.passes import Passes, inputs_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,18 +94,48 @@ class Objective:
         lead: Lead | None = None,
     ) -> None:
         dtype = np.dtype(architecture.dtype)
-        self._passes, self.system = Passes(architecture, points.t), system
-        self.points = _laid_out(points, dtype)
-        self.lead = None if lead is None else _laid_out(lead, dtype)
-        self._initial = _inner(weights.initial, dtype)
-        self._equation = _inner(points.equation[:, None] * weights.equation, dtype)
-        self._output = _inner(points.output * weights.output, dtype)
+        scale = architecture.scale or (1.0,) * architecture.shapes[-1][0]
+        parts = {f.name: getattr(points, f.name) for f in fields(points)}
+        if lead is not None:
+            parts |= {f"lead_{f.name}": getattr(lead, f.name) for f in fields(lead)}
+        parts["w_initial"] = weights.initial
+        parts["w_equation"] = points.equation[:, None] * weights.equation
+        parts["w_output"] = points.output * weights.output
+        parts["scale"], parts["inputs"] = np.asarray(scale), inputs_of(architecture, points.t)
+        laid_out = {name: _inner(np.asarray(part, dtype)) for name, part in parts.items()}
+        self._set(architecture, system, laid_out)
+
+    def _set(self, architecture: Architecture, system: System, parts: dict[str, Array]) -> None:
+        self.architecture, self.system, self._parts = architecture, system, parts
+        lead = {n.removeprefix("lead_"): part for n, part in parts.items() if n.startswith("lead_")}
+        self.points = Points(*(parts[f.name] for f in fields(Points)))
+        self.lead = Lead(**lead) if lead else None
+        self._initial, self._equation = parts["w_initial"], parts["w_equation"]
+        self._output = parts["w_output"]
+        self._passes = Passes(architecture, parts["inputs"], parts["scale"])
+
+    @classmethod
+    def stacked(cls, objectives: Sequence[Objective], device: str) -> Objective:
+        """Many objectives of networks of one shape at as many points as one, in torch: all that
+        `values` takes and gives has the batch as its first axis. There is no copy in the cache of
+        a CPU that would serve them all; there it takes longer than one after another."""
+        whole, first = cls.__new__(cls), objectives[0]
+        names = first._parts
+        stacks = {n: np.stack([objective._parts[n] for objective in objectives]) for n in names}
+        tensors = {n: torch.as_tensor(stack, device=device) for n, stack in stacks.items()}
+        whole._set(first.architecture, first.system, tensors)
+        return whole
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """The loss at weights theta (n,) and its gradient (n,)."""
         with np.errstate(all="ignore"):  # a trial step too long is told by a loss not finite
-            loss, *by_output = self._terms(*self._forward(theta))
-            return loss, self._passes.reverse(*by_output)
+            loss, gradient = self.values(theta)
+        return float(loss), gradient
+
+    def values(self, theta: Array) -> tuple[Array, Array]:
+        """The losses (...) at weights theta (..., n) and their gradients (..., n)."""
+        loss, *by_output = self._terms(*self._forward(theta))
+        return loss, self._passes.reverse(*by_output)
 
     def terms(self, theta: np.ndarray) -> np.ndarray:
         """The paper's three terms (3,) at weights theta (n,), in the system's own units."""
@@ -115,70 +147,61 @@ class Objective:
         initial = xhat[0] - points.xhat0
         return np.array([initial @ initial, equation, output], dtype=float)
 
-    def _forward(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """x̂ and dx̂/dt (num_points, nx), and L (num_points, nx, ny)."""
+    def _forward(self, theta: Array) -> tuple[Array, Array, Array]:
+        """x̂ and dx̂/dt (..., num_points, nx), and L (..., num_points, nx, ny)."""
         out, rate = self._passes.forward(theta)
         nx, ny = self.system.nx, self.system.ny
-        return out[:nx].T, rate.T, out[nx:].T.reshape(-1, nx, ny)
+        L = out[..., nx:, :].mT
+        return out[..., :nx, :].mT, rate.mT, L.reshape(*L.shape[:-1], nx, ny)
 
-    def _defects(
-        self, xhat: np.ndarray, rate: np.ndarray, L: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Innovations (num_points, ny), zero where missing, and residuals (num_points, nx)."""
+    def _defects(self, xhat: Array, rate: Array, L: Array) -> tuple[Array, Array]:
+        """Innovations (..., num_points, ny), zero where missing, and residuals
+        (..., num_points, nx)."""
         points = self.points
         innovation = (points.y - self.system.h(xhat)) * points.there
-        correction = (L * innovation[:, None, :]).sum(-1)
+        correction = (L * innovation[..., None, :]).sum(-1)
         return innovation, rate - self.system.f(points.t, xhat, points.u) - correction
 
-    def _terms(
-        self, xhat: np.ndarray, rate: np.ndarray, L: np.ndarray
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """The loss, and its derivatives by the network's outputs (nx + nx·ny, num_points) and by
-        dx̂/dt (nx, num_points)."""
+    def _terms(self, xhat: Array, rate: Array, L: Array) -> tuple[Array, Array, Array]:
+        """The losses (...), and their derivatives by the networks' outputs
+        (..., nx + nx·ny, num_points) and by dx̂/dt (..., nx, num_points)."""
         points, system = self.points, self.system
         innovation, residual = self._defects(xhat, rate, L)
-        initial = xhat[0] - points.xhat0
+        initial = xhat[..., 0, :] - points.xhat0
         by_initial, by_rate = self._initial * initial, self._equation * residual  # halves of them
         by_innovation = self._output * innovation
-        loss = (by_initial * initial).sum() + (by_rate * residual).sum()
-        loss += (by_innovation * innovation).sum()
+        loss = (by_initial * initial).sum(-1) + (by_rate * residual).sum((-2, -1))
+        loss += (by_innovation * innovation).sum((-2, -1))
         by_innovation -= _through(by_rate, L)
         by_innovation *= points.there
-        by_L = by_rate[:, :, None] * -innovation[:, None, :]
+        by_L = by_rate[..., None] * -innovation[..., None, :]
         A, H = system.f_jacobian(points.t, xhat, points.u), system.h_jacobian(xhat)
         by_xhat = _through(by_rate, -A) - _through(by_innovation, H)
-        by_xhat[0] += by_initial
+        by_xhat[..., 0, :] += by_initial
         if (lead := self.lead) is not None:
-            for value, towards, weight, by in (
-                (xhat, lead.xhat, lead.by_xhat, by_xhat),
-                (L, lead.L, lead.by_L, by_L),
+            for value, towards, weight, by, axes in (
+                (xhat, lead.xhat, lead.by_xhat, by_xhat, (-2, -1)),
+                (L, lead.L, lead.by_L, by_L, (-3, -2, -1)),
             ):
                 departure = value - towards
                 drawn = weight * departure
-                loss += (drawn * departure).sum()
+                loss += (drawn * departure).sum(axes)
                 by += drawn
-        by_out = np.concatenate([by_xhat.T, by_L.reshape(len(by_L), -1).T])
+        xp, flat = array_namespace(loss), by_L.reshape(*by_L.shape[:-2], -1)
+        by_out = xp.concat([by_xhat.mT, flat.mT], axis=-2)
         by_out *= 2
-        return float(loss), by_out, 2 * by_rate.T
+        return loss, by_out, 2 * by_rate.mT
 
 
-def _through(by: np.ndarray, J: np.ndarray) -> np.ndarray:
-    """Derivatives by a function's value (num_points, m) taken through its Jacobian J
-    (num_points, m, n) at every point."""
-    out = by[:, :1] * J[:, 0]
-    for i in range(1, J.shape[1]):
-        out += by[:, i : i + 1] * J[:, i]
+def _through(by: Array, J: Array) -> Array:
+    """Derivatives by a function's value (..., m) taken through its Jacobian J (..., m, n)."""
+    out = by[..., :1] * J[..., 0, :]
+    for i in range(1, J.shape[-2]):
+        out += by[..., i : i + 1] * J[..., i, :]
     return out
 
 
-_Part = TypeVar("_Part", Points, Lead)
-
-
-def _laid_out(part: _Part, dtype: np.dtype) -> _Part:
-    return replace(part, **{f.name: _inner(getattr(part, f.name), dtype) for f in fields(part)})
-
-
-def _inner(array: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """The same numbers (num_points, ...) in that precision, with the points innermost in memory, so
-    that arithmetic on few components of many points is contiguous."""
-    return np.ascontiguousarray(np.asarray(array, dtype).T).T
+def _inner(array: np.ndarray) -> np.ndarray:
+    """The same numbers (num_points, ...), the points innermost in memory, so that arithmetic on few
+    components of many points is contiguous."""
+    return np.ascontiguousarray(array.T).T

@@ -24,7 +24,7 @@ class PaperRun(Run):
         architecture = Architecture(*sizes, config.activation, config.dtype)
         order = np.random.default_rng(config.seed).permutation(self.record.num_samples)
         count = max(1, round(config.train_fraction * len(order)))
-        self._objective = self._loss_on(architecture, order[:count])
+        self.objective = self._loss_on(architecture, order[:count])
         left = order[count:]
         self._held_out = self._loss_on(architecture, left) if len(left) else None
         return architecture
@@ -40,7 +40,7 @@ class PaperRun(Run):
         return Network(self.architecture, generator)
 
     def _begun(self, theta: np.ndarray) -> Adam:
-        return Adam.start(self._objective, theta, self.config.learning_rate)
+        return Adam.start(self.objective, theta, self.config.learning_rate)
 
     def held_out(self) -> float | None:
         return None if self._held_out is None else self.total(self._held_out.terms(self.theta))

@@ -1,8 +1,9 @@
-"""A network and its time derivative, forward and in reverse, in NumPy and written out by hand.
+"""A network and its time derivative, forward and in reverse, written out by hand.
 
 At a few thousand points and twenty neurons torch spends its time on overhead and on arrays made
-anew; the same sums with the derivative carried forward through the layers, one reverse pass and
-arrays that are used again take a fraction.
+anew; the same sums in NumPy with the derivative carried forward through the layers, one reverse
+pass and arrays that are used again take a fraction. On a GPU the same lines run many networks at
+once in torch.
 """
 
 from __future__ import annotations
@@ -11,40 +12,45 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from array_api_compat import array_namespace, device
 
 from pinnobs_gym.network import Architecture, Network
+from pinnobs_gym.system import Array
 
 _CHUNK = 2000
 """Columns of a matrix product whose result is small; more of them fall out of the cache."""
 
 
-def _tanh(z: np.ndarray, value: np.ndarray, slope: np.ndarray, bend: np.ndarray) -> None:
-    np.tanh(z, out=value)
-    np.multiply(value, value, out=slope)
-    np.subtract(1, slope, out=slope)
-    np.multiply(value, slope, out=bend)
+def _tanh(z: Array, value: Array, slope: Array, bend: Array) -> None:
+    xp = array_namespace(z)
+    xp.tanh(z, out=value)
+    xp.multiply(value, value, out=slope)
+    slope *= -1
+    slope += 1
+    xp.multiply(value, slope, out=bend)
     bend *= -2
 
 
-def _sine(z: np.ndarray, value: np.ndarray, slope: np.ndarray, bend: np.ndarray) -> None:
-    np.sin(z, out=value)
-    np.cos(z, out=slope)
-    np.negative(value, out=bend)
+def _sine(z: Array, value: Array, slope: Array, bend: Array) -> None:
+    xp = array_namespace(z)
+    xp.sin(z, out=value)
+    xp.cos(z, out=slope)
+    bend[...] = -value
 
 
-def _sigmoid(z: np.ndarray, value: np.ndarray, slope: np.ndarray, bend: np.ndarray) -> None:
-    value[...] = 0.5 + 0.5 * np.tanh(0.5 * z)
-    np.multiply(value, 1 - value, out=slope)
-    np.multiply(slope, 1 - 2 * value, out=bend)
+def _sigmoid(z: Array, value: Array, slope: Array, bend: Array) -> None:
+    value[...] = 0.5 + 0.5 * array_namespace(z).tanh(0.5 * z)
+    slope[...] = value * (1 - value)
+    bend[...] = slope * (1 - 2 * value)
 
 
-def _relu(z: np.ndarray, value: np.ndarray, slope: np.ndarray, bend: np.ndarray) -> None:
+def _relu(z: Array, value: Array, slope: Array, bend: Array) -> None:
     slope[...] = z > 0
-    np.multiply(z, slope, out=value)
+    value[...] = z * slope
     bend[...] = 0
 
 
-_ACTIVATIONS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]] = {
+_ACTIVATIONS: dict[str, Callable[[Array, Array, Array, Array], None]] = {
     "tanh": _tanh,
     "sine": _sine,
     "sigmoid": _sigmoid,
@@ -71,7 +77,14 @@ def unstrung(architecture: Architecture, theta: np.ndarray) -> Network:
     return network
 
 
-def _layers(architecture: Architecture, theta: np.ndarray) -> list[np.ndarray]:
+def inputs_of(architecture: Architecture, t: np.ndarray) -> np.ndarray:
+    """What the first layer sees at times t (num_points,) in s, and the derivatives of that per s,
+    side by side: shape (num_features, 2 · num_points)."""
+    value, rate = architecture.features(t.astype(architecture.dtype))
+    return np.concatenate([value.T, rate.T], axis=1)
+
+
+def _layers(architecture: Architecture, theta: Array) -> list[Array]:
     """Views (..., out, in + 1) of theta (..., n): a layer's weights, and its biases as the last
     column."""
     layers, place = [], 0
@@ -84,75 +97,79 @@ def _layers(architecture: Architecture, theta: np.ndarray) -> list[np.ndarray]:
 
 
 class Passes:
-    """The two passes at fixed times.
+    """The two passes at fixed times, of one network or of a batch (...) of them at once.
 
-    Values and time derivatives lie side by side, (neurons, 2 · num_points), and under them a row of
-    one and zero, which the biases multiply. What a pass returns is overwritten by the next.
+    Values and time derivatives lie side by side, (..., neurons, 2 · num_points), and under them a
+    row of one and zero, which the biases multiply. What a pass returns is overwritten by the next.
 
     Args:
-        architecture: the network's.
-        t: times in s, shape (num_points,).
+        architecture: of the networks; its own times and scale are not looked at.
+        inputs: see `inputs_of`, shape (..., num_features, 2 · num_points), in the library, the
+            precision and on the device of everything else.
+        scale: what the networks' outputs are multiplied by, shape (..., nx + nx·ny).
     """
 
-    def __init__(self, architecture: Architecture, t: np.ndarray) -> None:
-        self._architecture, n = architecture, len(t)
-        dtype = np.dtype(architecture.dtype)
+    def __init__(self, architecture: Architecture, inputs: Array, scale: Array) -> None:
+        self._architecture, self._scale = architecture, scale[..., None]
         self._activation = _ACTIVATIONS[architecture.activation]
-        *hidden, (outputs, _) = architecture.shapes
-        scale = architecture.scale or (1.0,) * outputs
-        self._scale = np.asarray(scale, dtype)[:, None]
-        fans = [fan_in for _, fan_in in architecture.shapes]
-        self._seen = [np.zeros((fan_in + 1, 2 * n), dtype) for fan_in in fans]
-        for seen in self._seen:
-            seen[-1, :n] = 1
-        value, rate = architecture.features(t.astype(dtype))
-        self._seen[0][:-1] = np.concatenate([value.T, rate.T], axis=1)
-        self._slopes, self._bends = np.empty((2, len(hidden), architecture.width, n), dtype)
-        self._work = np.empty((2, architecture.width, 2 * n), dtype)
-        self._out = np.empty((outputs, 2 * n), dtype)
+        xp, batch, points = array_namespace(inputs), inputs.shape[:-2], inputs.shape[-1]
 
-    def forward(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The network's outputs (nx + nx·ny, num_points) at weights theta (n,), and the time
-        derivatives of the first nx of them (nx, num_points)."""
-        n, nx = self._out.shape[-1] // 2, self._architecture.nx
+        def empty(*shape: int) -> Array:
+            return xp.empty((*batch, *shape), dtype=inputs.dtype, device=device(inputs))
+
+        shapes, self._num_points = architecture.shapes, points // 2
+        self._seen = [empty(fan_in + 1, points) for _, fan_in in shapes]
+        for seen in self._seen:
+            seen[..., -1, : self._num_points], seen[..., -1, self._num_points :] = 1, 0
+        self._seen[0][..., :-1, :] = inputs
+        hidden = [width for width, _ in shapes[:-1]]
+        self._slopes = [empty(width, self._num_points) for width in hidden]
+        self._bends = [empty(width, self._num_points) for width in hidden]
+        self._work = [empty(architecture.width, points) for _ in range(2)]
+        self._out = empty(shapes[-1][0], points)
+
+    def forward(self, theta: Array) -> tuple[Array, Array]:
+        """The networks' outputs (..., nx + nx·ny, num_points) at weights theta (..., n), and the
+        time derivatives of the first nx of them (..., nx, num_points)."""
+        n, nx, xp = self._num_points, self._architecture.nx, array_namespace(theta)
         self._weights = _layers(self._architecture, theta)
         z = self._work[0]
         for k, weights in enumerate(self._weights[:-1]):
-            np.matmul(weights, self._seen[k], out=z)
-            above, slope, bend = self._seen[k + 1][:-1], self._slopes[k], self._bends[k]
-            self._activation(z[:, :n], above[:, :n], slope, bend)
-            np.multiply(slope, z[:, n:], out=above[:, n:])
-            bend *= z[:, n:]
-        out = np.matmul(self._weights[-1], self._seen[-1], out=self._out)
+            xp.matmul(weights, self._seen[k], out=z)
+            above, slope, bend = self._seen[k + 1][..., :-1, :], self._slopes[k], self._bends[k]
+            self._activation(z[..., :n], above[..., :n], slope, bend)
+            xp.multiply(slope, z[..., n:], out=above[..., n:])
+            bend *= z[..., n:]
+        out = xp.matmul(self._weights[-1], self._seen[-1], out=self._out)
         out *= self._scale
-        return out[:, :n], out[:nx, n:]
+        return out[..., :n], out[..., :nx, n:]
 
-    def reverse(self, by_out: np.ndarray, by_rate: np.ndarray) -> np.ndarray:
-        """The gradient (n,) of what has these derivatives by what `forward` returned last."""
-        n, nx = self._out.shape[-1] // 2, self._architecture.nx
+    def reverse(self, by_out: Array, by_rate: Array) -> Array:
+        """The gradient (..., n) of what has these derivatives by what `forward` returned last."""
+        n, nx, xp = self._num_points, self._architecture.nx, array_namespace(by_out)
         by_z = self._out
-        by_z[:, :n], by_z[:nx, n:], by_z[nx:, n:] = by_out, by_rate, 0
+        by_z[..., :n], by_z[..., :nx, n:], by_z[..., nx:, n:] = by_out, by_rate, 0
         by_z *= self._scale
-        size = sum(weights.size for weights in self._weights)
-        gradient = np.empty(size, by_z.dtype)
+        size = sum(out * (fan_in + 1) for out, fan_in in self._architecture.shapes)
+        shape = (*by_z.shape[:-2], size)
+        gradient = xp.empty(shape, dtype=by_z.dtype, device=device(by_z))
         parts = _layers(self._architecture, gradient)
         for k in range(len(parts) - 1, 0, -1):
             _outer(by_z, self._seen[k], parts[k])
             by_a = self._work[k % 2]
-            np.matmul(self._weights[k][:, :-1].T, by_z, out=by_a)
+            xp.matmul(self._weights[k][..., :-1].mT, by_z, out=by_a)
             slope, bend = self._slopes[k - 1], self._bends[k - 1]
-            bend *= by_a[:, n:]
-            by_a[:, :n] *= slope
-            by_a[:, :n] += bend
-            by_a[:, n:] *= slope
+            bend *= by_a[..., n:]
+            by_a[..., :n] *= slope
+            by_a[..., :n] += bend
+            by_a[..., n:] *= slope
             by_z = by_a
         _outer(by_z, self._seen[0], parts[0])
         return gradient
 
 
-def _outer(by_z: np.ndarray, seen: np.ndarray, out: np.ndarray) -> None:
+def _outer(by_z: Array, seen: Array, out: Array) -> None:
     """by_z · seenᵀ, summed chunk by chunk."""
-    np.matmul(by_z[:, :_CHUNK], seen[:, :_CHUNK].T, out=out)
+    out[...] = by_z[..., :_CHUNK] @ seen[..., :_CHUNK].mT
     for start in range(_CHUNK, seen.shape[-1], _CHUNK):
-        columns = slice(start, start + _CHUNK)
-        out += by_z[:, columns] @ seen[:, columns].T
+        out += by_z[..., start : start + _CHUNK] @ seen[..., start : start + _CHUNK].mT

@@ -7,9 +7,9 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,47 +26,13 @@ from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System
 from trainers.pinn_obs.config import Config
+from trainers.pinn_obs.minimum import Best, Mark, Method
 from trainers.pinn_obs.objective import Objective
 from trainers.pinn_obs.passes import strung, unstrung
 
 _RESTARTS = 3
-_FREE = ("iterations", "budget", "checkpoint_every", "log_every")
+_FREE = ("iterations", "budget", "device", "checkpoint_every", "log_every")
 """Settings that may change when training is resumed: they decide nothing but when it ends."""
-
-
-@dataclass(frozen=True, eq=False)
-class Best:
-    """The weights of the least loss so far."""
-
-    loss: float
-    """What is minimised, at these weights."""
-    iteration: int
-    """The iteration that found it, counted from 1."""
-    seed: int
-    """What these weights began from."""
-    theta: np.ndarray
-    """The weights in one vector (n,)."""
-
-
-@dataclass(frozen=True)
-class Mark:
-    """The last loss that was lower by enough for the patience to begin anew."""
-
-    loss: float
-    iteration: int
-
-
-class Method(Protocol):
-    """A minimisation in progress."""
-
-    x: np.ndarray
-    """Where it stands, shape (n,); made anew by each step."""
-    f: float
-    """The loss there."""
-
-    def step(self, objective: Objective) -> bool:
-        """One iteration; False if no lower value can be found."""
-        ...
 
 
 class Run(ABC):
@@ -83,7 +49,7 @@ class Run(ABC):
         self, system: System, config: Config, record: Record, noise_std: np.ndarray
     ) -> None:
         self.config, self.system, self.record, self.noise_std = config, system, record, noise_std
-        self._objective: Objective
+        self.objective: Objective
         self.iteration, self._earlier, self._start = 0, 0.0, time.process_time()
         self.architecture = self._architecture()
         self._kept: Best | None = None  # of attempts that ended in a loss that is not finite
@@ -99,7 +65,7 @@ class Run(ABC):
 
     @abstractmethod
     def _architecture(self) -> Architecture:
-        """The network's sizes; sets ``_objective``."""
+        """The network's sizes; sets ``objective``."""
 
     @abstractmethod
     def _drawn(self, generator: torch.Generator) -> Network:
@@ -120,21 +86,27 @@ class Run(ABC):
 
     def step(self) -> None:
         """One iteration, of which the first only looks at the weights that were drawn."""
-        self.iteration += 1
+        lower = True
         if self._method is None:
             self._method = self._begun(self._first)
         else:
-            self.stuck = not self._method.step(self._objective)
-        loss = self._method.f
+            lower = self._method.step(self.objective)
+        self.took(self._method.f, self._method.x, lower)
+
+    def took(self, loss: float, theta: np.ndarray, lower: bool = True) -> None:
+        """Count an iteration that ended at weights theta (n,), and keep them if their loss is the
+        least; ``lower`` is false if there is none lower to be found."""
+        self.iteration += 1
+        self.stuck = not lower
         if not math.isfinite(loss):
             self.restart()
         elif self.best is None or loss < self.best.loss:
-            self._found(loss, self._method.x)
+            self._found(loss, theta)
 
     def terms(self) -> np.ndarray:
         """The three terms of the loss (3,) at the iteration's weights, unweighted, in the system's
         own units."""
-        return self._objective.terms(self.theta)
+        return self.objective.terms(self.theta)
 
     def network(self) -> Network:
         """The network of the least loss."""
@@ -144,7 +116,7 @@ class Run(ABC):
     def loss(self) -> float:
         """The paper's loss of that network."""
         assert self.best is not None
-        return self.total(self._objective.terms(self.best.theta))
+        return self.total(self.objective.terms(self.best.theta))
 
     def covariance(self, network: Network) -> Covariance | None:
         """What is known of the error of that network's estimates; None unless overridden."""
