@@ -22,9 +22,20 @@ ALLOWED = {
     "estimator": {"system", "record", "simulate"},
     "checks": {"checks", "system", "simulate", "estimator", "record"},
     "systems": {"system", "registry"},
+    "kalman": {"estimator", "record", "simulate", "system"},
+    "sigma_points": {"estimator", "kalman", "record", "simulate"},
     "network": {"system"},
     "quasi_newton": set(),
-    "estimators": {"estimator", "record", "simulate", "system", "network", "registry"},
+    "estimators": {
+        "estimator",
+        "kalman",
+        "network",
+        "record",
+        "registry",
+        "sigma_points",
+        "simulate",
+        "system",
+    },
 }
 """What a module or subpackage may import of ours; itself is a case of its own below."""
 FORBIDDEN = {

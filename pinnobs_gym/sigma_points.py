@@ -1,0 +1,103 @@
+"""What the sigma-point filters share: all but where they put their points."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.estimator import State
+from pinnobs_gym.kalman import GaussianEstimator, checked, cholesky, covariances, divide, sandwich
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step
+
+JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
+"""What is added to variances, relatively, until a covariance has a Cholesky factor."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What the filter keeps besides the state's own fields; the batch comes last."""
+
+    Q: np.ndarray
+    """Covariance of the process noise, shape (nx, nx, 1)."""
+    R: np.ndarray
+    """Covariance of the output noise, shape (ny, ny, 1)."""
+    points: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """What `SigmaPointFilter.points` returns."""
+    jitter: np.ndarray
+    """The largest part of a variance that had to be added so far, shape (batch,); zero if none."""
+
+
+@dataclass(frozen=True)
+class SigmaPointFilter(GaussianEstimator):
+    """A Kalman filter whose moments come from points sent through the model.
+
+    The points are drawn anew after the prediction, so that they know of Q. With the weighted
+    deviations X of the points, and Y of their outputs, K = XYᵀ(YYᵀ + R)⁻¹ and
+    P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ: Joseph's form, positive semidefinite whatever K is (Arasaratnam
+    & Haykin 2009, the square-root form of section VII). If a covariance has no Cholesky factor,
+    `JITTER` of each of its variances is added, and reported in the state's memory.
+    """
+
+    @abstractmethod
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points of the standard normal distribution, (num_points, nx), and their weights in
+        means and in covariances, (num_points,), none negative."""
+
+    def reset(self, prior: Prior) -> State:
+        memory = Memory(*self.tuning(), self.points(), np.zeros(len(prior.mean)))
+        return State(prior.mean, P=checked(prior).cov, memory=memory)
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: Memory = state.memory
+        xhat, P = state.xhat, covariances(state)
+        unit, mean_weights, cov_weights = memory.points
+        weights = np.sqrt(cov_weights)[:, None]
+        L, jitter = factor(P, memory.jitter)
+        if state.t is not None:
+            points = xhat + (unit @ L).transpose(1, 2, 0)
+            points = model_step(self.system, state.t, t, points, state.u, u)
+            xhat = np.tensordot(mean_weights, points, 1)
+            X = (points - xhat).transpose(2, 0, 1) * weights
+            P = outer(X, X) + memory.Q
+            L, jitter = factor(P, jitter)
+        X = unit @ L  # (nx, num_points, batch)
+        outputs = np.asarray(self.system.h(xhat + X.transpose(1, 2, 0)))
+        yhat = np.tensordot(mean_weights, outputs, 1)
+        X, Y = X * weights, (outputs - yhat).transpose(2, 0, 1) * weights
+        innovation, missing = y - yhat, np.isnan(y)
+        if missing.any():
+            innovation = np.where(missing, 0.0, innovation)
+            Y = np.where(missing.T[:, None], 0.0, Y)
+        S = outer(Y, Y) + memory.R
+        K = divide(outer(X, Y), S)
+        X = X - np.einsum("ipb,pmb->imb", K, Y)
+        P = outer(X, X) + sandwich(K, memory.R)
+        xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
+        memory = replace(memory, jitter=jitter)
+        P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
+        return State(xhat, t, u, P, innovation, S, memory)
+
+
+def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """ABᵀ, shape (n, k, batch), of (n, m, batch) and (k, m, batch)."""
+    return np.einsum("imb,jmb->ijb", A, B)
+
+
+def factor(P: np.ndarray, jitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The Cholesky factors of P (nx, nx, batch), and the larger of the jitter (batch,) so far and
+    what had to be added now; not a number where even the largest of `JITTER` does not do."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        L = cholesky(P)
+        for added in JITTER:
+            bad = ~np.isfinite(L).all(axis=(0, 1)) & np.isfinite(P).all(axis=(0, 1))
+            if not bad.any():
+                break
+            enlarged = P[..., bad]
+            for i in range(len(P)):
+                enlarged[i, i] += added * enlarged[i, i] + np.finfo(float).tiny
+            L[..., bad] = cholesky(enlarged)
+            jitter = np.where(bad, np.maximum(jitter, added), jitter)
+    return L, jitter
