@@ -14,6 +14,9 @@ from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import identity, model_step_jacobian, product
 from pinnobs_gym.system import System, vector
 
+JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
+"""What is added to variances, relatively, until a covariance has a Cholesky factor."""
+
 
 @dataclass(frozen=True)
 class GaussianEstimator(Estimator):
@@ -133,12 +136,16 @@ def sandwich(M: np.ndarray, P: np.ndarray) -> np.ndarray:
 def divide(A: np.ndarray, S: np.ndarray) -> np.ndarray:
     """AS⁻¹, shape (n, m, batch), for A of that shape and S (m, m, batch), symmetric and positive
     definite; not a number where it is not."""
-    m = len(S)
-    if m == 1:
+    if len(S) == 1:
         return A / S
     with np.errstate(invalid="ignore", divide="ignore"):
-        L = cholesky(S)
-    X = np.empty(np.broadcast_shapes(A.shape, (*A.shape[:2], S.shape[2])))
+        return divide_factored(A, cholesky(S))
+
+
+def divide_factored(A: np.ndarray, L: np.ndarray) -> np.ndarray:
+    """A(LLᵀ)⁻¹, shape (n, m, batch), for A of that shape and L (m, m, batch) lower triangular."""
+    m = len(L)
+    X = np.empty(np.broadcast_shapes(A.shape, (*A.shape[:2], L.shape[2])))
     for j in range(m):  # X = A(Lᵀ)⁻¹
         X[:, j] = (A[:, j] - np.einsum("ikb,kb->ib", X[:, :j], L[j, :j])) / L[j, j]
     for j in reversed(range(m)):  # X L⁻¹
@@ -154,6 +161,23 @@ def cholesky(P: np.ndarray) -> np.ndarray:
         column = P[j:, j] - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
         L[j:, j] = column / np.sqrt(column[0])
     return L
+
+
+def factor(P: np.ndarray, jitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The Cholesky factors of P (nx, nx, batch), and the larger of the jitter (batch,) so far and
+    what had to be added now; not a number where even the largest of `JITTER` does not do."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        L = cholesky(P)
+        for added in JITTER:
+            bad = ~np.isfinite(L).all(axis=(0, 1)) & np.isfinite(P).all(axis=(0, 1))
+            if not bad.any():
+                break
+            enlarged = P[..., bad]
+            for i in range(len(P)):
+                enlarged[i, i] += added * enlarged[i, i] + np.finfo(float).tiny
+            L[..., bad] = cholesky(enlarged)
+            jitter = np.where(bad, np.maximum(jitter, added), jitter)
+    return L, jitter
 
 
 def squared_size(innovation: np.ndarray, S: np.ndarray) -> np.ndarray:

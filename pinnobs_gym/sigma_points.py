@@ -8,12 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.estimator import State
-from pinnobs_gym.kalman import GaussianEstimator, checked, cholesky, covariances, divide, sandwich
+from pinnobs_gym.kalman import GaussianEstimator, checked, covariances, divide, factor, sandwich
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import model_step
-
-JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
-"""What is added to variances, relatively, until a covariance has a Cholesky factor."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ class SigmaPointFilter(GaussianEstimator):
     deviations X of the points, and Y of their outputs, K = XYᵀ(YYᵀ + R)⁻¹ and
     P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ: Joseph's form, positive semidefinite whatever K is (Arasaratnam
     & Haykin 2009, the square-root form of section VII). If a covariance has no Cholesky factor,
-    `JITTER` of each of its variances is added, and reported in the state's memory.
+    `kalman.JITTER` of each of its variances is added, and reported in the state's memory.
     """
 
     @abstractmethod
@@ -84,20 +81,3 @@ class SigmaPointFilter(GaussianEstimator):
 def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """ABᵀ, shape (n, k, batch), of (n, m, batch) and (k, m, batch)."""
     return np.einsum("imb,jmb->ijb", A, B)
-
-
-def factor(P: np.ndarray, jitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The Cholesky factors of P (nx, nx, batch), and the larger of the jitter (batch,) so far and
-    what had to be added now; not a number where even the largest of `JITTER` does not do."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        L = cholesky(P)
-        for added in JITTER:
-            bad = ~np.isfinite(L).all(axis=(0, 1)) & np.isfinite(P).all(axis=(0, 1))
-            if not bad.any():
-                break
-            enlarged = P[..., bad]
-            for i in range(len(P)):
-                enlarged[i, i] += added * enlarged[i, i] + np.finfo(float).tiny
-            L[..., bad] = cholesky(enlarged)
-            jitter = np.where(bad, np.maximum(jitter, added), jitter)
-    return L, jitter

@@ -13,8 +13,8 @@ from pinnobs_gym.episodes import EpisodeSource
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
+from pinnobs_gym.kalman import factor
 from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.sigma_points import factor
 from pinnobs_gym.simulate import model_step
 from pinnobs_gym.system import Setup, System, stack
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
