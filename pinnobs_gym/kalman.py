@@ -133,6 +133,11 @@ def sandwich(M: np.ndarray, P: np.ndarray) -> np.ndarray:
     return product(MP, M.transpose(1, 0, 2))
 
 
+def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """ABᵀ, shape (n, k, batch), of (n, m, batch) and (k, m, batch)."""
+    return np.einsum("imb,jmb->ijb", A, B)
+
+
 def divide(A: np.ndarray, S: np.ndarray) -> np.ndarray:
     """AS⁻¹, shape (n, m, batch), for A of that shape and S (m, m, batch), symmetric and positive
     definite; not a number where it is not."""

@@ -8,7 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.estimator import State
-from pinnobs_gym.kalman import GaussianEstimator, checked, covariances, divide, factor, sandwich
+from pinnobs_gym.kalman import (
+    GaussianEstimator,
+    checked,
+    covariances,
+    divide,
+    factor,
+    outer,
+    sandwich,
+)
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import model_step
 
@@ -76,8 +84,3 @@ class SigmaPointFilter(GaussianEstimator):
         memory = replace(memory, jitter=jitter)
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)
-
-
-def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """ABᵀ, shape (n, k, batch), of (n, m, batch) and (k, m, batch)."""
-    return np.einsum("imb,jmb->ijb", A, B)
