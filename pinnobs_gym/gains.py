@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,7 @@ def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = N
     return scale[:, None] * (P @ H.T)
 
 
+@lru_cache(maxsize=64)
 def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarray:
     """L (nx, ny) of the default design: the `placed_gain`, or a part of it.
 
@@ -108,7 +110,9 @@ def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarr
             K = injection(L, np.repeat(H, len(parts), axis=0), weight, times[k + 1] - times[k])
             flow = (np.eye(system.nx) - K @ H) @ F @ flow
         left = abs(flow * scale / scale[:, None]).max(axis=(1, 2))
-    return parts[np.argmin(np.nan_to_num(left, nan=np.inf))] * L
+    gain = parts[np.argmin(np.nan_to_num(left, nan=np.inf))] * L
+    gain.flags.writeable = False  # the same array is returned again
+    return gain
 
 
 def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:

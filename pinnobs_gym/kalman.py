@@ -41,12 +41,12 @@ class GaussianEstimator(Estimator):
 
 
 def checked(prior: Prior) -> Prior:
-    """The prior, if its covariances are such.
+    """The prior in double precision, if its covariances are such.
 
     Raises:
         ValueError: in one line, if one is not symmetric and positive semidefinite.
     """
-    P = prior.cov
+    P = np.asarray(prior.cov, dtype=float)
     size = abs(P).max(axis=(1, 2))
     if (
         not np.isfinite(P).all()
@@ -59,7 +59,7 @@ def checked(prior: Prior) -> Prior:
         raise ValueError(
             f"P0 of row {row} has eigenvalue {least[row]:.3g}; expected a covariance, none below 0"
         )
-    return prior
+    return Prior(np.asarray(prior.mean, dtype=float), P)
 
 
 def covariances(state: State) -> np.ndarray:
@@ -163,7 +163,9 @@ def cholesky(P: np.ndarray) -> np.ndarray:
     definite."""
     L = np.zeros(P.shape)
     for j in range(len(P)):
-        column = P[j:, j] - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
+        column = P[j:, j]
+        if j:
+            column = column - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
         L[j:, j] = column / np.sqrt(column[0])
     return L
 
@@ -173,6 +175,8 @@ def factor(P: np.ndarray, jitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     what had to be added now; not a number where even the largest of `JITTER` does not do."""
     with np.errstate(invalid="ignore", divide="ignore"):
         L = cholesky(P)
+        if np.isfinite(L[-1, -1]).all():
+            return L, jitter
         for added in JITTER:
             bad = ~np.isfinite(L).all(axis=(0, 1)) & np.isfinite(P).all(axis=(0, 1))
             if not bad.any():

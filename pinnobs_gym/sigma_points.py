@@ -18,7 +18,7 @@ from pinnobs_gym.kalman import (
     sandwich,
 )
 from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.simulate import model_step, product
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,9 @@ class SigmaPointFilter(GaussianEstimator):
         means and in covariances, (num_points,), none negative."""
 
     def reset(self, prior: Prior) -> State:
+        prior = checked(prior)
         memory = Memory(*self.tuning(), self.points(), np.zeros(len(prior.mean)))
-        return State(prior.mean, P=checked(prior).cov, memory=memory)
+        return State(prior.mean, P=prior.cov, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: Memory = state.memory
@@ -62,25 +63,27 @@ class SigmaPointFilter(GaussianEstimator):
         weights = np.sqrt(cov_weights)[:, None]
         L, jitter = factor(P, memory.jitter)
         if state.t is not None:
-            points = xhat + (unit @ L).transpose(1, 2, 0)
+            points = np.add(xhat, (unit @ L).transpose(1, 2, 0), order="C")
             points = model_step(self.system, state.t, t, points, state.u, u)
-            xhat = np.tensordot(mean_weights, points, 1)
-            X = (points - xhat).transpose(2, 0, 1) * weights
-            P = outer(X, X) + memory.Q
+            points = np.ascontiguousarray(points.transpose(2, 0, 1))
+            mean = mean_weights @ points  # (nx, batch)
+            X = (points - mean[:, None]) * weights
+            xhat, P = mean.T, outer(X, X) + memory.Q
             L, jitter = factor(P, jitter)
         X = unit @ L  # (nx, num_points, batch)
-        outputs = np.asarray(self.system.h(xhat + X.transpose(1, 2, 0)))
-        yhat = np.tensordot(mean_weights, outputs, 1)
-        X, Y = X * weights, (outputs - yhat).transpose(2, 0, 1) * weights
-        innovation, missing = y - yhat, np.isnan(y)
+        outputs = np.asarray(self.system.h(xhat + X.transpose(1, 2, 0))).transpose(2, 0, 1)
+        mean = mean_weights @ outputs
+        X, Y = X * weights, (outputs - mean[:, None]) * weights
+        innovation, missing = y - mean.T, np.isnan(y)
         if missing.any():
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
         S = outer(Y, Y) + memory.R
         K = divide(outer(X, Y), S)
-        X = X - np.einsum("ipb,pmb->imb", K, Y)
+        X = X - product(K, Y)
         P = outer(X, X) + sandwich(K, memory.R)
         xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
-        memory = replace(memory, jitter=jitter)
+        if jitter is not memory.jitter:
+            memory = replace(memory, jitter=jitter)
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)

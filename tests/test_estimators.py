@@ -8,6 +8,7 @@ from scipy.linalg import block_diag
 
 from pinnobs_gym.episodes import EpisodeSource
 from pinnobs_gym.estimator import PerEpisode
+from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.kalman import cholesky, divide, joseph_update
@@ -15,6 +16,14 @@ from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import model_step
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+
+
+def untrained():
+    return [
+        name
+        for name, cls in ESTIMATORS.classes().items()
+        if cls.needs_training is None and cls.trains_on_record is None
+    ]
 
 
 def test_on_a_linear_system_the_ekf_is_the_kalman_filter():
@@ -165,6 +174,29 @@ def test_dividing_by_a_covariance(size):
     np.testing.assert_allclose(found, A @ np.linalg.inv(S), rtol=1e-9)
     L = cholesky(S.transpose(1, 2, 0)).transpose(2, 0, 1)
     np.testing.assert_allclose(L, np.linalg.cholesky(S), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", untrained())
+def test_single_precision_given_is_double_precision_kept(name):
+    """What is given in single precision is taken for what it is, and computed with in double."""
+    record = record_of(EpisodeSource("ReverseDuffing", duration=1.0), 2)
+    P0 = record.prior.cov.astype(np.float32)
+    single = Record(
+        record.t,
+        record.y.astype(np.float32),
+        record.u.astype(np.float32),
+        Prior(record.prior.mean.astype(np.float32), P0),
+    )
+    double = Record(
+        record.t,
+        single.y.astype(float),
+        single.u.astype(float),
+        Prior(single.prior.mean.astype(float), P0.astype(float)),
+    )
+    own = ESTIMATORS.resolve(name)(ReverseDuffing())
+    found, expected = own.run(single).xhat, own.run(double).xhat
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_open_loop_is_the_model_alone():

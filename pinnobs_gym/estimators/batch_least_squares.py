@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class BatchLeastSquares(OfflineEstimator):
 
     max_iterations: int = 50
     """Most evaluations of a record's trajectory over the whole of it."""
-    first_iterations: int = 10
+    first_iterations: int = 5
     """The same over each of the stretches before."""
     shortest: int = 16
     """Samples of the first stretch."""
@@ -45,7 +45,8 @@ class BatchLeastSquares(OfflineEstimator):
 
     def run(self, record: Record) -> Estimates:
         # The parameters are z with x₀ = x̂₀ + Lz, LLᵀ = P₀: standard normal by the prior.
-        L = root(checked(record.prior).cov.transpose(1, 2, 0))
+        record = replace(record, prior=checked(record.prior))
+        L = root(record.prior.cov.transpose(1, 2, 0))
         z = np.zeros(record.prior.mean.T.shape)
         with np.errstate(all="ignore"):
             for length in self._stretches(record.num_samples):
@@ -76,7 +77,7 @@ class BatchLeastSquares(OfflineEstimator):
     def _fitted(self, record: Record, L: np.ndarray, z: np.ndarray, length: int) -> np.ndarray:
         """The best z, from z on; a row is done when its next step would gain next to nothing."""
         whole = length == record.num_samples
-        least_gain = 1e-10 if whole else 1e-2  # in units of cost, of which one is a standard error
+        least_gain = 1e-8 if whole else 1e-2  # in units of cost, of which one is a standard error
         z, rows = z.copy(), np.arange(record.batch)
         fit = self._evaluated(record, L, z, rows, length)
         cost, information, right = fit.cost, fit.information, fit.right

@@ -74,7 +74,8 @@ class EKF(GaussianEstimator):
             raise ValueError(f"huber={self.huber}; expected a positive number")
 
     def reset(self, prior: Prior) -> State:
-        P0 = checked(prior).cov
+        prior = checked(prior)
+        P0 = prior.cov
         wide = P0 + np.diag(vector(self.system.scale, self.system.nx, "scale") ** 2)
         degrees = np.maximum(np.arange(self.system.ny + 1), 1)
         bounds = chi2.ppf(1.0 if self.gate is None else self.gate, degrees)

@@ -57,7 +57,8 @@ class EnKF(GaussianEstimator):
             raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
 
     def reset(self, prior: Prior) -> State:
-        L = root(checked(prior).cov.transpose(1, 2, 0))
+        prior = checked(prior)
+        L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + np.einsum("ijb,mj->mbi", L, self._draws(0, self.system.nx))
         stds = self.process_noise * np.asarray(self.system.scale), np.sqrt(self.output_variance)
         return State(prior.mean, P=prior.cov, memory=Memory(members, *stds))

@@ -46,9 +46,9 @@ class HighGain(GaussianEstimator):
             raise ValueError(f"theta={self.theta}; expected a number of at least 0")
 
     def reset(self, prior: Prior) -> State:
-        P0 = checked(prior).cov
-        largest = self._size(P0.transpose(1, 2, 0)) + self.system.nx
-        return State(prior.mean, P=P0, memory=(*self.tuning(), largest))
+        prior = checked(prior)
+        largest = self._size(prior.cov.transpose(1, 2, 0)) + self.system.nx
+        return State(prior.mean, P=prior.cov, memory=(*self.tuning(), largest))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat, P, (Q, R, largest) = state.xhat, covariances(state), state.memory

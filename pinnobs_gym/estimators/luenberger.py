@@ -64,7 +64,7 @@ class Luenberger(Estimator):
         return settling_gain(self.system, rate)
 
     def reset(self, prior: Prior) -> State:
-        return State(prior.mean, memory=self.designed())
+        return State(prior.mean.astype(float), memory=self.designed())
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat, L, dt = state.xhat, state.memory, 0.0

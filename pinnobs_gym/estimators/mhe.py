@@ -60,7 +60,7 @@ class MHE(GaussianEstimator):
 
     process_noise: float = 2e-5
     """Standard deviation of the process noise per sample, over the state's scale."""
-    window: int = 20
+    window: int = 10
     """Samples in the window."""
     steps: int = 1
     """Gauss-Newton steps at every sample; one is the real-time iteration of Diehl et al. 2005."""
@@ -74,9 +74,9 @@ class MHE(GaussianEstimator):
                 raise ValueError(f"{name}={getattr(self, name)}; expected at least 1")
 
     def reset(self, prior: Prior) -> State:
-        P0 = checked(prior).cov
-        memory = Memory(*self.tuning(), prior.mean, P0.transpose(1, 2, 0), prior.mean)
-        return State(prior.mean, P=P0, memory=memory)
+        prior = checked(prior)
+        P0, mean = prior.cov.transpose(1, 2, 0), prior.mean
+        return State(mean, P=prior.cov, memory=Memory(*self.tuning(), mean, P0, mean))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: Memory = state.memory

@@ -65,7 +65,8 @@ class ParticleFilter(Estimator):
             raise ValueError(f"discount={self.discount}; expected a number in (1/3, 1]")
 
     def reset(self, prior: Prior) -> State:
-        L = root(checked(prior).cov.transpose(1, 2, 0))
+        prior = checked(prior)
+        L = root(prior.cov.transpose(1, 2, 0))
         draws = np.random.default_rng([self.seed, 0]).standard_normal(
             (self.particles, self.system.nx)
         )

@@ -75,7 +75,8 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
     def _forward(self, record: Record) -> list[Filtered]:
         """The filter at every sample."""
         Q, R = self.tuning()
-        xhat, P = record.prior.mean, checked(record.prior).cov.transpose(1, 2, 0)
+        prior = checked(record.prior)
+        xhat, P = prior.mean, prior.cov.transpose(1, 2, 0)
         samples = []
         for k, t in enumerate(record.t):
             innovation, H = observe(self.system, xhat, record.y[:, k])

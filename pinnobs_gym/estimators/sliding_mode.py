@@ -46,7 +46,7 @@ class SlidingMode(Estimator):
         rate = default_rate(self.system) if self.rate is None else self.rate
         L = settling_gain(self.system, rate, 1 + self.switching)
         layer = self.layer * np.sqrt(self.output_variance)
-        return State(prior.mean, memory=(L, layer))
+        return State(prior.mean.astype(float), memory=(L, layer))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat, (L, layer), dt = state.xhat, state.memory, 0.0

@@ -47,7 +47,8 @@ class StrongTrackingEKF(GaussianEstimator):
                 raise ValueError(f"{name}={getattr(self, name)}; expected a number of at least 0")
 
     def reset(self, prior: Prior) -> State:
-        return State(prior.mean, P=checked(prior).cov, memory=self.tuning())
+        prior = checked(prior)
+        return State(prior.mean, P=prior.cov, memory=self.tuning())
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat, P, (Q, R) = state.xhat, covariances(state), state.memory
