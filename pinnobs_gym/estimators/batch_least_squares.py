@@ -26,9 +26,9 @@ class BatchLeastSquares(OfflineEstimator):
     told (`Estimator.output_variance`).
     """
 
-    max_iterations: int = 50
+    max_iterations: int = 20
     """Most evaluations of a record's trajectory over the whole of it."""
-    first_iterations: int = 5
+    first_iterations: int = 10
     """The same over each of the stretches before."""
     shortest: int = 16
     """Samples of the first stretch."""
