@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimators.ekf import EKF, joseph_update
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.kalman import joseph_update
 from pinnobs_gym.record import Record
 from pinnobs_gym.simulate import model_step_jacobian, product
 from pinnobs_gym.system import vector
@@ -134,7 +135,6 @@ def _pass(ekf: EKF, record: Record, points: np.ndarray | None) -> np.ndarray:
         missing = np.isnan(innovation)
         H = np.where(missing.T[:, None], 0.0, H)
         x, P, _ = joseph_update(x, P, np.where(missing, 0.0, innovation), H, R)
-        P = (P + P.transpose(1, 0, 2)) / 2
     smoothed = [x]
     scale = vector(ekf.system.scale, ekf.system.nx, "scale")
     for x, cross, x_next, P_next in reversed(backward):
