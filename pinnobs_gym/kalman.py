@@ -189,10 +189,12 @@ def divide(A: np.ndarray, S: np.ndarray) -> np.ndarray:
 def divide_factored(A: np.ndarray, L: np.ndarray) -> np.ndarray:
     """A(LLᵀ)⁻¹, shape (n, m, batch), for A of that shape and L (m, m, batch) lower triangular."""
     m = len(L)
-    X = np.empty(np.broadcast_shapes(A.shape, (*A.shape[:2], L.shape[2])))
+    X = np.empty((*A.shape[:2], max(A.shape[2], L.shape[2])))
     for j in range(m):  # X = A(Lᵀ)⁻¹
-        X[:, j] = (A[:, j] - np.einsum("ikb,kb->ib", X[:, :j], L[j, :j])) / L[j, j]
-    for j in reversed(range(m)):  # X L⁻¹
+        rest = A[:, j] - np.einsum("ikb,kb->ib", X[:, :j], L[j, :j]) if j else A[:, j]
+        X[:, j] = rest / L[j, j]
+    X[:, -1] /= L[-1, -1]
+    for j in reversed(range(m - 1)):  # X L⁻¹
         X[:, j] = (X[:, j] - np.einsum("ikb,kb->ib", X[:, j + 1 :], L[j + 1 :, j])) / L[j, j]
     return X
 

@@ -270,7 +270,7 @@ def model_step(
 ) -> Array:
     """The state (..., nx) at t1 of the model that is in x at t0 (s), by the classical Runge-Kutta
     method in equal steps of at most the system's `System.model_step`. Rows (batch, nx) of x may
-    each have a time of their own, t0 and t1 then being (batch,), with the same t1 − t0 for all.
+    each have times of their own, t0 and t1 then being (batch,); all take as many steps.
 
     ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1; they are used, joined by a
     straight line, only if the system's input is a measured one.
@@ -313,7 +313,8 @@ def model_step_jacobian(
         if u.ndim == 2:
             stage_inputs = stage_inputs[:, None]
         A = system.f_jacobian(stage_times, points, stage_inputs)
-        A = np.multiply(A.transpose(0, 2, 3, 1), step / 2, order="C")  # (4, nx, nx, batch)
+        half = step / 2 if t.ndim == 1 else step[:, 0] / 2
+        A = np.multiply(A.transpose(0, 2, 3, 1), half, order="C")  # (4, nx, nx, batch)
         K2 = A[1] + product(A[1], A[0])
         K3 = A[2] + product(A[2], K2)
         K4 = A[3] + 2 * product(A[3], K3)
@@ -347,29 +348,27 @@ def substeps(
     u0: Array | None,
     u1: Array | None,
     longest: float = np.inf,
-) -> Iterator[tuple[Array, float, Array]]:
+) -> Iterator[tuple[Array, Array, Array]]:
     """Yield, for each Runge-Kutta step of `model_step` from t0 to t1, the three times (s) at which
     f is evaluated, the step, and the inputs at these times, (3, ..., nu). No step is over
     ``longest`` (s).
 
-    The times are (3,) or, where t0 is an array (batch,) of a time for each row, (3, batch); all
-    rows are then taken on by the same t1 − t0.
+    The times are (3,) or, where t0 and t1 are arrays (batch,), (3, batch), and the step (batch, 1).
     """
     xp = np if isinstance(x, np.ndarray) else array_namespace(x)
     longest = min(longest, system.model_step or system.setups["benchmark"].dt)
-    gap = t1 - t0
-    whole = float(np.max(gap) if np.ndim(gap) else gap)
-    count = max(1, int(np.ceil(whole / longest - 1e-6)))
-    step = whole / count
+    by_row = np.ndim(t0) > 0
+    whole = t1 - t0
+    count = max(1, int(np.ceil(float(whole.max() if by_row else whole) / longest - 1e-6)))
+    step = whole[:, None] / count if by_row else float(whole) / count
     for k in range(count):
-        start = k * step
-        after = xp.asarray([start, start + step / 2, start + step], dtype=x.dtype)
-        after = after.reshape(3, *([1] * np.ndim(t0)))
-        t = t0 + after
+        part = xp.asarray([k, k + 0.5, k + 1], dtype=x.dtype)
+        after = part * step
+        t = t0 + (after.T if by_row else after)
         if system.measured_input:
             if u0 is None or u1 is None:
                 raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
-            weight = (after / whole).reshape(3, *([1] * u0.ndim))
+            weight = (part / count).reshape(3, *([1] * u0.ndim))
             u = (1 - weight) * u0 + weight * u1
         else:
             u = system.input(t)
