@@ -162,7 +162,7 @@ class Leaderboard:
     """Episodes of each estimator and system."""
     trained_episodes: int = 5
     """Episodes of those that train on every record."""
-    budget: float = 20.0
+    budget: float = 45.0
     """CPU seconds of each training."""
     seed: int = 0
     """Seed of the first episode."""

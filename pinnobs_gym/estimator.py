@@ -124,6 +124,8 @@ class Estimator(ABC):
         benchmark = self.system.setups["benchmark"].noise_std
         told = benchmark if self.noise_std is None else self.noise_std
         std = vector(told, self.system.ny, "noise_std")
+        if not (np.isfinite(std).all() and (std >= 0).all()):
+            raise ValueError(f"noise_std={told}; expected numbers of at least 0")
         return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
 
     @property
@@ -213,8 +215,12 @@ class PerEpisode(Estimator):
 
 
 def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:
-    return {
-        name: np.empty((num_samples, *getattr(state, name).shape))
-        for name in (f.name for f in fields(Estimates))
-        if getattr(state, name) is not None
-    }
+    """Arrays (num_samples, batch, ...) for what the state has, laid out in memory as it is."""
+    columns = {}
+    for name in (f.name for f in fields(Estimates)):
+        array = getattr(state, name)
+        if array is not None:
+            order = np.argsort([-stride for stride in array.strides], kind="stable")
+            column = np.empty((num_samples, *(array.shape[axis] for axis in order)))
+            columns[name] = column.transpose(0, *(1 + np.argsort(order)))
+    return columns

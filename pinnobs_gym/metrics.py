@@ -76,16 +76,16 @@ def score(
         }
         counts = np.ones(x.shape, dtype=bool) if scored is None else scored
         total, number = _sums(error, scale, counts)
-        scores["nrmse"] = _window(total, number, 1.0)
-        scores["nrmse_75"] = _window(total, number, 0.75)
-        scores["nrmse_tail"] = _window(total, number, 0.25)
+        scores["nrmse"] = window(total, number, 1.0)
+        scores["nrmse_75"] = window(total, number, 0.75)
+        scores["nrmse_tail"] = window(total, number, 0.25)
         by_sample = np.sqrt(total / np.maximum(number, 1))
         scores["settling"] = _settling(t, by_sample)
         scores["peak"] = by_sample.max(axis=1)
         for other in alternatives:
             total = np.minimum(total, _sums(xhat - other, scale, counts)[0])
-        scores["nrmse_modulo"] = _window(total, number, 1.0)
-        scores["nrmse_tail_modulo"] = _window(total, number, 0.25)
+        scores["nrmse_modulo"] = window(total, number, 1.0)
+        scores["nrmse_tail_modulo"] = window(total, number, 0.25)
     for values in scores.values():
         values[~finite] = np.inf
     scores["diverged"] = ~(scores["nrmse_tail"] <= DIVERGED)
@@ -100,7 +100,7 @@ def _sums(
     return square.sum(axis=-1), counts.sum(axis=-1)
 
 
-def _window(total: np.ndarray, number: np.ndarray, part: float) -> np.ndarray:
+def window(total: np.ndarray, number: np.ndarray, part: float) -> np.ndarray:
     """NRMSE over the last part of the samples."""
     first = round((1 - part) * total.shape[1])
     return np.sqrt(total[:, first:].sum(axis=1) / np.maximum(number[:, first:].sum(axis=1), 1))

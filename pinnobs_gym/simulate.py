@@ -22,6 +22,8 @@ _NODES = 6
 """Solver steps that one interpolating polynomial passes through, with value and slope."""
 _HALVINGS = 7
 """How often the step is halved before an episode is given to an adaptive solver."""
+_STAGES = np.array([0, 1, 1, 2])
+"""Which of a step's start, middle and end each of the four Runge-Kutta stages looks at."""
 _FAR = 1e9
 """Size of a state, over its scale, from which on it is taken to have run away."""
 
@@ -268,7 +270,7 @@ def model_step(
 ) -> Array:
     """The state (..., nx) at t1 of the model that is in x at t0 (s), by the classical Runge-Kutta
     method in equal steps of at most the system's `System.model_step`. Rows (batch, nx) of x may
-    each have a time of their own, t0 and t1 then being (batch,), with the same t1 − t0 for all.
+    each have times of their own, t0 and t1 then being (batch,); all take as many steps.
 
     ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1; they are used, joined by a
     straight line, only if the system's input is a measured one.
@@ -292,34 +294,31 @@ def model_step_jacobian(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What `model_step` returns for x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape
     (batch, nx, nx), with the batch innermost in memory."""
-    batch, nx = x.shape
     F = None
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
-        points = np.empty((4, batch, nx))
+        points = np.empty((4, *x.shape))
         points[0] = x
         k1 = system.f(t[0], x, u[0])
-        points[1] = x + (step / 2) * k1
+        np.add(x, (step / 2) * k1, out=points[1])
         k2 = system.f(t[1], points[1], u[1])
-        points[2] = x + (step / 2) * k2
+        np.add(x, (step / 2) * k2, out=points[2])
         k3 = system.f(t[1], points[2], u[1])
-        points[3] = x + step * k3
+        np.add(x, step * k3, out=points[3])
         k4 = system.f(t[2], points[3], u[2])
         x = x + (step / 6) * (k1 + 2 * (k2 + k3) + k4)
         # The variational equation Φ' = A(t)Φ, by the same method along the same stages.
-        stage_times, stage_inputs = t[[0, 1, 1, 2]], u[[0, 1, 1, 2]]
+        stage_times, stage_inputs = t[_STAGES], u[_STAGES]
         if t.ndim == 1:
             stage_times = stage_times[:, None]
         if u.ndim == 2:
             stage_inputs = stage_inputs[:, None]
         A = system.f_jacobian(stage_times, points, stage_inputs)
-        A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
-        K1 = A[0]
-        K2 = A[1] + product(A[1], (step / 2) * K1)
-        K3 = A[2] + product(A[2], (step / 2) * K2)
-        K4 = A[3] + product(A[3], step * K3)
-        flow = (step / 6) * (K1 + 2 * (K2 + K3) + K4)
-        for i in range(nx):
-            flow[i, i] += 1
+        half = step / 2 if t.ndim == 1 else step[:, 0] / 2
+        A = np.multiply(A.transpose(0, 2, 3, 1), half, order="C")  # (4, nx, nx, batch)
+        K2 = A[1] + product(A[1], A[0])
+        K3 = A[2] + product(A[2], K2)
+        K4 = A[3] + 2 * product(A[3], K3)
+        flow = identity(x.shape[1]) + (A[0] + K4 + 2 * (K2 + K3)) / 3
         F = flow if F is None else product(flow, F)
     assert F is not None  # there is at least one substep
     return x, F.transpose(2, 0, 1)
@@ -328,7 +327,17 @@ def model_step_jacobian(
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The matrix products (n, m, batch) of (n, k, batch) and (k, m, batch): several times faster
     than the same with the batch first where the matrices are small."""
+    if a.shape[1] == 1:
+        return a * b
     return np.einsum("ijb,jkb->ikb", a, b)
+
+
+@lru_cache(maxsize=64)
+def identity(size: int) -> np.ndarray:
+    """The identity matrix, shape (size, size, 1), not to be written to."""
+    matrix = np.eye(size)[..., None]
+    matrix.flags.writeable = False
+    return matrix
 
 
 def substeps(
@@ -339,28 +348,27 @@ def substeps(
     u0: Array | None,
     u1: Array | None,
     longest: float = np.inf,
-) -> Iterator[tuple[Array, float, Array]]:
+) -> Iterator[tuple[Array, Array, Array]]:
     """Yield, for each Runge-Kutta step of `model_step` from t0 to t1, the three times (s) at which
     f is evaluated, the step, and the inputs at these times, (3, ..., nu). No step is over
     ``longest`` (s).
 
-    The times are (3,) or, where t0 is an array (batch,) of a time for each row, (3, batch); all
-    rows are then taken on by the same t1 − t0.
+    The times are (3,) or, where t0 and t1 are arrays (batch,), (3, batch), and the step (batch, 1).
     """
-    xp = array_namespace(x)
+    xp = np if isinstance(x, np.ndarray) else array_namespace(x)
     longest = min(longest, system.model_step or system.setups["benchmark"].dt)
-    whole = float(np.max(t1 - t0))
-    count = max(1, int(np.ceil(whole / longest - 1e-6)))
-    step = whole / count
+    by_row = np.ndim(t0) > 0
+    whole = t1 - t0
+    count = max(1, int(np.ceil(float(whole.max() if by_row else whole) / longest - 1e-6)))
+    step = whole[:, None] / count if by_row else float(whole) / count
     for k in range(count):
-        start = k * step
-        after = xp.asarray([start, start + step / 2, start + step], dtype=x.dtype)
-        after = after.reshape(3, *([1] * np.ndim(t0)))
-        t = t0 + after
+        part = xp.asarray([k, k + 0.5, k + 1], dtype=x.dtype)
+        after = part * step
+        t = t0 + (after.T if by_row else after)
         if system.measured_input:
             if u0 is None or u1 is None:
                 raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
-            weight = (after / whole).reshape(3, *([1] * u0.ndim))
+            weight = (part / count).reshape(3, *([1] * u0.ndim))
             u = (1 - weight) * u0 + weight * u1
         else:
             u = system.input(t)

@@ -137,7 +137,7 @@ class System(ABC):
 
     def input(self, t: Array) -> Array:
         """The known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
-        xp = array_namespace(t)
+        xp = np if isinstance(t, np.ndarray) else array_namespace(t)
         return xp.zeros((*t.shape, self.nu), dtype=t.dtype)
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
@@ -269,7 +269,7 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
 
     The batch lies innermost in memory, so that arithmetic on one entry over a batch is contiguous.
     """
-    xp = array_namespace(like)
+    xp = np if isinstance(like, np.ndarray) else array_namespace(like)
     batch = tuple(like.shape[:-1])
     n, m = len(rows), len(rows[0])
     out = xp.zeros((n, m, *batch), dtype=like.dtype, device=like.device)

@@ -1,59 +1,29 @@
 """The filters against closed forms and other implementations."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from linear import H, Linear, kalman_filter, linear_record, record_of, runge_kutta_matrix
 from scipy.linalg import block_diag
 
-from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym.episodes import EpisodeSource
 from pinnobs_gym.estimator import PerEpisode
-from pinnobs_gym.estimators.ekf import EKF, joseph_update
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.open_loop import OpenLoop
+from pinnobs_gym.kalman import cholesky, divide, joseph_update
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import model_step
-from pinnobs_gym.system import Setup, System, stack
+from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
 
-@dataclass(frozen=True)
-class Linear(System):
-    """A damped oscillator of which both states are measured, the second in double."""
-
-    state_names = ("x1", "x2")
-    output_names = ("y1", "y2")
-    scale = (1.0, 1.0)
-    setups = {
-        "benchmark": Setup(
-            (-1.0, -1.0), (1.0, 1.0), (0.3, -0.2), (0.8, 0.5), duration=2.0, dt=0.1, noise_std=0.1
-        )
-    }
-
-    def f(self, t, x, u):
-        return stack(x, x[..., 1], -2.0 * x[..., 0] - 0.3 * x[..., 1])
-
-    def h(self, x):
-        return stack(x, x[..., 0], 2 * x[..., 1])
-
-
-A = np.array([[0.0, 1.0], [-2.0, -0.3]])
-H = np.array([[1.0, 0.0], [0.0, 2.0]])
-
-
-def runge_kutta_matrix(dt):
-    """What the classical Runge-Kutta method does to a linear system."""
-    h = dt * A
-    return np.eye(2) + h + h @ h / 2 + h @ h @ h / 6 + h @ h @ h @ h / 24
-
-
-def record_of(source, batch):
-    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(batch)]
-    return source.record(source.play(source.draw(streams)))
-
-
-def linear_record(batch=3):
-    return record_of(EpisodeSource(Linear), batch)
+def untrained():
+    return [
+        name
+        for name, cls in ESTIMATORS.classes().items()
+        if cls.needs_training is None and cls.trains_on_record is None
+    ]
 
 
 def test_on_a_linear_system_the_ekf_is_the_kalman_filter():
@@ -61,14 +31,7 @@ def test_on_a_linear_system_the_ekf_is_the_kalman_filter():
     ekf = EKF(Linear(), noise_std=(0.1, 0.2), process_noise=0.05)
     estimates = ekf.run(record)
     for i in range(record.batch):
-        peer = KalmanFilter(dim_x=2, dim_z=2)
-        peer.x, peer.P = record.prior.mean[i].copy(), record.prior.cov[i].copy()
-        peer.F, peer.H = runge_kutta_matrix(0.1), H
-        peer.Q, peer.R = np.eye(2) * 0.05**2, np.diag([0.01, 0.04])
-        for k in range(record.num_samples):
-            if k:
-                peer.predict()
-            peer.update(record.y[i, k])
+        for k, peer in enumerate(kalman_filter(record, i, 0.05, (0.1, 0.2))):
             np.testing.assert_allclose(estimates.xhat[i, k], peer.x, atol=1e-12)
             np.testing.assert_allclose(estimates.P[i, k], peer.P, atol=1e-12)
             np.testing.assert_allclose(estimates.S[i, k], peer.S, atol=1e-12)
@@ -123,6 +86,117 @@ def test_josephs_form_keeps_P_symmetric_and_semidefinite():
         x, P, _ = joseph_update(x, P, np.zeros((1, 1)), H1, R)
     np.testing.assert_allclose(P[..., 0], P[..., 0].T, atol=1e-20)
     assert np.linalg.eigvalsh((P + P.swapaxes(0, 1))[..., 0] / 2).min() > -1e-12
+
+
+def test_the_gate_restarts_a_filter_that_is_wrong():
+    """The second output jumps for good; five samples later P is widened, as done by hand here."""
+    record = linear_record(1)
+    y = record.y.copy()
+    y[0, 8:] += 5.0
+    jump = Record(record.t, y, record.u, record.prior)
+    gated = EKF(Linear(), noise_std=0.1, gate=0.9999, patience=5).run(jump)
+    plain = EKF(Linear(), noise_std=0.1).run(jump)
+    np.testing.assert_array_equal(gated.xhat[0, :12], plain.xhat[0, :12])
+    peer = KalmanFilter(dim_x=2, dim_z=2)
+    peer.x, peer.F, peer.H, peer.Q = plain.xhat[0, 11], runge_kutta_matrix(0.1), H, np.eye(2) * 1e-8
+    peer.R = np.eye(2) * 0.01
+    peer.predict()
+    peer.P = record.prior.cov[0] + np.eye(2)
+    peer.update(y[0, 12])
+    np.testing.assert_allclose(gated.xhat[0, 12], peer.x, atol=1e-12)
+    np.testing.assert_allclose(gated.P[0, 12], peer.P, atol=1e-12)
+
+
+def test_the_gate_ends_false_locks_of_the_motor():
+    """With a large Q the filter locks on wrongly in one episode of six or so, for good."""
+    record = record_of(EpisodeSource("InductionMotor", duration=0.4), 24)
+    motor = SYSTEMS.resolve("InductionMotor")()
+    speeds = [
+        EKF(motor, process_noise=1e-3, gate=gate).run(record).xhat[:, -1, 4]
+        for gate in (None, 0.9999)
+    ]
+    reference = EKF(motor, process_noise=1e-4).run(record).xhat[:, -1, 4]
+    wrong = [abs(speed - reference) > 30.0 for speed in speeds]
+    assert wrong[0].sum() >= 3
+    assert not wrong[1].any()
+
+
+def test_hubers_weight_enlarges_the_variance_of_an_outlier_alone():
+    record = linear_record(1)
+    y = record.y.copy()
+    y[0, 6, 0] += 4.0
+    robust = EKF(Linear(), noise_std=0.1, huber=2.0)
+    wild = Record(record.t, y, record.u, record.prior)
+    before, after = robust.run(wild).xhat[0, 5], robust.run(wild)
+    P = robust.run(wild).P[0, 5]
+    F = runge_kutta_matrix(0.1)
+    x, P = F @ before, F @ P @ F.T + np.eye(2) * 1e-8
+    e = y[0, 6] - H @ x
+    size = abs(e) / np.sqrt(np.diag(H @ P @ H.T) + 0.01)
+    assert size[0] > 10
+    assert size[1] < 2
+    S = H @ P @ H.T + np.diag([0.01 * size[0] / 2, 0.01])
+    np.testing.assert_allclose(after.xhat[0, 6], x + P @ H.T @ np.linalg.solve(S, e), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gate": 1.0}, "gate=1.0; expected a probability"),
+        ({"gate": 0.99, "patience": 0}, "patience=0; expected at least 1"),
+        ({"huber": 0.0}, "huber=0.0; expected a positive number"),
+        ({"process_noise": -1.0}, "process_noise=-1.0; expected a number of at least 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        EKF(Linear(), **options)
+
+
+def test_an_indefinite_prior_and_a_negative_noise_are_refused():
+    mean = np.zeros((2, 2))
+    indefinite = np.stack([np.eye(2), np.diag([1.0, -0.5])])
+    with pytest.raises(ValueError, match=r"P0 of row 1 has eigenvalue -0\.5"):
+        EKF(Linear()).reset(Prior(mean, indefinite))
+    with pytest.raises(ValueError, match="P0 is not symmetric"):
+        EKF(Linear()).reset(Prior(mean, np.array([[[1.0, 0.5], [0.0, 1.0]]] * 2)))
+    with pytest.raises(ValueError, match=r"noise_std=-0\.1; expected"):
+        EKF(Linear(), noise_std=-0.1).reset(Prior(mean, np.stack([np.eye(2)] * 2)))
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_dividing_by_a_covariance(size):
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((4, size, size))
+    S = root @ root.swapaxes(1, 2) + 0.1 * np.eye(size)
+    A = rng.standard_normal((4, 3, size))
+    found = divide(A.transpose(1, 2, 0), S.transpose(1, 2, 0)).transpose(2, 0, 1)
+    np.testing.assert_allclose(found, A @ np.linalg.inv(S), rtol=1e-9)
+    L = cholesky(S.transpose(1, 2, 0)).transpose(2, 0, 1)
+    np.testing.assert_allclose(L, np.linalg.cholesky(S), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", untrained())
+def test_single_precision_given_is_double_precision_kept(name):
+    """What is given in single precision is taken for what it is, and computed with in double."""
+    record = record_of(EpisodeSource("ReverseDuffing", duration=1.0), 2)
+    P0 = record.prior.cov.astype(np.float32)
+    single = Record(
+        record.t,
+        record.y.astype(np.float32),
+        record.u.astype(np.float32),
+        Prior(record.prior.mean.astype(np.float32), P0),
+    )
+    double = Record(
+        record.t,
+        single.y.astype(float),
+        single.u.astype(float),
+        Prior(single.prior.mean.astype(float), P0.astype(float)),
+    )
+    own = ESTIMATORS.resolve(name)(ReverseDuffing())
+    found, expected = own.run(single).xhat, own.run(double).xhat
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_open_loop_is_the_model_alone():

@@ -7,16 +7,17 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from test_estimators import Linear
+from linear import Linear
 
 from pinnobs_gym import env_id
 from pinnobs_gym.checks import ESTIMATOR_CHECKS
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimator import output_scale
-from pinnobs_gym.estimators.ekf import EKF, update_with
+from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.gain_network import memory_size, shapes
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.estimators.pinn_obs import identity
+from pinnobs_gym.kalman import update_with
 from pinnobs_gym.record import Record
 from pinnobs_gym.simulate import model_step_jacobian
 from pinnobs_gym.suite import TRAINING_SEED, record_of

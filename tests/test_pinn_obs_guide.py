@@ -12,12 +12,13 @@ from pinnobs_gym.evaluation import make_vector_env
 from pinnobs_gym.network import Architecture, Network, evaluate, layers_of
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import model_step_jacobian, truth
+from pinnobs_gym.smoother import backward, flows
 from pinnobs_gym.system import stack
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from trainers.pinn_obs import Config, train
 from trainers.pinn_obs.guide import observer_gain
-from trainers.pinn_obs.smoother import DRIFT, backward, flows, forward, smooth
+from trainers.pinn_obs.smoother import DRIFT, forward, smooth
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def weighted_squares(system, record, noise):
 
     def residuals(flat):
         x = flat.reshape(n, -1)
-        ends, _ = flows(system, record.t, x, record.u[0])
+        ends = flows(system, record.t, x[:, None], record.u.swapaxes(0, 1))[0][:, 0]
         innovation = (record.y[0] - system.h(x)) / noise
         parts = (root @ (x[0] - record.prior.mean[0]), (x[1:] - ends) / (DRIFT * scale))
         return np.concatenate([p.ravel() for p in parts] + [innovation[~np.isnan(innovation)]])
@@ -69,12 +70,12 @@ def test_on_a_linear_plant_the_smoother_solves_the_least_squares_problem():
     A = np.stack([residuals(row) - residuals(zero) for row in np.eye(len(zero))], axis=1)
     solution = np.linalg.lstsq(A, -residuals(zero), rcond=None)[0].reshape(-1, 2)
     covariance = np.linalg.inv(A.T @ A)
-    path = backward(forward(system, record, noise, about=np.zeros((record.num_samples, 2))))
-    np.testing.assert_allclose(path.xhat, solution, rtol=1e-6, atol=1e-6)
+    path = backward(forward(system, record, noise, about=np.zeros((record.num_samples, 1, 2))))
+    np.testing.assert_allclose(path.xhat[:, 0], solution, rtol=1e-6, atol=1e-6)
     for k in (0, 8, 24):
         block = covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
-        np.testing.assert_allclose(path.P[k], block, rtol=1e-5)
-    np.testing.assert_allclose(smooth(system, record, noise, 0.2).xhat, solution, atol=1e-6)
+        np.testing.assert_allclose(path.P[k, ..., 0], block, rtol=1e-5)
+    np.testing.assert_allclose(smooth(system, record, noise, 0.2).xhat[:, 0], solution, atol=1e-6)
 
 
 def test_on_a_nonlinear_plant_nothing_near_is_more_likely():
@@ -82,21 +83,21 @@ def test_on_a_nonlinear_plant_nothing_near_is_more_likely():
     record, truth = played("ReverseDuffing", 3)
     record = replace(record, t=record.t[:40], y=record.y[:, :40], u=record.u[:, :40])
     noise = np.array([0.05])
-    path = smooth(system, record, noise, 0.2)
+    x = smooth(system, record, noise, 0.2).xhat[:, 0]
     residuals = weighted_squares(system, record, noise)
 
-    def cost(x):
-        return float((residuals(x.ravel()) ** 2).sum())
+    def cost(path):
+        return float((residuals(path.ravel()) ** 2).sum())
 
-    least = cost(path.xhat)
+    ends = flows(system, record.t, x[:, None], record.u.swapaxes(0, 1))[0][:, 0]
+    least = cost(x)
     assert least < cost(truth[:40])
     for _ in range(20):  # along what the model allows, where the cost is flattest
-        other = np.empty_like(path.xhat)
-        other[0] = path.xhat[0] + rng.normal(size=2) * 0.003
+        other = np.empty_like(x)
+        other[0] = x[0] + rng.normal(size=2) * 0.003
         for k in range(39):
-            defect = path.xhat[k + 1] - flows(system, record.t, path.xhat, record.u[0])[0][k]
-            ends = record.t[k], record.t[k + 1], other[None, k]
-            other[k + 1] = model_step_jacobian(system, *ends)[0][0] + defect
+            step = record.t[k], record.t[k + 1], other[None, k]
+            other[k + 1] = model_step_jacobian(system, *step)[0][0] + x[k + 1] - ends[k]
         assert cost(other) > least
 
 
@@ -104,12 +105,12 @@ def test_all_flows_at_once_are_those_one_by_one():
     system = InductionMotor()
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(1e-4, 2e-3, 6))
-    x = rng.normal(size=(6, 5)) * system.scale
-    ends, F = flows(system, t, x, np.asarray(system.input(t)))
+    x = rng.normal(size=(6, 2, 5)) * system.scale
+    ends, F = flows(system, t, x, np.zeros((6, 2, system.nu)))
     for k in range(5):
-        one, flow = model_step_jacobian(system, t[k], t[k + 1], x[None, k])
-        np.testing.assert_allclose(ends[k], one[0], rtol=1e-4, atol=1e-6)  # other substeps
-        np.testing.assert_allclose(F[k], flow[0], rtol=1e-3, atol=1e-4)
+        one, flow = model_step_jacobian(system, t[k], t[k + 1], x[k])
+        np.testing.assert_allclose(ends[k], one, rtol=1e-4, atol=1e-6)  # other substeps
+        np.testing.assert_allclose(F[k].transpose(2, 0, 1), flow, rtol=1e-3, atol=1e-4)
 
 
 def test_the_observers_gain_takes_away_what_the_filter_takes():
@@ -120,8 +121,9 @@ def test_the_observers_gain_takes_away_what_the_filter_takes():
     for k in range(1, record.num_samples):
         dt = record.t[k] - record.t[k - 1]
         left = np.exp(-dt * L[k, 0, 0])  # of an innovation that nothing but L changes
-        assert left == pytest.approx(1 - (filtered.H[k] @ filtered.K[k]).item(), rel=1e-9)
-        ratio = filtered.K[k] / max(abs(filtered.K[k]).max(), 1e-30)
+        K, H = filtered.K[k, ..., 0], filtered.H[k, ..., 0]
+        assert left == pytest.approx(1 - (H @ K).item(), rel=1e-9)
+        ratio = K / max(abs(K).max(), 1e-30)
         np.testing.assert_allclose(L[k] / max(abs(L[k]).max(), 1e-30), ratio)
 
 

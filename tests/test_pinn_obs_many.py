@@ -16,6 +16,9 @@ from trainers.pinn_obs.objective import Objective
 from trainers.pinn_obs.run import Run
 from trainers.pinn_obs.stacked import Minimisations, advance
 
+# few points make quick tests
+pytestmark = pytest.mark.filterwarnings("ignore:points=40 do not resolve")
+
 SMALL = Config(depth=2, width=8, iterations=25, points=40)
 
 

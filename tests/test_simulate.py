@@ -380,6 +380,22 @@ def test_measured_input_is_joined_by_straight_lines() -> None:
     assert jacobian_x == pytest.approx(x, abs=1e-13)
 
 
+@pytest.mark.parametrize("measured", [False, True])
+def test_rows_may_have_intervals_of_their_own(measured: bool) -> None:
+    system = Linear(measured_input=measured)
+    t0 = np.array([0.3, 2.0, 1.0])
+    t1 = t0 + np.array([2.5, 2.2, 3.0]) * BENCHMARK.dt  # three substeps each
+    x0 = np.array([[0.3, -0.2], [1.0, 2.0], [0.0, 1.0]])
+    u0, u1 = np.array([[1.0], [-2.0], [0.5]]), np.array([[3.0], [0.5], [-1.0]])
+    x, F = model_step_jacobian(system, t0, t1, x0, u0, u1)
+    assert model_step(system, t0, t1, x0, u0, u1) == pytest.approx(x, abs=1e-13)
+    for row in range(3):
+        own = slice(row, row + 1)
+        alone = model_step_jacobian(system, t0[row], t1[row], x0[own], u0[own], u1[own])
+        assert x[own] == pytest.approx(alone[0], abs=1e-13)
+        assert F[own] == pytest.approx(alone[1], abs=1e-13)
+
+
 def test_known_input_is_taken_at_any_time() -> None:
     """Inputs at the samples are not used where the system knows its input."""
     x0 = np.array([[0.3, -0.2]])

@@ -2,18 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import State
+from pinnobs_gym.kalman import (
+    GaussianEstimator,
+    checked,
+    joseph_update,
+    observe,
+    predicted,
+    sandwich,
+    squared_size,
+)
 from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step_jacobian, product
-from pinnobs_gym.system import System, vector
+from pinnobs_gym.system import vector
 
 
 @dataclass(frozen=True)
-class EKF(Estimator):
+class Memory:
+    """What the filter keeps besides the state's own fields; the batch comes last."""
+
+    Q: np.ndarray
+    """Covariance of the process noise, shape (nx, nx, 1)."""
+    R: np.ndarray
+    """Covariance of the output noise, shape (ny, ny, 1)."""
+    P_restart: np.ndarray
+    """Covariances that a filter that was wrong starts again with, shape (nx, nx, batch)."""
+    bounds: np.ndarray
+    """The gate's bounds on the NIS of 0, 1, ... ny outputs."""
+    beyond: np.ndarray
+    """How many samples in a row were beyond the gate, shape (batch,)."""
+
+
+@dataclass(frozen=True)
+class EKF(GaussianEstimator):
     """The continuous-discrete extended Kalman filter (Jazwinski 1970, section 8.3).
 
     Between samples the state and the variational flow Φ' = A(x̂)Φ by the classical Runge-Kutta
@@ -24,125 +49,69 @@ class EKF(Estimator):
     told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
     """
 
-    process_noise: float = 1e-4
-    """Standard deviation of the process noise per sample, over the state's scale."""
+    gate: float | None = None
+    """Probability of the χ² band that a normalised innovation squared (NIS) should be in, such as
+    0.9999 (Bar-Shalom, Li & Kirubarajan 2001, section 5.4). After `patience` samples in a row
+    beyond it the filter has locked on wrongly, and starts again from its estimate with the
+    covariance P₀ + diag(scale²). None never does."""
+    patience: int = 15
+    """How many samples in a row may be beyond the gate."""
+    huber: float | None = None
+    """Innovations beyond so many standard deviations count less, as in Huber's M-estimate: the
+    noise variance of such an output is enlarged by the excess, for this sample (one reweighting;
+    Huber 1964; Karlgaard & Schaub 2007). 1.345 is 95 % efficient on Gaussian noise. None: never."""
 
     name = "ekf"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.process_noise < np.inf:
-            raise ValueError(f"process_noise={self.process_noise}; expected a number of at least 0")
+        super().__post_init__()
+        if self.gate is not None and not 0 < self.gate < 1:
+            raise ValueError(f"gate={self.gate}; expected a probability between 0 and 1")
+        if self.patience < 1:
+            raise ValueError(f"patience={self.patience}; expected at least 1 sample")
+        if self.huber is not None and not self.huber > 0:
+            raise ValueError(f"huber={self.huber}; expected a positive number")
 
     def reset(self, prior: Prior) -> State:
-        return State(prior.mean, P=prior.cov, memory=self.tuning())
+        prior = checked(prior)
+        P0 = prior.cov
+        wide = P0 + np.diag(vector(self.system.scale, self.system.nx, "scale") ** 2)
+        degrees = np.maximum(np.arange(self.system.ny + 1), 1)
+        bounds = chi2.ppf(1.0 if self.gate is None else self.gate, degrees)
+        beyond = np.zeros(len(P0), dtype=int)
+        memory = Memory(*self.tuning(), wide.transpose(1, 2, 0), bounds, beyond)
+        return State(prior.mean, P=P0, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        Q, R = state.memory
-        xhat, P = predicted(self.system, state, t, u, Q)
-        innovation, H = innovated(self.system, xhat, y)
+        memory: Memory = state.memory
+        xhat, P = predicted(self.system, state, t, u, memory.Q)
+        R = memory.R
+        innovation, H = observe(self.system, xhat, y)
+        if self.gate is not None:
+            P, memory = self._gated(P, innovation, H, memory)
+        if self.huber is not None:
+            R = self._reweighted(P, innovation, H, R)
         xhat, P, S = joseph_update(xhat, P, innovation, H, R)
-        P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory=state.memory)
+        covariance, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
+        return State(xhat, t, u, covariance, innovation, S, memory)
 
-    def tuning(self) -> tuple[np.ndarray, np.ndarray]:
-        """Q (nx, nx, 1) and R (ny, ny, 1), in squared units of state and output."""
-        scale = vector(self.system.scale, self.system.nx, "scale")
-        Q = np.diag((self.process_noise * scale) ** 2)
-        return Q[..., None], np.diag(self.output_variance)[..., None]
+    def _gated(
+        self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, memory: Memory
+    ) -> tuple[np.ndarray, Memory]:
+        """P, widened where the filter starts again."""
+        present = H.any(axis=1).sum(axis=0)  # outputs that are not missing
+        nis = squared_size(innovation, sandwich(H, P) + memory.R)
+        beyond = ~(nis <= memory.bounds[present])
+        count = np.where(present > 0, np.where(beyond, memory.beyond + 1, 0), memory.beyond)
+        restart = count >= self.patience
+        P = np.where(restart, memory.P_restart, P)
+        return P, replace(memory, beyond=np.where(restart, 0, count))
 
-
-def predicted(
-    system: System, state: State, t: float, u: np.ndarray, Q: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The prediction x̂(k|k−1), (batch, nx), at time t and its covariance P⁻ = ΦPΦᵀ + Q, (nx, nx,
-    batch): here the batch comes last. Before the first sample both are the prior's.
-
-    Args:
-        system: the model.
-        state: after the sample before.
-        t: time of this sample in s.
-        u: inputs at this sample, shape (batch, nu).
-        Q: covariance of the process noise of a sample, shape (nx, nx, batch or 1).
-    """
-    xhat, P = state.xhat, _given(state.P).transpose(1, 2, 0)
-    if state.t is None:
-        return xhat, P
-    xhat, F = model_step_jacobian(system, state.t, t, xhat, state.u, u)
-    F = F.transpose(1, 2, 0)
-    return xhat, product(product(F, P), F.transpose(1, 0, 2)) + Q
-
-
-def innovated(system: System, xhat: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations y − h(x̂), (batch, ny), and output Jacobians, (ny, nx, batch), of predictions x̂
-    (batch, nx) and outputs y (batch, ny); those of missing outputs are zero."""
-    missing = np.isnan(y)
-    innovation = y - system.h(xhat)
-    H = system.h_jacobian(xhat).transpose(1, 2, 0)
-    if missing.any():
-        innovation = np.where(missing, 0.0, innovation)
-        H = np.where(missing.T[:, None], 0.0, H)
-    return innovation, H
-
-
-def joseph_update(
-    xhat: np.ndarray, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, R: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The Kalman update of a batch in Joseph's form.
-
-    Args:
-        xhat: predictions, shape (batch, nx).
-        P: their covariances, shape (nx, nx, batch): here the batch comes last.
-        innovation: y − h(x̂), shape (batch, ny).
-        H: output Jacobians, shape (ny, nx, batch).
-        R: covariance of the output noise, shape (ny, ny, batch or 1).
-
-    Returns:
-        Estimates (batch, nx), their covariances (nx, nx, batch), and those of the innovations
-        (ny, ny, batch).
-    """
-    K, S = kalman_gain(P, H, R)
-    return *update_with(K, xhat, P, innovation, H, R), S
-
-
-def kalman_gain(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The gains K = PHᵀS⁻¹, (nx, ny, batch), and the covariances S = HPHᵀ + R of the innovations,
-    (ny, ny, batch); arguments as in `joseph_update`."""
-    HP = product(H, P)
-    S = product(HP, H.transpose(1, 0, 2)) + R
-    return _divide(HP, S), S
-
-
-def update_with(
-    K: np.ndarray,
-    xhat: np.ndarray,
-    P: np.ndarray,
-    innovation: np.ndarray,
-    H: np.ndarray,
-    R: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Estimates (batch, nx) and their covariances (nx, nx, batch) after an update with any gains K
-    (nx, ny, batch): P⁺ = (I − KH)P(I − KH)ᵀ + KRKᵀ; other arguments as in `joseph_update`."""
-    M = -product(K, H)
-    for i in range(len(M)):
-        M[i, i] += 1
-    KR = K * R[0, 0] if len(R) == 1 else np.einsum("ipb,pqc->iqb", K, R)
-    P = product(product(M, P), M.transpose(1, 0, 2)) + product(KR, K.transpose(1, 0, 2))
-    return xhat + np.einsum("ipb,bp->bi", K, innovation), P
-
-
-def _divide(HP: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """K = PHᵀS⁻¹, (nx, ny, batch); not a number where S is singular."""
-    PHt = HP.transpose(1, 0, 2)
-    if len(S) == 1:
-        return PHt / S
-    first = S.transpose(2, 0, 1)
-    usable = np.isfinite(first).all(axis=(1, 2)) & (np.linalg.det(first) > 0)
-    inverse = np.full_like(first, np.nan)
-    inverse[usable] = np.linalg.inv(first[usable])
-    return product(PHt, inverse.transpose(1, 2, 0))
-
-
-def _given(P: np.ndarray | None) -> np.ndarray:
-    if P is None:
-        raise ValueError("the state has no covariance; begin with reset(prior)")
-    return P
+    def _reweighted(
+        self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, R: np.ndarray
+    ) -> np.ndarray:
+        """R (ny, ny, batch) with the variances of outputs enlarged whose innovation is large."""
+        assert self.huber is not None
+        std = np.sqrt(np.einsum("iib->ib", sandwich(H, P) + R))
+        excess = np.maximum(abs(innovation.T) / (self.huber * std), 1.0)
+        return R * excess[:, None]

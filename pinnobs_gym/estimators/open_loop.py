@@ -19,7 +19,7 @@ class OpenLoop(Estimator):
     knows = ("model", "prior")
 
     def reset(self, prior: Prior) -> State:
-        return State(prior.mean)
+        return State(np.asarray(prior.mean, dtype=float))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat = state.xhat

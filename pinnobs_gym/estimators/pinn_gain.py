@@ -11,8 +11,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from pinnobs_gym.estimator import Estimator, State, output_scale
-from pinnobs_gym.estimators.ekf import EKF, innovated, kalman_gain, predicted, update_with
+from pinnobs_gym.estimator import State, output_scale
 from pinnobs_gym.estimators.gain_network import (
     Variant,
     corrected_gain,
@@ -22,6 +21,14 @@ from pinnobs_gym.estimators.gain_network import (
     shapes,
 )
 from pinnobs_gym.estimators.pinn_obs import check_same, identity, read, write
+from pinnobs_gym.kalman import (
+    GaussianEstimator,
+    checked,
+    kalman_gain,
+    observe,
+    predicted,
+    update_with,
+)
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import model_step
 from pinnobs_gym.system import System, vector
@@ -98,7 +105,7 @@ class TrainedGain:
 
 
 @dataclass(frozen=True)
-class PinnGain(Estimator):
+class PinnGain(GaussianEstimator):
     """A Kalman filter whose gain a small network corrects, one network for all episodes; it is
     trained beforehand on outputs and the model's equations and never sees a true state.
 
@@ -116,14 +123,12 @@ class PinnGain(Estimator):
 
     trained: TrainedGain = field(kw_only=True, repr=False)
     """The trained network."""
-    process_noise: float = 1e-4
-    """Standard deviation of the process noise per sample, over the state's scale."""
 
     name = "pinn_gain"
     needs_training = "pinn_gain"
 
     def reset(self, prior: Prior) -> State:
-        return self.begin(prior, self.output_variance[:, None])
+        return self.begin(checked(prior), self.output_variance[:, None])
 
     def begin(self, prior: Prior, variance: np.ndarray) -> State:
         """What `reset` does, told variances of the output noise that may differ from row to row:
@@ -134,7 +139,7 @@ class PinnGain(Estimator):
         if self.trained.variant == "gru":
             fixed = scale, output_scale(self.system)[:, None], np.sqrt(variance)
             return State(prior.mean, memory=(fixed, np.zeros((size, batch))))
-        Q, _ = EKF(self.system, self.noise_std, self.process_noise).tuning()
+        Q, _ = self.tuning()
         R = np.eye(self.system.ny)[..., None] * variance
         return State(prior.mean, P=prior.cov, memory=((scale, Q, R), np.ones((size, batch))))
 
@@ -144,7 +149,7 @@ class PinnGain(Estimator):
         fixed, memory = state.memory
         scale, Q, R = fixed
         xhat, P = predicted(self.system, state, t, u, Q)
-        innovation, H = innovated(self.system, xhat, y)
+        innovation, H = observe(self.system, xhat, y)
         K, S = kalman_gain(P, H, R)
         e, variance = np.ascontiguousarray(innovation.T), np.einsum("iib->ib", S)
         share = np.maximum(1 - np.einsum("iib->ib", R) / variance, 0.0)
@@ -153,8 +158,8 @@ class PinnGain(Estimator):
         K = corrected_gain(layers, scale, x, P, e, variance, K, share, memory)
         memory = remembered(memory, e, variance, ~np.isnan(y).T)
         xhat, P = update_with(K, xhat, P, innovation, H, R)
-        P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), (fixed, memory))
+        P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
+        return State(xhat, t, u, P, innovation, S, (fixed, memory))
 
     def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         fixed, memory = state.memory

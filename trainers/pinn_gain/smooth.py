@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimators.ekf import EKF, joseph_update
+from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.record import Record
-from pinnobs_gym.simulate import model_step_jacobian, product
+from pinnobs_gym.smoother import backward, forward
 from pinnobs_gym.system import vector
 
 PROCESS_NOISE = (30.0, 1.0)
@@ -113,41 +113,8 @@ def _blocks(ekf: EKF, record: Record, points: np.ndarray | None) -> np.ndarray:
 
 
 def _pass(ekf: EKF, record: Record, points: np.ndarray | None) -> np.ndarray:
-    """One Gauss-Newton step: filter and smoother (Rauch, Tung & Striebel 1965) of the model
-    linearised at points (batch, num_samples, nx), or along the filter itself."""
-    Q, R = ekf.tuning()
-    x, P = record.prior.mean, record.prior.cov.transpose(1, 2, 0)
-    backward = []
-    for k in range(record.num_samples):
-        if k:
-            at = x if points is None else points[:, k - 1]
-            u0, u1 = record.u[:, k - 1], record.u[:, k]
-            after, F = model_step_jacobian(ekf.system, record.t[k - 1], record.t[k], at, u0, u1)
-            F = F.transpose(1, 2, 0)
-            before = x, product(P, F.transpose(1, 0, 2))
-            x = after + np.einsum("ijb,bj->bi", F, x - at)
-            P = product(F, before[1]) + Q
-            backward.append((*before, x, P))
-        at = x if points is None else points[:, k]
-        H = ekf.system.h_jacobian(at).transpose(1, 2, 0)
-        innovation = record.y[:, k] - ekf.system.h(at) - np.einsum("ijb,bj->bi", H, x - at)
-        missing = np.isnan(innovation)
-        H = np.where(missing.T[:, None], 0.0, H)
-        x, P, _ = joseph_update(x, P, np.where(missing, 0.0, innovation), H, R)
-        P = (P + P.transpose(1, 0, 2)) / 2
-    smoothed = [x]
-    scale = vector(ekf.system.scale, ekf.system.nx, "scale")
-    for x, cross, x_next, P_next in reversed(backward):
-        gap = _solve(P_next.transpose(2, 0, 1), smoothed[-1] - x_next, scale)
-        smoothed.append(x + np.einsum("ijb,bj->bi", cross, gap))
-    return np.stack(smoothed[::-1], axis=1)
-
-
-def _solve(P: np.ndarray, gap: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """P⁻¹ gap, (batch, nx), in scaled quantities; not a number where that cannot be had."""
-    P, gap = P / (scale[:, None] * scale), gap / scale
-    bad = ~(np.linalg.det(np.where(np.isfinite(P), P, 0.0)) > 0)
-    P[bad] = np.eye(len(scale))
-    solved = np.linalg.solve(P, gap[..., None])[..., 0] / scale
-    solved[bad] = np.nan
-    return solved
+    """One Gauss-Newton step: filter and smoother of the model linearised at points (batch,
+    num_samples, nx), or along the filter itself."""
+    about = None if points is None else points.swapaxes(0, 1)
+    path = backward(forward(ekf.system, record, *ekf.tuning(), about))
+    return path.xhat.swapaxes(0, 1)

@@ -140,8 +140,8 @@ class FastRun(Run):
             return None
         t, smoothed = self.guide.t, self.guide.smoothed
         with torch.no_grad():
-            away = network(torch.from_numpy(t))[0].numpy() - smoothed.xhat
-        return Covariance(t, smoothed.P + away[:, :, None] * away[:, None, :])
+            away = network(torch.from_numpy(t))[0].numpy() - smoothed
+        return Covariance(t, self.guide.P + away[:, :, None] * away[:, None, :])
 
     def _state(self) -> dict[str, Any]:
         method = self._method

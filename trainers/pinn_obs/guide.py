@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.record import Record
+from pinnobs_gym.smoother import Filtered
 from pinnobs_gym.system import System
 from trainers.pinn_obs.objective import Points
 from trainers.pinn_obs.points import on_lines
-from trainers.pinn_obs.smoother import Filtered, Path, forward, smooth
+from trainers.pinn_obs.smoother import forward, smooth
 
 QUIET = 1e-4
 """Least standard deviation of output noise, over the output's scale."""
@@ -42,8 +43,10 @@ class Guide:
     """Gains there in state units per s and output unit, shape (num_points, nx, ny)."""
     t: np.ndarray
     """Times in s of the samples that it was made from, shape (num_samples,)."""
-    smoothed: Path
-    """The states at these samples, given all of them."""
+    smoothed: np.ndarray
+    """The states at these samples, given all of them, shape (num_samples, nx)."""
+    P: np.ndarray
+    """Their covariances, shape (num_samples, nx, nx)."""
 
 
 def guide_of(
@@ -71,21 +74,19 @@ def guide_of(
             Riccati's alone.
     """
     told = np.maximum(noise, QUIET * y_scale)
-    try:
-        with np.errstate(all="ignore"):
-            smoothed = smooth(system, samples, told, _CAUTION)
-            along = forward(system, samples, told, about=smoothed.xhat, caution=_CAUTION)
-    except np.linalg.LinAlgError:  # a covariance that is singular or not finite
+    with np.errstate(all="ignore"):
+        path = smooth(system, samples, told, _CAUTION)
+        along = forward(system, samples, told, about=path.xhat, caution=_CAUTION)
+    if not all(np.isfinite(part).all() for part in (path.xhat, path.P, along.K)):
         return None
-    if not all(np.isfinite(part).all() for part in (smoothed.xhat, smoothed.P, along.K)):
-        return None
+    smoothed, P = path.xhat[:, 0], path.P[..., 0]
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
     L = on_lines(t, samples.t, observer_gain(samples.t, along))
     first = abs(points.y[0] - system.h(points.xhat0)) * points.there[0]
     if transfer or not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
-        return Guide(on_lines(t, samples.t, along.xhat), L, samples.t, smoothed)
+        return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
     left = np.exp((t[0] - t) / tau)[:, None]
-    goal = on_lines(t, samples.t, smoothed.xhat)
+    goal = on_lines(t, samples.t, smoothed)
     xhat = left * points.xhat0 + (1 - left) * goal
     rate = (1 - left) * np.gradient(goal, t, axis=0) + left / tau * (goal - points.xhat0)
     innovation = (points.y - system.h(xhat)) * points.there / y_scale
@@ -94,13 +95,15 @@ def guide_of(
     floor = max(_CLEAR, 3 * float((noise / y_scale).max()))
     share = (innovation / y_scale) / ((innovation**2).sum(-1, keepdims=True) + floor**2)
     inside = (t < t[0] + _LAYER * tau)[:, None, None]
-    return Guide(xhat, L + inside * residual[:, :, None] * share[:, None, :], samples.t, smoothed)
+    L = L + inside * residual[:, :, None] * share[:, None, :]
+    return Guide(xhat, L, samples.t, smoothed, P)
 
 
 def observer_gain(t: np.ndarray, filtered: Filtered) -> np.ndarray:
     """Gains L (num_samples, nx, ny) with which an observer, over the interval that ends at a
     sample, takes away as much of that output's innovation as the filter does at the sample."""
-    taken = np.clip(np.einsum("kji,kij->kj", filtered.H, filtered.K), 1e-9, 1 - 1e-9)
+    K, H = filtered.K[..., 0], filtered.H[..., 0]
+    taken = np.clip(np.einsum("kji,kij->kj", H, K), 1e-9, 1 - 1e-9)
     per_interval = -np.log1p(-taken) / taken
     interval = np.diff(t, prepend=2 * t[0] - t[1])
-    return filtered.K * (per_interval / interval[:, None])[:, None, :]
+    return K * (per_interval / interval[:, None])[:, None, :]

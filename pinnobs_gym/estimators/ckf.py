@@ -1,0 +1,27 @@
+"""The cubature Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.sigma_points import SigmaPointFilter
+
+
+@dataclass(frozen=True)
+class CKF(SigmaPointFilter):
+    """The cubature Kalman filter of third degree (Arasaratnam & Haykin 2009): the 2·nx points
+    x̂ ± √nx·columns of √P, of equal weight.
+
+    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
+    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    """
+
+    name = "ckf"
+
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nx = self.system.nx
+        axes = np.sqrt(nx) * np.eye(nx)
+        weights = np.full(2 * nx, 0.5 / nx)
+        return np.concatenate([axes, -axes]), weights, weights

@@ -1,0 +1,95 @@
+"""The ensemble Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.estimator import State
+from pinnobs_gym.kalman import GaussianEstimator, checked, divide, outer
+from pinnobs_gym.least_squares import root
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The ensemble, and what made it."""
+
+    members: np.ndarray
+    """States, shape (num_members, batch, nx)."""
+    Q_std: np.ndarray
+    """Standard deviations of the process noise, shape (nx,)."""
+    R_std: np.ndarray
+    """Standard deviations of the output noise, shape (ny,)."""
+    sample: int = 0
+    """How many samples there were."""
+
+
+@dataclass(frozen=True)
+class EnKF(GaussianEstimator):
+    """The ensemble Kalman filter with perturbed outputs (Evensen 1994; Burgers, van Leeuwen &
+    Evensen 1998), its ensemble inflated about its mean at every sample (Anderson & Anderson 1999).
+
+    Random numbers depend on the seed and the sample alone, and all episodes of a batch share them:
+    results are reproducible, and an episode's does not depend on those estimated with it. Their
+    mean over the ensemble is removed.
+
+    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
+    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    """
+
+    members: int = 50
+    """Size of the ensemble."""
+    inflation: float = 1.01
+    """What deviations from the ensemble's mean are multiplied with at every sample."""
+    seed: int = 0
+    """Of the random numbers."""
+
+    name = "enkf"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.members <= self.system.nx:
+            raise ValueError(f"members={self.members}; expected more than nx={self.system.nx}")
+        if not 1 <= self.inflation < np.inf:
+            raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
+
+    def reset(self, prior: Prior) -> State:
+        prior = checked(prior)
+        L = root(prior.cov.transpose(1, 2, 0))
+        members = prior.mean + np.einsum("ijb,mj->mbi", L, self._draws(0, self.system.nx))
+        stds = self.process_noise * np.asarray(self.system.scale), np.sqrt(self.output_variance)
+        return State(prior.mean, P=prior.cov, memory=Memory(members, *stds))
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: Memory = state.memory
+        members, nx = memory.members, self.system.nx
+        draws = self._draws(memory.sample + 1, nx + self.system.ny)[:, None]
+        if state.t is not None:
+            members = model_step(self.system, state.t, t, members, state.u, u)
+            mean = members.mean(axis=0)
+            members = mean + self.inflation * (members - mean) + memory.Q_std * draws[..., :nx]
+        mean, outputs = members.mean(axis=0), np.asarray(self.system.h(members))
+        yhat, noise = outputs.mean(axis=0), memory.R_std * draws[..., nx:]
+        weight = 1 / np.sqrt(self.members - 1)
+        X = weight * (members - mean).transpose(2, 0, 1)
+        Y = weight * (outputs - yhat).transpose(2, 0, 1)
+        missing = np.isnan(y)
+        Y = np.where(missing.T[:, None], 0.0, Y)
+        S = outer(Y, Y) + np.diag(memory.R_std**2)[..., None]
+        K = divide(outer(X, Y), S)
+        errors = np.where(missing, 0.0, y + noise - outputs)
+        members = members + np.einsum("ipb,mbp->mbi", K, errors)
+        xhat = members.mean(axis=0)
+        X = weight * (members - xhat).transpose(2, 0, 1)
+        P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
+        memory = replace(memory, members=members, sample=memory.sample + 1)
+        return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
+
+    def _draws(self, sample: int, size: int) -> np.ndarray:
+        """Standard normal numbers (members, size) of a sample, of mean zero and unit variance."""
+        draws = np.random.default_rng([self.seed, sample]).standard_normal((self.members, size))
+        draws -= draws.mean(axis=0)
+        return draws / draws.std(axis=0, ddof=1)

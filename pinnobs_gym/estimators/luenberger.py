@@ -1,0 +1,77 @@
+"""The Luenberger observer: a constant gain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.gains import default_rate, injection, lmi_gain, placed_gain, settling_gain
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step
+
+
+@dataclass(frozen=True)
+class Luenberger(Estimator):
+    """The Luenberger observer x̂' = f(x̂, u) + L(y − h(x̂)) with a constant gain (Luenberger 1964).
+
+    Between samples the model alone; at a sample the correction over the time since the last, by
+    Euler's implicit method (`pinnobs_gym.gains.injection`). A missing output corrects nothing.
+
+    Default tuning, the same rule for all systems: L places the poles of the model, linearised where
+    it is from x̂₀ after a quarter of a benchmark episode, to the left of −`rate`
+    (`pinnobs_gym.gains.placed_gain`). That promises nothing far from there: if less of it leaves a
+    smaller error along the model's path from x̂₀, less is taken (`pinnobs_gym.gains.settling_gain`).
+    """
+
+    gain: Sequence[Sequence[float]] | None = None
+    """L, nx rows of ny numbers, in state units per output unit and s; designed if None."""
+    design: str = "poles"
+    """How it is designed: ``poles``, or ``lmi`` for one gain for the whole initial set
+    (`pinnobs_gym.gains.lmi_gain`; needs the extra lmi)."""
+    poles: Sequence[complex] | None = None
+    """The poles to place, nx of them in 1/s; by the rate if None."""
+    rate: float | None = None
+    """How fast errors should decay in 1/s; 20 time constants per benchmark episode if None."""
+
+    name = "luenberger"
+    knows = ("model", "prior")
+
+    def __post_init__(self) -> None:
+        if self.design not in ("poles", "lmi"):
+            raise ValueError(f"design={self.design!r}; expected 'poles' or 'lmi'")
+        if self.rate is not None and not 0 < self.rate < np.inf:
+            raise ValueError(f"rate={self.rate}; expected a positive number")
+        shape = (self.system.nx, self.system.ny)
+        if self.gain is not None and np.shape(self.gain) != shape:
+            raise ValueError(f"gain has shape {np.shape(self.gain)}; expected (nx, ny)={shape}")
+
+    def designed(self) -> np.ndarray:
+        """L, shape (nx, ny).
+
+        Raises:
+            ValueError: in one line, if the design has no solution.
+        """
+        if self.gain is not None:
+            return np.asarray(self.gain, dtype=float)
+        rate = default_rate(self.system) if self.rate is None else self.rate
+        if self.design == "lmi":
+            return lmi_gain(self.system, rate)
+        if self.poles is not None:
+            return placed_gain(self.system, rate, self.poles)
+        return settling_gain(self.system, rate)
+
+    def reset(self, prior: Prior) -> State:
+        return State(prior.mean.astype(float), memory=self.designed())
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        xhat, L, dt = state.xhat, state.memory, 0.0
+        if state.t is not None:
+            xhat, dt = model_step(self.system, state.t, t, xhat, state.u, u), t - state.t
+        missing = np.isnan(y)
+        innovation = np.where(missing, 0.0, y - self.system.h(xhat))
+        K = injection(L, np.asarray(self.system.h_jacobian(xhat)), 1.0 - missing, dt)
+        xhat = xhat + (K @ innovation[..., None])[..., 0]
+        return State(xhat, t, u, innovation=innovation, memory=L)

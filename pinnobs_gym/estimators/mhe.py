@@ -1,0 +1,129 @@
+"""Moving-horizon estimation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.estimator import State
+from pinnobs_gym.kalman import (
+    GaussianEstimator,
+    checked,
+    divide,
+    joseph_update,
+    observe,
+    predict,
+    sandwich,
+)
+from pinnobs_gym.least_squares import Fit, linearised
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import identity, product
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The window, and what is known of its start; in matrices the batch comes last."""
+
+    Q: np.ndarray
+    """Covariance of the process noise, shape (nx, nx, 1)."""
+    R: np.ndarray
+    """Covariance of the output noise, shape (ny, ny, 1)."""
+    arrival: np.ndarray
+    """x̄, the estimate of the window's first state from all samples before it, (batch, nx)."""
+    P: np.ndarray
+    """Its covariance, shape (nx, nx, batch)."""
+    start: np.ndarray
+    """The window's first state as the samples in it correct it, shape (batch, nx)."""
+    t: tuple[float, ...] = ()
+    """Times of the window's samples in s."""
+    y: tuple[np.ndarray, ...] = ()
+    """Their outputs, (batch, ny) each."""
+    u: tuple[np.ndarray, ...] = ()
+    """Their inputs, (batch, nu) each."""
+
+
+@dataclass(frozen=True)
+class MHE(GaussianEstimator):
+    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the model's trajectory over the last
+    samples that is nearest to their outputs and to what was known before them.
+
+    At every sample some Gauss-Newton steps go down
+    (x − x̄)ᵀP̄⁻¹(x − x̄) + Σ(y − h)ᵀR⁻¹(y − h) over the window's first state x, from where the last
+    sample left it. When a sample leaves the window, x̄ and P̄ take it in as an extended Kalman filter
+    does that is linearised about x. Within the window the model is taken as exact. A window longer
+    than the record is the whole of it.
+
+    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
+    told (`Estimator.output_variance`), Q = (`process_noise`·scale)² between windows.
+    """
+
+    process_noise: float = 2e-5
+    """Standard deviation of the process noise per sample, over the state's scale."""
+    window: int = 10
+    """Samples in the window."""
+    steps: int = 1
+    """Gauss-Newton steps at every sample; one is the real-time iteration of Diehl et al. 2005."""
+
+    name = "mhe"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("window", "steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}; expected at least 1")
+
+    def reset(self, prior: Prior) -> State:
+        prior = checked(prior)
+        P0, mean = prior.cov.transpose(1, 2, 0), prior.mean
+        return State(mean, P=prior.cov, memory=Memory(*self.tuning(), mean, P0, mean))
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: Memory = state.memory
+        if len(memory.t) == self.window:
+            memory = self._moved(memory, t, u)
+        memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
+        weight = divide(identity(self.system.nx), memory.P)
+        start = memory.start
+        fit = self._fit(memory, start)
+        innovation, _ = observe(self.system, fit.x[-1], y)
+        step, P = _step(fit, weight, memory.arrival - start)
+        for _ in range(self.steps - 1):
+            start = start + step
+            fit = self._fit(memory, start)
+            step, P = _step(fit, weight, memory.arrival - start)
+        start = start + step
+        xhat = fit.x[-1] + np.einsum("ijb,bj->bi", fit.X[-1], step)
+        P = sandwich(fit.X[-1], P)
+        memory = replace(memory, start=start)
+        P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
+        return State(xhat, t, u, P, innovation, memory=memory)
+
+    def _fit(self, memory: Memory, start: np.ndarray) -> Fit:
+        """The model's trajectory through the window from a state at its start."""
+        nx, batch = self.system.nx, len(start)
+        X = np.broadcast_to(identity(nx), (nx, nx, batch))
+        R = np.diagonal(memory.R[..., 0])
+        return linearised(self.system, memory.t, memory.y, memory.u, start, X, R)
+
+    def _moved(self, memory: Memory, t: float, u: np.ndarray) -> Memory:
+        """The window without its first sample, which x̄ and P̄ take in."""
+        start = memory.start
+        innovation, H = observe(self.system, start, memory.y[0])
+        ahead = memory.arrival - start
+        innovation = innovation - np.einsum("pib,bi->bp", H, ahead)
+        ahead, P, _ = joseph_update(ahead, memory.P, innovation, H, memory.R)
+        second, u_second = (*memory.t, t)[1], (*memory.u, u)[1]
+        times, inputs = (memory.t[0], second), (memory.u[0], u_second)
+        start, P, F = predict(self.system, times, start, P, memory.Q, inputs)
+        arrival = start + product(F, ahead.T[:, None])[:, 0].T
+        memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
+        return replace(memory, arrival=arrival, P=P, start=start)
+
+
+def _step(fit: Fit, weight: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The Gauss-Newton step (batch, nx) of the window's first state, with x̄ so far ahead of it, and
+    the covariance (nx, nx, batch) of where it leads."""
+    P = divide(identity(len(weight)), fit.information + weight)
+    right = fit.right + np.einsum("ijb,bj->ib", weight, ahead)
+    return np.einsum("ijb,jb->bi", P, right), P

@@ -1,0 +1,177 @@
+"""The particle filter of Liu and West."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.kalman import checked, factor
+from pinnobs_gym.least_squares import root
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step
+
+_FEW = 10
+"""One particle in so many must be left, or the likelihood is taken in parts."""
+_ROUNDS = 20
+"""Most such parts."""
+_HALVINGS = 20
+"""Of the interval in which the power of a part is sought."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The particles."""
+
+    particles: np.ndarray
+    """States, shape (num_particles, batch, nx)."""
+    log_weights: np.ndarray
+    """Logarithms of their weights, which sum to one, shape (num_particles, batch)."""
+    sample: int = 0
+    """How many samples there were."""
+
+
+@dataclass(frozen=True)
+class ParticleFilter(Estimator):
+    """A particle filter for plants without process noise (Liu & West 2001).
+
+    Particles move with the model and are weighted by the likelihood of the outputs. Where their
+    effective number falls below half, they are resampled systematically (Kitagawa 1996) and drawn
+    from Gaussians about them that are shrunk towards the mean, so that neither mean nor covariance
+    of the set changes: without that, few initial states would soon be left. A sample that would
+    leave less than a tenth is taken in parts (Neal 2001).
+
+    Random numbers depend on the seed and the sample alone, and all episodes of a batch share them:
+    results are reproducible, and an episode's does not depend on those estimated with it.
+
+    Default tuning, the same rule for all systems: particles from the Gaussian prior, the likelihood
+    from the noise level it is told (`Estimator.output_variance`).
+    """
+
+    particles: int = 500
+    """Number of particles."""
+    discount: float = 0.95
+    """Liu and West's δ: Gaussians of variance 1 − ((3δ − 1)/2δ)² times that of the set."""
+    seed: int = 0
+    """Of the random numbers."""
+
+    name = "particle"
+
+    def __post_init__(self) -> None:
+        if self.particles < 2:
+            raise ValueError(f"particles={self.particles}; expected at least 2")
+        if not 1 / 3 < self.discount <= 1:
+            raise ValueError(f"discount={self.discount}; expected a number in (1/3, 1]")
+
+    def reset(self, prior: Prior) -> State:
+        prior = checked(prior)
+        L = root(prior.cov.transpose(1, 2, 0))
+        draws = np.random.default_rng([self.seed, 0]).standard_normal(
+            (self.particles, self.system.nx)
+        )
+        particles = prior.mean + np.einsum("ijb,mj->mbi", L, draws)
+        log_weights = np.full(particles.shape[:2], -np.log(self.particles))
+        return State(prior.mean, P=prior.cov, memory=Memory(particles, log_weights))
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: Memory = state.memory
+        x, log_weights = memory.particles, memory.log_weights
+        if state.t is not None:
+            x = model_step(self.system, state.t, t, x, state.u, u)
+        missing = np.isnan(y)
+        yhat = np.einsum("nb,nbp->bp", np.exp(log_weights), np.asarray(self.system.h(x)))
+        x, log_weights = self._tempered(x, log_weights, y, memory.sample)
+        weights = np.exp(log_weights)
+        xhat, P = _moments(weights, x)
+        rows = np.flatnonzero((weights**2).sum(axis=0) > 2 / self.particles)
+        if len(rows):
+            x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
+        memory = Memory(x, log_weights, memory.sample + 1)
+        innovation = np.where(missing, 0.0, y - yhat)
+        return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, memory=memory)
+
+    def _tempered(
+        self, x: np.ndarray, log_weights: np.ndarray, y: np.ndarray, sample: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Particles and the logarithms of their weights after the outputs y (batch, ny).
+
+        Where these say so much that hardly a particle would be left, their likelihood is taken in
+        parts, each of a power of it that leaves a quarter, with a resampling between them.
+        """
+        left = np.ones(len(y))
+        log_likelihood = self._log_likelihood(x, y)
+        for part_number in range(_ROUNDS):
+            trial = log_weights + left * log_likelihood
+            rows = np.flatnonzero(_effective(trial) < self.particles / _FEW)
+            if not len(rows):
+                break
+            part = _power(log_weights[:, rows], log_likelihood[:, rows], left[rows], self.particles)
+            log_weights = log_weights.copy()
+            log_weights[:, rows] = _normalised(
+                log_weights[:, rows] + part * log_likelihood[:, rows]
+            )
+            left[rows] -= part
+            x, log_weights = self._resampled(x, log_weights, rows, (sample, part_number))
+            log_likelihood[:, rows] = self._log_likelihood(x[:, rows], y[rows])
+        return x, _normalised(log_weights + left * log_likelihood)
+
+    def _log_likelihood(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Of the outputs, (num_particles, batch)."""
+        errors = np.nan_to_num(y - np.asarray(self.system.h(x)))
+        return np.einsum("nbp,p->nb", errors**2, -0.5 / self.output_variance)
+
+    def _resampled(
+        self, x: np.ndarray, log_weights: np.ndarray, rows: np.ndarray, stream: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same with as many equally probable particles of the same mean and covariance in some
+        of the episodes. The stream tells the random numbers of one resampling from others'."""
+        rng = np.random.default_rng([self.seed, 1, *stream])
+        old, weights, count = x[:, rows], np.exp(log_weights[:, rows]), self.particles
+        shrinkage = (3 * self.discount - 1) / (2 * self.discount)
+        mean, P = _moments(weights, old)
+        ends = np.clip(np.ceil(np.cumsum(weights, axis=0) * count - rng.random()), 0, count)
+        ends[-1] = count
+        copies = np.diff(ends, axis=0, prepend=0).astype(int)
+        kept = np.repeat(np.tile(np.arange(count), len(rows)), copies.T.ravel())
+        drawn = np.take_along_axis(old, kept.reshape(len(rows), count).T[..., None], axis=0)
+        L, _ = factor(P.transpose(1, 2, 0), np.zeros(len(rows)))
+        L = np.sqrt(1 - shrinkage**2) * L
+        noise = np.einsum("ijb,mj->mbi", L, rng.standard_normal((count, x.shape[-1])))
+        x, log_weights = x.copy(), log_weights.copy()
+        x[:, rows] = shrinkage * drawn + (1 - shrinkage) * mean + noise
+        log_weights[:, rows] = -np.log(count)
+        return x, log_weights
+
+
+def _moments(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means (batch, nx) and covariances (batch, nx, nx) of x (num_particles, batch, nx)."""
+    mean = np.einsum("nb,nbi->bi", weights, x)
+    deviations = (x - mean).transpose(2, 0, 1)
+    P = np.einsum("inb,jnb->bij", weights * deviations, deviations)
+    return mean, P
+
+
+def _normalised(log_weights: np.ndarray) -> np.ndarray:
+    """The same, so that the weights sum to one."""
+    log_weights = log_weights - log_weights.max(axis=0)
+    return log_weights - np.log(np.exp(log_weights).sum(axis=0))
+
+
+def _effective(log_weights: np.ndarray) -> np.ndarray:
+    """The effective number of particles (batch,), (Σw)²/Σw²."""
+    weights = np.exp(log_weights - log_weights.max(axis=0))
+    return weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
+
+
+def _power(
+    log_weights: np.ndarray, log_likelihood: np.ndarray, left: np.ndarray, count: int
+) -> np.ndarray:
+    """The power (batch,), up to what is left, of the likelihood that leaves effectively a quarter
+    of the particles, by bisection."""
+    low, high = np.zeros_like(left), left
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        enough = _effective(log_weights + middle * log_likelihood) > count / 4
+        low, high = np.where(enough, middle, low), np.where(enough, high, middle)
+    return high

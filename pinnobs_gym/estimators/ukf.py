@@ -1,0 +1,40 @@
+"""The unscented Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.sigma_points import SigmaPointFilter
+
+
+@dataclass(frozen=True)
+class UKF(SigmaPointFilter):
+    """The unscented Kalman filter (Julier & Uhlmann 1997) with 2·nx + 1 points.
+
+    The centre has weight κ/(nx + κ), κ = max(0, 3 − nx), and the points x̂ ± √(nx + κ)·columns of
+    √P weigh 1/(2(nx + κ)) each: van der Merwe's α = 1, at which no weight is negative. In
+    covariances the centre has β more (van der Merwe 2004).
+
+    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
+    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    """
+
+    beta: float = 0.0
+    """What is added to the weight of the centre in covariances."""
+
+    name = "ukf"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.beta < np.inf:
+            raise ValueError(f"beta={self.beta}; expected a number of at least 0")
+
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nx = self.system.nx
+        spread = float(max(nx, 3))  # nx + κ
+        axes = np.sqrt(spread) * np.eye(nx)
+        weights = np.append(1 - nx / spread, np.full(2 * nx, 0.5 / spread))
+        points = np.concatenate([np.zeros((1, nx)), axes, -axes])
+        return points, weights, weights + np.append(self.beta, np.zeros(2 * nx))

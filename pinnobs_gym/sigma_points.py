@@ -1,0 +1,89 @@
+"""What the sigma-point filters share: all but where they put their points."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.estimator import State
+from pinnobs_gym.kalman import (
+    GaussianEstimator,
+    checked,
+    covariances,
+    divide,
+    factor,
+    outer,
+    sandwich,
+)
+from pinnobs_gym.record import Prior
+from pinnobs_gym.simulate import model_step, product
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What the filter keeps besides the state's own fields; the batch comes last."""
+
+    Q: np.ndarray
+    """Covariance of the process noise, shape (nx, nx, 1)."""
+    R: np.ndarray
+    """Covariance of the output noise, shape (ny, ny, 1)."""
+    points: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """What `SigmaPointFilter.points` returns."""
+    jitter: np.ndarray
+    """The largest part of a variance that had to be added so far, shape (batch,); zero if none."""
+
+
+@dataclass(frozen=True)
+class SigmaPointFilter(GaussianEstimator):
+    """A Kalman filter whose moments come from points sent through the model.
+
+    The points are drawn anew after the prediction, so that they know of Q. With the weighted
+    deviations X of the points, and Y of their outputs, K = XYᵀ(YYᵀ + R)⁻¹ and
+    P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ: Joseph's form, positive semidefinite whatever K is (Arasaratnam
+    & Haykin 2009, the square-root form of section VII). If a covariance has no Cholesky factor,
+    `kalman.JITTER` of each of its variances is added, and reported in the state's memory.
+    """
+
+    @abstractmethod
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points of the standard normal distribution, (num_points, nx), and their weights in
+        means and in covariances, (num_points,), none negative."""
+
+    def reset(self, prior: Prior) -> State:
+        prior = checked(prior)
+        memory = Memory(*self.tuning(), self.points(), np.zeros(len(prior.mean)))
+        return State(prior.mean, P=prior.cov, memory=memory)
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: Memory = state.memory
+        xhat, P = state.xhat, covariances(state)
+        unit, mean_weights, cov_weights = memory.points
+        weights = np.sqrt(cov_weights)[:, None]
+        L, jitter = factor(P, memory.jitter)
+        if state.t is not None:
+            points = np.add(xhat, (unit @ L).transpose(1, 2, 0), order="C")
+            points = model_step(self.system, state.t, t, points, state.u, u)
+            points = np.ascontiguousarray(points.transpose(2, 0, 1))
+            mean = mean_weights @ points  # (nx, batch)
+            X = (points - mean[:, None]) * weights
+            xhat, P = mean.T, outer(X, X) + memory.Q
+            L, jitter = factor(P, jitter)
+        X = unit @ L  # (nx, num_points, batch)
+        outputs = np.asarray(self.system.h(xhat + X.transpose(1, 2, 0))).transpose(2, 0, 1)
+        mean = mean_weights @ outputs
+        X, Y = X * weights, (outputs - mean[:, None]) * weights
+        innovation, missing = y - mean.T, np.isnan(y)
+        if missing.any():
+            innovation = np.where(missing, 0.0, innovation)
+            Y = np.where(missing.T[:, None], 0.0, Y)
+        S = outer(Y, Y) + memory.R
+        K = divide(outer(X, Y), S)
+        X = X - product(K, Y)
+        P = outer(X, X) + sandwich(K, memory.R)
+        xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
+        if jitter is not memory.jitter:
+            memory = replace(memory, jitter=jitter)
+        P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
+        return State(xhat, t, u, P, innovation, S, memory)
