@@ -121,7 +121,11 @@ def test_ctrl_c_keeps_what_every_record_has(monkeypatch):
 
     monkeypatch.setattr(Run, "step", interrupted)
     config = replace(SMALL, device="cpu")
-    many = train_many(system, config, record=record, noise_std=noise)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored here
+    try:
+        many = train_many(system, config, record=record, noise_std=noise)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert [trained.iterations for trained in many] == [3, 1, 1]
     stopped = runs_of(system, record, noise)
     advance(stopped, "cpu", [True])
