@@ -212,6 +212,7 @@ def readme_section(rows: Sequence[Row], tables: Iterable[Table]) -> str:
         return ""
     made = (
         "`python scripts/reproduce_paper.py depth` (`activation`, `weights`, `examples`) makes the "
-        f"paper's tables anew. {measured_on(used)}"
+        f"paper's tables anew. {measured_on(used)} `fast` is guided by a Kalman smoother of the "
+        "same record; `paper` is the recipe of the paper."
     )
     return "\n\n".join([made, *parts, *PROTOCOL])
