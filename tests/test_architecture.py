@@ -43,7 +43,9 @@ ALLOWED = {
         "simulate",
         "smoother",
         "system",
+        "trained_file",
     },
+    "trained_file": {"system"},
     "training": set(),
 }
 """What a module or subpackage may import of ours; itself is a case of its own below."""

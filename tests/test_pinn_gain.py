@@ -16,7 +16,6 @@ from pinnobs_gym.estimator import output_scale
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.gain_network import memory_size, shapes
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
-from pinnobs_gym.estimators.pinn_obs import identity
 from pinnobs_gym.kalman import update_with
 from pinnobs_gym.record import Record
 from pinnobs_gym.simulate import model_step_jacobian
@@ -24,6 +23,7 @@ from pinnobs_gym.suite import TRAINING_SEED, record_of
 from pinnobs_gym.system import System
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+from pinnobs_gym.trained_file import identity
 from trainers.pinn_gain import Config, train
 from trainers.pinn_gain.rollout import Model, Moment, predict, update
 from trainers.pinn_gain.smooth import smooth

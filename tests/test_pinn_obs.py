@@ -10,13 +10,14 @@ import torch
 from array_api_compat import array_namespace
 from scipy.integrate import solve_ivp
 
-from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, Trained, identity
+from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, Trained
 from pinnobs_gym.log import Log
 from pinnobs_gym.network import Architecture, Network
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import truth
 from pinnobs_gym.system import Setup, System, matrix, stack
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.trained_file import identity
 from trainers.pinn_obs import Config, PinnObs, train
 from trainers.pinn_obs.adam import Adam
 from trainers.pinn_obs.objective import Objective, Weights

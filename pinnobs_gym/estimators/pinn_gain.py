@@ -20,7 +20,6 @@ from pinnobs_gym.estimators.gain_network import (
     remembered,
     shapes,
 )
-from pinnobs_gym.estimators.pinn_obs import check_same, identity, read, write
 from pinnobs_gym.kalman import (
     GaussianEstimator,
     checked,
@@ -32,6 +31,7 @@ from pinnobs_gym.kalman import (
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import model_step
 from pinnobs_gym.system import System, vector
+from pinnobs_gym.trained_file import check_same, identity, read, write
 
 Layers = tuple[tuple[np.ndarray, np.ndarray], ...]
 """Weights (rows, columns) and biases (rows,) of each layer."""
