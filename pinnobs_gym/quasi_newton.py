@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
-from scipy.linalg import get_blas_funcs
+from scipy.linalg import block_diag, get_blas_funcs
 
 Objective: TypeAlias = Callable[[np.ndarray], tuple[float, np.ndarray]]
 """A function and its gradient: f and ∇f (n,) at x (n,)."""
@@ -24,6 +24,10 @@ SUFFICIENT_DECREASE = 1e-4
 CURVATURE = 0.9
 """c₂ of the strong Wolfe conditions."""
 _TRIALS = 25
+_APART = 16
+"""Updates of the inverse Hessian that are added up at a time."""
+Weights: TypeAlias = tuple[float, float, float, float]
+"""What an update divides H by, and its weights of ssᵀ, swᵀ + wsᵀ and wwᵀ."""
 _symv, _syr2k = get_blas_funcs(("symv", "syr2k"), dtype=np.float64)
 
 
@@ -141,6 +145,52 @@ def _minimiser(one: Trial, other: Trial, otherwise: float) -> float:
 
 
 @dataclass(eq=False)
+class Inverse:
+    """The inverse Hessian's approximation: scale · matrix + vectors · middle · vectorsᵀ.
+
+    The last updates stay apart: to multiply by them is cheap, and to add many at once takes little
+    more than to add one, for which the whole matrix goes through memory just the same.
+    """
+
+    matrix: np.ndarray = field(repr=False)
+    """Shape (n, n), in Fortran's order; its lower triangle counts."""
+    scale: float
+    vectors: np.ndarray = field(repr=False)
+    """Shape (n, 2k), two for each of k updates."""
+    middle: np.ndarray = field(repr=False)
+    """Shape (2k, 2k)."""
+
+    @staticmethod
+    def identity(n: int, scale: float) -> Inverse:
+        """A multiple of the identity."""
+        matrix = np.asfortranarray(np.eye(n))
+        return Inverse(matrix, scale, np.empty((n, 0), order="F"), np.empty((0, 0)))
+
+    def times(self, x: np.ndarray) -> np.ndarray:
+        """The product with x (n,)."""
+        by_vectors = self.middle @ (self.vectors.T @ x)
+        return _symv(self.scale, self.matrix, x, lower=1) + self.vectors @ by_vectors
+
+    def update(self, s: np.ndarray, w: np.ndarray, weights: Weights) -> None:
+        """Divide by τ and add ssᵀ, swᵀ + wsᵀ and wwᵀ with their weights; see `update_weights`."""
+        tau, ss, sw, ww = weights
+        self.scale /= tau
+        self.vectors = np.asfortranarray(np.column_stack([self.vectors, s, w]))
+        self.middle = np.asarray(block_diag(self.middle / tau, [[ss, sw], [sw, ww]]))
+        if self.vectors.shape[1] >= 2 * _APART:
+            half = np.asfortranarray(self.vectors @ (self.middle / 2))
+            args = self.vectors, half, self.scale, self.matrix
+            self.matrix = _syr2k(1.0, *args, lower=1, overwrite_c=1)
+            self.scale, self.vectors = 1.0, self.vectors[:, :0]
+            self.middle = self.middle[:0, :0]
+
+    @property
+    def whole(self) -> bool:
+        """Whether no update stands apart."""
+        return self.vectors.shape[1] == 0
+
+
+@dataclass(eq=False)
 class QuasiNewton:
     """A minimisation in progress: all that changes from one step to the next."""
 
@@ -150,9 +200,10 @@ class QuasiNewton:
     """The function there."""
     gradient: np.ndarray
     """The gradient there, shape (n,)."""
-    H: np.ndarray | None = field(default=None, repr=False)
-    """The inverse Hessian's approximation, shape (n, n), of which the lower triangle counts; the
-    identity if None."""
+    H: Inverse | None = field(default=None, repr=False)
+    """The inverse Hessian's approximation; the identity if None."""
+    direction: np.ndarray | None = field(default=None, repr=False)
+    """−H∇f, shape (n,), if it is known."""
     curvature: float = CURVATURE
     """c₂ of the line search."""
     first: float = 1.0
@@ -174,7 +225,9 @@ class QuasiNewton:
         steepest descent tried.
         """
         while True:
-            direction = self._direction()
+            direction = self.direction
+            if direction is None:
+                direction = -self.gradient if self.H is None else -self.H.times(self.gradient)
             slope = float(self.gradient @ direction)
             here = Point(0.0, self.f, slope, self.x, self.gradient)
             first = self.first if self.H is not None else first_step(slope)
@@ -183,36 +236,39 @@ class QuasiNewton:
                 found = line_search(objective, here, direction, first, self.curvature)
             if found is not None or self.H is None:
                 break
-            self.H = None
+            self.H = self.direction = None
         if found is None:
             return False
-        self._update(found)
+        self._update(found, direction)
         self.x, self.f, self.gradient = found.x, found.f, found.gradient
         return True
 
-    def _direction(self) -> np.ndarray:
-        if self.H is None:
-            return -self.gradient
-        return _symv(-1.0, self.H, self.gradient, lower=1)
-
-    def _update(self, found: Point) -> None:
+    def _update(self, found: Point, direction: np.ndarray) -> None:
         """The new H: (H − wwᵀ/yᵀw + φ·vvᵀ)/τ + ssᵀ/sᵀy with w = Hy and
-        v = √(yᵀw)·(s/sᵀy − w/yᵀw), written out in ssᵀ, swᵀ + wsᵀ and wwᵀ."""
-        s, y = found.x - self.x, found.gradient - self.gradient
+        v = √(yᵀw)·(s/sᵀy − w/yᵀw), written out in ssᵀ, swᵀ + wsᵀ and wwᵀ.
+
+        With it comes the new direction, from that of the step and w; it is multiplied out anew
+        whenever the updates are added up, so that rounding does not gather in it.
+        """
+        s, y, g = found.x - self.x, found.gradient - self.gradient, found.gradient
         sy = float(s @ y)
+        self.direction = None
         if not curved(sy, float(s @ s), float(y @ y)):
             return
         if self.H is None:  # Nocedal & Wright, 6.20
-            self.H = np.asfortranarray(np.eye(len(s)) * (sy / float(y @ y)))
-            sBs = float(s @ s) / (sy / float(y @ y))
+            scale = sy / float(y @ y)
+            self.H = Inverse.identity(len(s), scale)
+            sBs, along = float(s @ s) / scale, scale * self.gradient
         else:
-            sBs = -found.step * float(s @ self.gradient)
-        w = _symv(1.0, self.H, y, lower=1)
-        yw = float(y @ w)
-        tau, ss, sw, ww = update_weights(sBs, yw, sy, len(s))
-        left = np.stack([s, w], axis=1)
-        right = np.stack([ss / 2 * s + sw * w, ww / 2 * w], axis=1)
-        self.H = _syr2k(1.0, left, right, 1 / tau, self.H, lower=1, overwrite_c=1)
+            sBs, along = -found.step * float(s @ self.gradient), -direction
+        w = self.H.times(y)
+        weights = update_weights(sBs, float(y @ w), sy, len(s))
+        self.H.update(s, w, weights)
+        if not self.H.whole:
+            tau, ss, sw, ww = weights
+            sg, wg = float(s @ g), float(w @ g)
+            product = (along + w) / tau + (ss * sg + sw * wg) * s + (sw * sg + ww * wg) * w
+            self.direction = -product
 
 
 def first_step(slope: float) -> float:
@@ -225,7 +281,7 @@ def curved(sy: float, ss: float, yy: float) -> bool:
     return sy > 1e-14 * math.sqrt(ss * yy)
 
 
-def update_weights(sBs: float, yw: float, sy: float, n: int) -> tuple[float, float, float, float]:
+def update_weights(sBs: float, yw: float, sy: float, n: int) -> Weights:
     """What the update divides H by, and its weights of ssᵀ, swᵀ + wsᵀ and wwᵀ."""
     phi, tau = _scaled_broyden(sBs / sy, yw / sy, n)
     return tau, phi * yw / (sy * sy) / tau + 1 / sy, -phi / sy / tau, (phi - 1) / yw / tau

@@ -68,12 +68,15 @@ def test_every_step_satisfies_the_strong_wolfe_conditions(objective, monkeypatch
 
 def test_the_matrix_satisfies_the_secant_equation():
     state = QuasiNewton.start(rosenbrock, np.tile([-1.2, 1.0], 3))
-    for _ in range(8):
+    for _ in range(40):  # past the step at which updates are added up
         x, gradient = state.x, state.gradient
         assert state.step(rosenbrock)
-        H = np.tril(state.H) + np.tril(state.H, -1).T
+        H = np.stack([state.H.times(unit) for unit in np.eye(6)])
         np.testing.assert_allclose(H @ (state.gradient - gradient), state.x - x, atol=1e-10)
+        np.testing.assert_allclose(H, H.T, rtol=1e-9)
         assert np.linalg.eigvalsh(H).min() > 0
+        if state.direction is not None:
+            np.testing.assert_allclose(state.direction, -H @ state.gradient, rtol=1e-6, atol=1e-12)
 
 
 def test_at_a_minimum_there_is_no_step():

@@ -13,7 +13,7 @@ import torch
 
 from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.network import Architecture, Network
-from pinnobs_gym.quasi_newton import QuasiNewton
+from pinnobs_gym.quasi_newton import Inverse, QuasiNewton
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
 from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Lead, Objective, Weights
@@ -146,11 +146,21 @@ class FastRun(Run):
     def _state(self) -> dict[str, Any]:
         method = self._method
         assert isinstance(method, QuasiNewton)
-        known = {} if method.H is None else {"H": torch.from_numpy(method.H.T)}
-        return {**known, "gradient": torch.from_numpy(method.gradient)}
+        parts: dict[str, Any] = {"gradient": torch.from_numpy(method.gradient)}
+        if method.H is not None:
+            parts |= {"H_scale": method.H.scale, "H_middle": torch.from_numpy(method.H.middle)}
+            parts |= {"H": torch.from_numpy(method.H.matrix.T)}  # C's order, like all tensors'
+            parts["H_vectors"] = torch.from_numpy(method.H.vectors.T)
+        if method.direction is not None:
+            parts["direction"] = torch.from_numpy(method.direction)
+        return parts
 
     def _resumed(self, state: Mapping[str, Any]) -> QuasiNewton:
         assert self.best is not None
-        H = state["H"].numpy().T if "H" in state else None
+        H = None
+        if "H" in state:
+            matrix, vectors = state["H"].numpy().T, state["H_vectors"].numpy().T
+            H = Inverse(matrix, state["H_scale"], vectors, state["H_middle"].numpy())
+        direction = state["direction"].numpy() if "direction" in state else None
         here = self.best.theta, self.best.loss, state["gradient"].numpy()
-        return QuasiNewton(*here, H, first=FIRST_STEP)
+        return QuasiNewton(*here, H, direction, first=FIRST_STEP)
