@@ -86,7 +86,7 @@ class MHE(GaussianEstimator):
         weight = divide(identity(self.system.nx), memory.P)
         start = memory.start
         fit = self._fit(memory, start)
-        innovation, _ = observe(self.system, fit.x[-1], y)
+        innovation, H = observe(self.system, fit.x[-1], y)
         step, P = _step(fit, weight, memory.arrival - start)
         for _ in range(self.steps - 1):
             start = start + step
@@ -96,8 +96,9 @@ class MHE(GaussianEstimator):
         xhat = fit.x[-1] + np.einsum("ijb,bj->bi", fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
         memory = replace(memory, start=start)
+        S = _innovation_covariance(P, H, memory.R).transpose(2, 0, 1)
         P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, memory=memory)
+        return State(xhat, t, u, P, innovation, S, memory)
 
     def _fit(self, memory: Memory, start: np.ndarray) -> Fit:
         """The model's trajectory through the window from a state at its start."""
@@ -119,6 +120,13 @@ class MHE(GaussianEstimator):
         arrival = start + product(F, ahead.T[:, None])[:, 0].T
         memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
         return replace(memory, arrival=arrival, P=P, start=start)
+
+
+def _innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """S = HP⁻Hᵀ + R, (ny, ny, batch), of the covariance P after the update: R(R − HPHᵀ)⁻¹R."""
+    R = np.broadcast_to(R, (*R.shape[:2], P.shape[-1]))
+    S = product(divide(R, R - sandwich(H, P)), R)
+    return (S + S.transpose(1, 0, 2)) / 2
 
 
 def _step(fit: Fit, weight: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
