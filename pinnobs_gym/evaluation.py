@@ -284,6 +284,8 @@ def _common(
         "env_id": env_id,
         "setup": setup,
         "condition": condition,
+        "ranked": condition == env.source.system.ranked_condition,
+        "nx": env.source.system.nx,
         "estimator": estimator.label,
         "track": estimator.track,
         "knows": list(estimator.knows),

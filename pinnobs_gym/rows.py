@@ -19,6 +19,8 @@ Row: TypeAlias = dict[str, Any]
 
 - ``schema``: version of this format.
 - ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
+- ``ranked``: whether this is the condition that the system is ranked under; ``nx``: how many states
+  it has.
 - ``estimator``, ``track``, ``knows``, ``options``, ``config_hash``: the estimator, its track, what
   it is told, its settings, and a hash of these and of its model and training.
 - ``training``, ``training_seed``: how it was trained, for learned ones: seconds, config, ...
@@ -120,7 +122,7 @@ def _decoded(path: Path, number: int, line: str) -> Row:
             f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}: move "
             f"the file away and run again"
         )
-    missing = [name for name in (*KEY, *SCORES, "diverged") if name not in row]
+    missing = [name for name in (*KEY, *SCORES, "diverged", "ranked", "nx") if name not in row]
     if missing:
         raise ValueError(f"{path}, line {number}: a row without {', '.join(missing)}")
     for name in SCORES:

@@ -10,7 +10,8 @@ from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
 def row(seed=0, **changes):
     scores = dict.fromkeys(SCORES, 0.5)
     names = dict.fromkeys(rows.KEY, "x")
-    base = {"schema": rows.SCHEMA, **names, **scores, "diverged": False, "episode_seed": seed}
+    facts = {"diverged": False, "episode_seed": seed, "ranked": True, "nx": 2}
+    base = {"schema": rows.SCHEMA, **names, **scores, **facts}
     return {**base, **changes}
 
 
