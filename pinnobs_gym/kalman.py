@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import Estimator, Range, State
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import identity, model_step_jacobian, product
 from pinnobs_gym.system import System, vector
@@ -28,6 +28,8 @@ class GaussianEstimator(Estimator):
 
     process_noise: float = 1e-4
     """Standard deviation of the process noise per sample, over the state's scale."""
+
+    tunable = {"process_noise": Range(1e-7, 1e-1, log=True)}
 
     def __post_init__(self) -> None:
         if not 0 <= self.process_noise < np.inf:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import State
+from pinnobs_gym.estimator import Range, State
 from pinnobs_gym.kalman import (
     GaussianEstimator,
     checked,
@@ -66,6 +66,7 @@ class MHE(GaussianEstimator):
     """Gauss-Newton steps at every sample; one is the real-time iteration of Diehl et al. 2005."""
 
     name = "mhe"
+    tunable = {**GaussianEstimator.tunable, "window": Range(2, 40, log=True)}
 
     def __post_init__(self) -> None:
         super().__post_init__()

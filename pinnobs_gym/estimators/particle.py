@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import Estimator, Range, State
 from pinnobs_gym.kalman import checked, factor
 from pinnobs_gym.least_squares import root
 from pinnobs_gym.record import Prior
@@ -57,6 +57,7 @@ class ParticleFilter(Estimator):
     """Of the random numbers."""
 
     name = "particle"
+    tunable = {"discount": Range(0.8, 0.999)}
 
     def __post_init__(self) -> None:
         if self.particles < 2:
