@@ -84,15 +84,14 @@ class MHE(GaussianEstimator):
         if len(memory.t) == self.window:
             memory = self._moved(memory, t, u)
         memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
-        weight = divide(identity(self.system.nx), memory.P)
         start = memory.start
         fit = self._fit(memory, start)
         innovation, H = observe(self.system, fit.x[-1], y)
-        step, P = _step(fit, weight, memory.arrival - start)
+        step, P = _step(fit, memory.P, memory.arrival - start)
         for _ in range(self.steps - 1):
             start = start + step
             fit = self._fit(memory, start)
-            step, P = _step(fit, weight, memory.arrival - start)
+            step, P = _step(fit, memory.P, memory.arrival - start)
         start = start + step
         xhat = fit.x[-1] + np.einsum("ijb,bj->bi", fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
@@ -130,9 +129,11 @@ def _innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.nd
     return (S + S.transpose(1, 0, 2)) / 2
 
 
-def _step(fit: Fit, weight: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _step(fit: Fit, P: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The Gauss-Newton step (batch, nx) of the window's first state, with x̄ so far ahead of it, and
-    the covariance (nx, nx, batch) of where it leads."""
-    P = divide(identity(len(weight)), fit.information + weight)
-    right = fit.right + np.einsum("ijb,bj->ib", weight, ahead)
-    return np.einsum("ijb,jb->bi", P, right), P
+    the covariance (nx, nx, batch) of where it leads, (P̄⁻¹ + Λ)⁻¹ with Λ the information of the
+    window; without P̄⁻¹, because P̄ may be singular: what is known stays."""
+    matrix = identity(len(P)) + product(P, fit.information)
+    P = np.linalg.solve(matrix.transpose(2, 0, 1), P.transpose(2, 0, 1)).transpose(1, 2, 0)
+    right = fit.right - np.einsum("ijb,bj->ib", fit.information, ahead)
+    return ahead + np.einsum("ijb,jb->bi", P, right), P
