@@ -201,15 +201,17 @@ def divide_factored(A: np.ndarray, L: np.ndarray) -> np.ndarray:
     return X
 
 
-def cholesky(P: np.ndarray) -> np.ndarray:
+def cholesky(P: np.ndarray, semidefinite: bool = False) -> np.ndarray:
     """The lower triangular L with LLᵀ = P (n, n, batch); not a number where P is not positive
-    definite."""
+    definite or, if it may be semidefinite, not a number itself: a pivot below zero is then taken
+    for the rounding of zero."""
     L = np.zeros(P.shape)
     for j in range(len(P)):
         column = P[j:, j]
         if j:
             column = column - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
-        L[j:, j] = column / np.sqrt(column[0])
+        pivot = np.where(column[0] <= 0, np.inf, column[0]) if semidefinite else column[0]
+        L[j:, j] = column / np.sqrt(pivot)
     return L
 
 

@@ -304,3 +304,17 @@ def test_an_indefinite_P0_is_refused_in_one_line(estimator):
         return
     with pytest.raises(ValueError, match="P0 of row 1 has eigenvalue -1; expected a covariance"):
         cls(source.system).run(wrong)
+
+
+def test_a_semidefinite_matrix_has_a_cholesky_factor_too():
+    rng = np.random.default_rng(0)
+    full = rng.standard_normal((4, 4))
+    thin = rng.standard_normal((4, 2))
+    gaps = np.diag([1.0, 0.0, 2.0, 0.0])
+    P = np.stack([full @ full.T, thin @ thin.T, gaps, 0 * gaps], axis=-1)
+    L = cholesky(P, semidefinite=True)
+    np.testing.assert_allclose(np.einsum("ikb,jkb->ijb", L, L), P, atol=1e-7)
+    assert (L[np.triu_indices(4, 1)] == 0).all()
+    with np.errstate(all="ignore"):
+        assert np.isnan(cholesky(P)[..., 3]).any()
+        assert np.isnan(cholesky(np.full((2, 2, 1), np.nan), semidefinite=True)).any()

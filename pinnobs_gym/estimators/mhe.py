@@ -10,6 +10,7 @@ from pinnobs_gym.estimator import Range, State
 from pinnobs_gym.kalman import (
     GaussianEstimator,
     checked,
+    cholesky,
     divide,
     joseph_update,
     observe,
@@ -133,7 +134,9 @@ def _step(fit: Fit, P: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.nd
     """The Gauss-Newton step (batch, nx) of the window's first state, with x̄ so far ahead of it, and
     the covariance (nx, nx, batch) of where it leads, (P̄⁻¹ + Λ)⁻¹ with Λ the information of the
     window; without P̄⁻¹, because P̄ may be singular: what is known stays."""
-    matrix = identity(len(P)) + product(P, fit.information)
-    P = np.linalg.solve(matrix.transpose(2, 0, 1), P.transpose(2, 0, 1)).transpose(1, 2, 0)
+    L = cholesky(P, semidefinite=True)
+    L_transposed = L.transpose(1, 0, 2)
+    inner = identity(len(P)) + product(product(L_transposed, fit.information), L)
+    P = product(divide(L, inner), L_transposed)
     right = fit.right - np.einsum("ijb,bj->ib", fit.information, ahead)
     return ahead + np.einsum("ijb,jb->bi", P, right), P
