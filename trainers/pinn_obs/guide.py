@@ -63,10 +63,10 @@ def guide_of(
 
     x̂ has to begin at x̂₀. Where the first innovation tells more than noise, a finite gain can lead
     it away from there at once: it goes to the smoothed states within the first interval, and the
-    gain that this takes, good for this record alone, is added to Riccati's. Of noisy outputs that is
-    Riccati's from a part of the prior: from the whole it would give away to the noise of the next
-    samples what is known by then. Otherwise x̂ has to wait for the outputs to show what is wrong,
-    and goes with the filter.
+    gain that this takes, good for this record alone, is added to Riccati's. Of noisy outputs that
+    is Riccati's from a part of the prior: from the whole it would give away to the noise of the
+    next samples what is known by then. Otherwise x̂ has to wait for the outputs to show what is
+    wrong, and goes with the filter.
 
     Args:
         system: the model.
