@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 from rich import box
 from rich.console import Console
 from rich.progress import (
@@ -24,7 +26,8 @@ def print_table(table: leaderboard.Table) -> None:
     """Print a leaderboard's table; a narrow terminal is spared the intervals."""
     wide = console.width >= 145
     shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
-    hidden = {"is told", "training"} | (set() if wide else {"90th pct.", "µs/step"})
+    hidden = {"is told", "training", "NIS", "corr.", "tail / CRR"}
+    hidden |= {"track"} if wide else {"90th pct.", "µs/step", "/ CRR", "ANEES", "covers %"}
     columns = [i for i, name in enumerate(leaderboard.HEADER) if name not in hidden]
     for i in columns:
         name = leaderboard.HEADER[i]
@@ -38,6 +41,16 @@ def print_table(table: leaderboard.Table) -> None:
         console.print(f"  {standing.estimator} is told: {standing.knows}{trained}")
     if table.note:
         console.print(f"  {table.note}", style="yellow")
+
+
+def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
+    """Print a table of text whose first column is of names."""
+    shown = RichTable(title=title, title_justify="left", title_style="bold", box=box.SIMPLE)
+    for i, name in enumerate(header):
+        shown.add_column(name, justify="right" if i else "left", overflow="fold")
+    for line in lines:
+        shown.add_row(*line)
+    console.print(shown)
 
 
 def progress() -> Progress:

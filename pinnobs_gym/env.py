@@ -386,7 +386,7 @@ def _given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.
         raise ValueError(f"x0 has shape {x0.shape}; expected ({nx},)")
     if not np.isfinite(x0).all():
         raise ValueError(f"x0={x0.tolist()} is not finite")
-    if not source.contains(x0):
+    if not np.all(source.contains(x0)):
         name = type(source.system).__name__
         gym.logger.warn(f"x0={x0.tolist()} is outside the initial set of {name}")
     return np.broadcast_to(x0, (batch, nx)).copy()

@@ -10,7 +10,7 @@ import numpy as np
 
 from pinnobs_gym.conditions import Condition, noise_scale, parse_condition
 from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.simulate import truth
+from pinnobs_gym.simulate import disturbed_truth, truth
 from pinnobs_gym.system import System, vector
 from pinnobs_gym.systems import SYSTEMS
 
@@ -91,6 +91,7 @@ class EpisodeSource:
         self.condition.plant(self.system, ())  # a condition that does not fit says so now
         self.setup = self.condition.setup(self.system, chosen)
         self.fixed_x0 = self.setup.fixed_x0
+        self.process_noise = self.condition.process_noise(self.system)
         self.trivial = type(self.condition) is Condition
         self.deterministic = self.fixed_x0 and self.trivial and not np.any(self.setup.noise_std)
         self.times = self.setup.times
@@ -99,12 +100,10 @@ class EpisodeSource:
         self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
         self._noise_std = vector(self.setup.noise_std, self.system.ny, "noise_std")
 
-    def contains(self, x0: np.ndarray) -> bool:
-        """Whether all initial states (..., nx) belong to the setup's set."""
-        if self.fixed_x0:
-            return bool((x0 == self.x0_low).all())
-        inside = (x0 >= self.x0_low) & (x0 <= self.x0_high)
-        return bool(inside.all() and np.all(self.system.admissible(x0)))
+    def contains(self, x0: np.ndarray) -> np.ndarray:
+        """Which initial states (..., nx) belong to the setup's set: bool (...)."""
+        inside = np.asarray(((x0 >= self.x0_low) & (x0 <= self.x0_high)).all(axis=-1))
+        return inside if self.fixed_x0 else inside & self.system.admissible(x0)
 
     def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
         """What chance decides in the next episode of each stream; a stream may stand there several
@@ -133,14 +132,20 @@ class EpisodeSource:
         x, y, observations = episodes.x, episodes.y, episodes.observations
         rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
-        if plant is self.system and len(start) > 1 and (start == start[0]).all():
+        if self.process_noise is not None:
+            steps = (len(self.times) - 1, self.system.nx)
+            drawn = np.stack([rng.standard_normal(steps) for rng in rngs], axis=1)
+            noise = self.process_noise * drawn
+            disturbed_truth(plant, start, self.times, noise, self.setup.truth_step, out=x)
+        elif plant is self.system and len(start) > 1 and (start == start[0]).all():
             x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
         else:
             truth(plant, start, self.times, self.setup.truth_step, out=x)
         np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
-        y += self.system.h(x)
+        y += plant.h(x)
         if not self.trivial:
-            y[:] = self.condition.outputs(y, noise_scale(self.system, self.setup), rngs)
+            scale = noise_scale(self.system, self.setup)
+            y[:] = self.condition.outputs(self.times, y, scale, rngs)
         ny = self.system.ny
         observations[..., :ny] = y
         observations[..., ny:-1] = self.inputs[:, None]
@@ -174,13 +179,18 @@ class Stream:
         self.conditions = conditions
 
     def next_x0(self, source: EpisodeSource) -> np.ndarray:
-        """The next initial state (nx,) from the setup's set."""
-        if source.fixed_x0:
-            return source.x0_low
-        for _ in range(_ATTEMPTS):
+        """The next initial state (nx,): from the setup's set, as the condition changes it."""
+        for _ in range(1 if source.fixed_x0 else _ATTEMPTS):
             if self._queue:
                 return self._queue.pop(0)
-            drawn = self._states.uniform(source.x0_low, source.x0_high, (_DRAWS, source.system.nx))
-            self._queue = list(drawn[source.system.admissible(drawn)])
+            if source.fixed_x0:
+                drawn = source.x0_low[None]
+            else:
+                shape = (_DRAWS, source.system.nx)
+                drawn = self._states.uniform(source.x0_low, source.x0_high, shape)
+                drawn = drawn[source.system.admissible(drawn)]
+            self._queue = list(source.condition.starts(drawn, source.contains))
+        if self._queue:
+            return self._queue.pop(0)
         name = type(source.system).__name__
         raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")

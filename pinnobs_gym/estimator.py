@@ -51,6 +51,21 @@ class Estimates:
 
 
 @dataclass(frozen=True)
+class Range:
+    """Where a setting is searched; whole numbers only if both bounds are."""
+
+    low: float
+    high: float
+    log: bool = False
+    """Whether by its logarithm."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether it takes whole numbers only."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+
+@dataclass(frozen=True)
 class Estimator(ABC):
     """An online estimator: x̂(k|k) from y₀..y_k, for a batch of episodes at once.
 
@@ -74,6 +89,8 @@ class Estimator(ABC):
     """What it is told besides the outputs and inputs."""
     needs_training: ClassVar[str | None] = None
     """Name of the trainer that must make it, if `for_setup` alone cannot."""
+    tunable: ClassVar[Mapping[str, Range]] = {}
+    """Which of its settings are searched by ``pinnobs tune``, and where."""
     recipe: ClassVar[Mapping[str, Any]] = {}
     """Choices in that trainer's Config that are made for it unless others are."""
 

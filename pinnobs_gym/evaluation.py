@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,17 @@ import gymnasium as gym
 import numpy as np
 
 from pinnobs_gym import rows as rows_module
+from pinnobs_gym.bound import cramer_rao, expected_scores
+from pinnobs_gym.consistency import consistency
 from pinnobs_gym.env import EstimationVectorEnv
+from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimator import Estimates, Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.figures import state_figure
 from pinnobs_gym.log import SILENT, Log
-from pinnobs_gym.metrics import score
+from pinnobs_gym.metrics import OPTIONAL_SCORES, score
 from pinnobs_gym.rows import SCHEMA, Row
-from pinnobs_gym.system import System
+from pinnobs_gym.system import System, vector
 
 BATCH = 256
 """Episodes that are run at a time."""
@@ -210,14 +214,47 @@ def score_batch(
         scored=system.observable(x),
         alternatives=system.indistinguishable(x),
     )
+    optional = consistency(x, estimates, np.isnan(record.y))
+    if reset_options is None and not changes:
+        reference = _reference(type(system), setup, condition, tuple(seeds))
+        for name, whole in (("reference_ratio", "nrmse"), ("reference_ratio_tail", "nrmse_tail")):
+            ratio = None if reference is None else scores[f"{whole}_modulo"] / reference[whole]
+            optional[name] = ratio
     cost_now = {"us_per_step": cost, "batch": record.batch, "date": _now()}
     rows = [
-        {**{name: values[i].item() for name, values in scores.items()}, **cost_now}
+        {name: values[i].item() for name, values in scores.items()}
+        | {name: _number_of(optional.get(name), i) for name in OPTIONAL_SCORES}
+        | cost_now
         for i in range(record.batch)
     ]
     P = None if estimates.P is None else estimates.P[0]
     example = {"t": record.t, "xhat": xhat[0], "x": x[0], "y": record.y[0], "P": P}
     return rows, example
+
+
+@lru_cache(maxsize=8)
+def _reference(
+    system: type[System], setup: str, condition: str, seeds: tuple[int, ...]
+) -> dict[str, np.ndarray] | None:
+    """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each;
+    None where there is none: without noise, from a fixed initial state, or under a condition that
+    is not in the model (`Condition.reference`)."""
+    source = EpisodeSource(system, setup, condition)
+    std = vector(source.setup.noise_std, source.system.ny, "noise_std")
+    if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
+        return None
+    draws = source.draw([Stream(np.random.SeedSequence(seed)) for seed in seeds])
+    episodes = source.play(draws)
+    record, x = source.record(episodes), episodes.x[: source.setup.num_steps].swapaxes(0, 1)
+    Q = None if source.process_noise is None else np.diag(source.process_noise**2)
+    P0, R = record.prior.cov[0], np.diag(std**2)
+    P = cramer_rao(source.system, record.t, x, P0, R, Q, np.isnan(record.y))
+    return expected_scores(P, source.system.scale, source.system.observable(x))
+
+
+def _number_of(values: np.ndarray | None, row: int) -> float | None:
+    """That row's value, if it has one."""
+    return None if values is None or np.isnan(values[row]) else values[row].item()
 
 
 def _checked(estimates: Estimates, estimator: Estimator, shape: tuple[int, ...]) -> np.ndarray:
@@ -247,6 +284,8 @@ def _common(
         "env_id": env_id,
         "setup": setup,
         "condition": condition,
+        "ranked": condition == env.source.system.ranked_condition,
+        "nx": env.source.system.nx,
         "estimator": estimator.label,
         "track": estimator.track,
         "knows": list(estimator.knows),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import Estimator, Range, State
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import identity, model_step_jacobian, product
 from pinnobs_gym.system import System, vector
@@ -28,6 +28,8 @@ class GaussianEstimator(Estimator):
 
     process_noise: float = 1e-4
     """Standard deviation of the process noise per sample, over the state's scale."""
+
+    tunable = {"process_noise": Range(1e-7, 1e-1, log=True)}
 
     def __post_init__(self) -> None:
         if not 0 <= self.process_noise < np.inf:
@@ -199,15 +201,17 @@ def divide_factored(A: np.ndarray, L: np.ndarray) -> np.ndarray:
     return X
 
 
-def cholesky(P: np.ndarray) -> np.ndarray:
+def cholesky(P: np.ndarray, semidefinite: bool = False) -> np.ndarray:
     """The lower triangular L with LLᵀ = P (n, n, batch); not a number where P is not positive
-    definite."""
+    definite or, if it may be semidefinite, not a number itself: a pivot below zero is then taken
+    for the rounding of zero."""
     L = np.zeros(P.shape)
     for j in range(len(P)):
         column = P[j:, j]
         if j:
             column = column - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
-        L[j:, j] = column / np.sqrt(column[0])
+        pivot = np.where(column[0] <= 0, np.inf, column[0]) if semidefinite else column[0]
+        L[j:, j] = column / np.sqrt(pivot)
     return L
 
 

@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.stats import binom, binomtest
 
+from pinnobs_gym.consistency import band
+from pinnobs_gym.intervals import Interval, median, rate
 from pinnobs_gym.metrics import DIVERGED
 from pinnobs_gym.rows import Row
-
-CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A number with its confidence interval."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def percent(self) -> Interval:
-        """The same in percent, rounded."""
-        return Interval(*(float(round(100 * part)) for part in (self.value, self.low, self.high)))
 
 
 @dataclass(frozen=True)
@@ -48,6 +34,18 @@ class Standing:
     """Median of the same modulo indistinguishable states; None where that changes nothing."""
     tail_90: float
     """90th percentile over the last quarter."""
+    reference_ratio: float | None
+    """Median NRMSE over the Cramér-Rao reference of the same episode; None where there is none."""
+    reference_ratio_tail: float | None
+    """The same of the last quarter."""
+    anees: Interval | None
+    """Mean over episodes, with the band that it should be in; None without covariances."""
+    coverage: float | None
+    """Mean over episodes."""
+    nis: float | None
+    """Mean over episodes."""
+    innovation_correlation: float | None
+    """Mean over episodes."""
     us_per_step: float
     knows: str
     budget: float | None
@@ -120,6 +118,12 @@ def standing(rows: Sequence[Row]) -> Standing:
         tail=median(values("nrmse_tail")),
         tail_modulo=_modulo(rows),
         tail_90=float(np.quantile(values("nrmse_tail"), 0.9, method="higher")),
+        reference_ratio=_of(np.median, rows, "reference_ratio"),
+        reference_ratio_tail=_of(np.median, rows, "reference_ratio_tail"),
+        anees=_anees(rows),
+        coverage=_of(np.mean, rows, "coverage"),
+        nis=_of(np.mean, rows, "nis"),
+        innovation_correlation=_of(np.mean, rows, "innovation_correlation"),
         us_per_step=float(np.median([row["us_per_step"] for row in rows])),
         knows=", ".join(first["knows"]),
         budget=first["training"].get("config", {}).get("budget"),
@@ -135,19 +139,15 @@ def _modulo(rows: Sequence[Row]) -> float | None:
     return float(np.median(np.where(modulo <= DIVERGED, modulo, np.inf)))
 
 
-def median(values: np.ndarray) -> Interval:
-    """The median with its distribution-free interval from order statistics, which takes infinite
-    values as well (Conover, "Practical Nonparametric Statistics", section 3.2); the whole range
-    where there are too few values for it."""
-    ordered = np.sort(values)
-    low = max(int(binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)) - 1, 0)
-    return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[-1 - low]))
+def _of(statistic: Callable[..., Any], rows: Sequence[Row], name: str) -> float | None:
+    """A statistic of an optional score, over the episodes that have it."""
+    values = [row[name] for row in rows if row[name] is not None]
+    return float(statistic(values)) if values else None
 
 
-def rate(hits: int, count: int) -> Interval:
-    """A proportion with Wilson's interval."""
-    interval = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
-    return Interval(hits / count, float(interval.low), float(interval.high))
+def _anees(rows: Sequence[Row]) -> Interval | None:
+    mean = _of(np.mean, rows, "anees")
+    return None if mean is None else Interval(mean, *band(len(rows), rows[0]["nx"]))
 
 
 def training_of(rows: Sequence[Row]) -> str:
@@ -176,6 +176,12 @@ HEADER = (
     "NRMSE",
     "tail NRMSE",
     "90th pct.",
+    "/ CRR",
+    "tail / CRR",
+    "ANEES",
+    "covers %",
+    "NIS",
+    "corr.",
     "µs/step",
     "is told",
     "training",
@@ -203,6 +209,12 @@ def cells(table: Table, intervals: bool = True) -> list[list[str]]:
                 shown(s.nrmse),
                 tail,
                 number(s.tail_90),
+                _optional(s.reference_ratio),
+                _optional(s.reference_ratio_tail),
+                _banded(s.anees),
+                _optional(None if s.coverage is None else 100 * s.coverage, 2),
+                _optional(s.nis),
+                _optional(s.innovation_correlation, 2),
                 number(s.us_per_step),
                 s.knows,
                 s.training,
@@ -213,14 +225,18 @@ def cells(table: Table, intervals: bool = True) -> list[list[str]]:
 
 def markdown(tables: Iterable[Table]) -> str:
     """The tables in Markdown."""
-    parts = ["# Leaderboard\n", NOTE + "\n"]
+    parts = ["# Each game\n", NOTE + "\n"]
     for table in tables:
         parts.append(f"\n## {table.title}\n")
-        parts.append("| " + " | ".join(HEADER) + " |")
-        parts.append("|" + "|".join(["---"] * len(HEADER)) + "|")
-        parts += ["| " + " | ".join(line) + " |" for line in cells(table)]
+        parts.append(markdown_table(HEADER, cells(table)))
         parts += [f"\n{table.note}"] if table.note else []
     return "\n".join(parts) + "\n"
+
+
+def markdown_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """One table in Markdown."""
+    rules = ["---"] * len(header)
+    return "\n".join("| " + " | ".join(line) + " |" for line in (header, rules, *lines))
 
 
 NOTE = (
@@ -229,7 +245,11 @@ NOTE = (
     "diverged if its tail NRMSE is above 0.2 or anything is not finite, and then scores infinity. "
     "Online estimators are causal; offline ones see the whole record first and are ranked apart. "
     "In brackets: modulo states that no output tells apart. Seconds behind a name are the CPU time "
-    "that each training was given."
+    "that each training was given. / CRR: median NRMSE over the Cramér-Rao reference of the same "
+    "episode, empty where there is none (the condition is not in the model, or there is no noise). "
+    "For those that give covariances, means over episodes: ANEES, which should be 1 (▲ above its "
+    "95 % band: errors are larger than P says, ▼ below); how many errors the central 90 % interval "
+    "covers; NIS, which should be 1; and the correlation of successive innovations, 0 if white."
 )
 """How to read the tables."""
 
@@ -241,6 +261,18 @@ def number(value: float, digits: int = 3) -> str:
     if abs(value) >= 10**digits:
         return f"{value:.0f}" if abs(value) < 1e5 else f"{value:.1e}"
     return f"{value:.{digits}g}"
+
+
+def _optional(value: float | None, digits: int = 3) -> str:
+    return "" if value is None else number(value, digits)
+
+
+def _banded(value: Interval | None) -> str:
+    """The value, and on which side of its band it is."""
+    if value is None:
+        return ""
+    side = " ▲" if value.value > value.high else " ▼" if value.value < value.low else ""
+    return number(value.value) + side
 
 
 def _interval(interval: Interval) -> str:

@@ -26,6 +26,17 @@ SCORES = (
 )
 """The numbers that `score` returns for each episode, besides ``diverged``."""
 
+OPTIONAL_SCORES = (
+    "anees",
+    "coverage",
+    "nis",
+    "innovation_correlation",
+    "reference_ratio",
+    "reference_ratio_tail",
+)
+"""Numbers that episodes have where they apply: those of `pinnobs_gym.consistency`, and the NRMSE of
+the whole episode and of its tail over their Cramér-Rao reference (`pinnobs_gym.bound`)."""
+
 
 def score(
     t: np.ndarray,

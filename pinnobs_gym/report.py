@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pinnobs_gym.conditions import CONDITIONS, fitting
 from pinnobs_gym.env import NOT_FINITE_REWARD
 from pinnobs_gym.estimator import Estimates
 from pinnobs_gym.record import Record
@@ -63,6 +64,12 @@ def page(cls: type[System], env_id: str) -> str:
         "noise_std=None, parameters=None, render_mode=None)`. Reset options: `x0`, `xhat0`. "
         "Parameters:\n",
         _parameters(cls),
+        "\n## Conditions\n",
+        "Names for `condition`, joined by `+`; `estimators told` is what is known of it.\n",
+        _table(
+            ("name", "what changes", "estimators told"),
+            [(n, CONDITIONS[n].summary, CONDITIONS[n].told) for n in fitting(system, setup)],
+        ),
         "\n## Version History\n",
         f"v{cls.version}: first version.",
     ]

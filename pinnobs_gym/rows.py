@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pinnobs_gym.metrics import SCORES
+from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the row format."""
 
 Row: TypeAlias = dict[str, Any]
@@ -19,10 +19,14 @@ Row: TypeAlias = dict[str, Any]
 
 - ``schema``: version of this format.
 - ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
+- ``ranked``: whether this is the condition that the system is ranked under; ``nx``: how many states
+  it has.
 - ``estimator``, ``track``, ``knows``, ``options``, ``config_hash``: the estimator, its track, what
   it is told, its settings, and a hash of these and of its model and training.
 - ``training``, ``training_seed``: how it was trained, for learned ones: seconds, config, ...
 - the scores of `pinnobs_gym.metrics.score` by name, ``null`` standing for infinity.
+- those of `pinnobs_gym.metrics.OPTIONAL_SCORES` that apply, in the same way; those that do not are
+  None here and absent in the file.
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
 - ``batch``: the size of that batch.
 - ``versions``, ``date``: of the packages, and when it was run (UTC).
@@ -99,6 +103,7 @@ def _encoded(row: Row) -> Row:
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in row.items()
+        if not (value is None and name in OPTIONAL_SCORES)
     }
 
 
@@ -114,11 +119,14 @@ def _decoded(path: Path, number: int, line: str) -> Row:
         )
     if row.get("schema") != SCHEMA:
         raise ValueError(
-            f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}"
+            f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}: move "
+            f"the file away and run again"
         )
-    missing = [name for name in (*KEY, *SCORES, "diverged") if name not in row]
+    missing = [name for name in (*KEY, *SCORES, "diverged", "ranked", "nx") if name not in row]
     if missing:
         raise ValueError(f"{path}, line {number}: a row without {', '.join(missing)}")
     for name in SCORES:
         row[name] = math.inf if row[name] is None else row[name]
+    for name in OPTIONAL_SCORES:
+        row[name] = math.inf if name in row and row[name] is None else row.get(name)
     return row

@@ -67,12 +67,79 @@ def truth(
         stop = int(np.searchsorted(times, end, side="right"))
         last = _smooth(system, state, start, float(end), times[done:stop], longest, x[done:stop])
         done, start, state = stop, float(end), last
+    _check_finite(system, x0, x)
+    return x
+
+
+def disturbed_truth(
+    system: System,
+    x0: np.ndarray,
+    times: np.ndarray,
+    noise: np.ndarray,
+    max_step: float | None = None,
+    out: np.ndarray | None = None,
+) -> np.ndarray:
+    """The trajectories of a plant that is disturbed at every sample: x(t) solves its equations
+    between samples, and to the state at each but the first the noise is added.
+
+    By `truth`'s method in equal steps of at most ``max_step`` between samples, without control of
+    its error, which is far below any noise worth the name.
+
+    Args:
+        system: as in `truth`, and so are ``x0``, ``times`` and ``max_step``.
+        x0: initial states, shape (batch, nx).
+        times: sample times in s, ascending.
+        noise: what is added, in state units, shape (num_samples - 1, batch, nx).
+        max_step: the solver's longest step in s; a hundredth of the time if None.
+        out: an array to write the result into.
+
+    Returns:
+        States, shape (num_samples, batch, nx).
+
+    Raises:
+        FloatingPointError: if a state leaves the finite numbers.
+    """
+    x = np.empty((len(times), *x0.shape)) if out is None else out
+    x[0] = x0
+    longest = max_step or float(times[-1] - times[0]) / 100
+    stages = np.empty((1 + len(DOP853.B), *x0.shape))
+    with np.errstate(all="ignore"):
+        for k in range(len(times) - 1):
+            start, end = float(times[k]), float(times[k + 1])
+            stages[0] = x[k]
+            ends = [b for b in system.breakpoints() if start < b < end] + [end]
+            for part in ends:
+                steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
+                step = round((part - start) / steps, 15)
+                last = np.nextafter(part, start)
+                for i in range(steps):
+                    _take_step(system, start + i * step, step, last, stages)
+                start = part
+            np.add(stages[0], noise[k], out=x[k + 1])
+    _check_finite(system, x0, x)
+    return x
+
+
+def _take_step(system: System, start: float, step: float, last: float, stages: np.ndarray) -> None:
+    """One step of Dormand and Prince's method of order 8, which evaluates f no later than at
+    ``last``; ``stages`` holds the state (batch, nx), and then room for the slopes of the stages.
+    The state in it becomes the next one; the first slope stays that of the state before."""
+    flat = stages.reshape(len(stages), -1)
+    t = np.minimum(start + step * DOP853.C, last)
+    u = system.input(t)
+    weights = _tableau(step)
+    for i, row in enumerate(weights[:-1]):
+        stage = np.dot(row, flat[: i + 1]).reshape(stages.shape[1:])
+        stages[i + 1] = system.f(t[i], stage, u[i])
+    np.dot(weights[-1], flat, out=flat[0])
+
+
+def _check_finite(system: System, x0: np.ndarray, x: np.ndarray) -> None:
     if not np.isfinite(x.sum()):
         row = int(np.flatnonzero(~np.isfinite(x).all(axis=(0, 2)))[0])
         raise FloatingPointError(
             f"{type(system).__name__} leaves the finite numbers from x0={x0[row].tolist()}"
         )
-    return x
 
 
 def _smooth(
@@ -123,17 +190,11 @@ def _fixed_step(
     batch, nx = x0.shape
     path = np.empty((len(mesh.nodes), 2, batch, nx))  # the states and their slopes at the nodes
     stages = np.empty((1 + len(DOP853.B), batch, nx))  # the state, then the slopes of the stages
-    flat = stages.reshape(len(stages), -1)
     stages[0] = x0
     for k, step in enumerate(mesh.steps):
-        t = np.minimum(mesh.nodes[k] + step * DOP853.C, last)
-        u = system.input(t)
-        weights = _tableau(step)
-        for i, row in enumerate(weights[:-1]):
-            stage = np.dot(row, flat[: i + 1]).reshape(batch, nx)
-            stages[i + 1] = system.f(t[i], stage, u[i])
-        path[k] = stages[:2]
-        np.dot(weights[-1], flat, out=flat[0])
+        path[k, 0] = stages[0]
+        _take_step(system, mesh.nodes[k], step, last, stages)
+        path[k, 1] = stages[1]
     path[-1, 0] = stages[0]
     path[-1, 1] = system.f(last, stages[0], system.input(last))
     flat = path.reshape(2 * len(path), -1)

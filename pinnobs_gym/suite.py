@@ -17,6 +17,7 @@ from typing import Any
 import joblib
 
 from pinnobs_gym import env_id
+from pinnobs_gym.conditions import fitting
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.evaluation import (
@@ -98,7 +99,7 @@ def jobs_of(
     estimators: Sequence[str],
     *,
     setup: str,
-    condition: str | None,
+    conditions: Sequence[str],
     episodes: int,
     trained_episodes: int,
     seed: int,
@@ -107,10 +108,13 @@ def jobs_of(
 ) -> list[Job]:
     """The jobs of a cross of systems and estimators, the longest first.
 
-    Under a condition of None every system is played under nominal ones, and under those it is
-    ranked under if these are others. Estimators that train on each record get their own, smaller
+    Without conditions every system is played under the nominal one, and under that it is ranked
+    under if this is another. ``all`` stands for these and, for estimators that need no training,
+    for all others that fit the system. Estimators that train on each record get their own, smaller
     number of episodes, a job each.
     """
+    if "all" in conditions and len(conditions) > 1:
+        raise ValueError(f"conditions {' '.join(conditions)}: 'all' stands alone")
     quick, long = [], []
     for estimator in estimators:
         cls = ESTIMATORS.resolve(estimator)
@@ -118,7 +122,12 @@ def jobs_of(
             raise ValueError(f"estimator {estimator!r} knows one record; it cannot be ranked")
         for system in systems:
             name, ranked = env_id(system), SYSTEMS.resolve(system).ranked_condition
-            played = list(dict.fromkeys(["nominal", ranked])) if condition is None else [condition]
+            played = list(dict.fromkeys(["nominal", ranked]))
+            if list(conditions) != ["all"]:
+                played = list(dict.fromkeys(conditions)) or played
+            elif cls.needs_training is None and cls.trains_on_record is None:
+                model, chosen = SYSTEMS.resolve(system).configured(setup)
+                played += [name for name in fitting(model, chosen) if name not in played]
             for each in played:
                 # A bad combination is refused before any run.
                 source = make_vector_env(name, 1, setup, each).source

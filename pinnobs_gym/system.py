@@ -109,6 +109,8 @@ class System(ABC):
     """Version of the env id ``pinnobs/<class name>-v<version>``."""
     ranked_condition: ClassVar[str] = "nominal"
     """The condition under which the leaderboard ranks estimators on this system."""
+    uncertain: ClassVar[tuple[str, ...] | None] = None
+    """Parameters that may be off under the conditions of mismatch; all that are numbers if None."""
     model_step: ClassVar[float | None] = None
     """Longest Runge-Kutta step in s of model-based estimators; the benchmark's dt if None."""
 
@@ -228,6 +230,9 @@ class System(ABC):
                     vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
         except ValueError as error:
             raise TypeError(f"system {cls.__name__}: {error}") from None
+        unknown = [name for name in cls.uncertain or () if name not in cls().parameters]
+        if unknown:
+            raise TypeError(f"system {cls.__name__}: uncertain names no parameter {unknown[0]!r}")
 
 
 def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:

@@ -19,10 +19,11 @@ from machine import processor
 from reproduction import report as paper
 from reproduction.tables import TABLES
 
-from pinnobs_gym import leaderboard, rows
+from pinnobs_gym import overview, rows
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.figures import state_figure
+from pinnobs_gym.leaderboard import markdown_table
 from pinnobs_gym.report import replacing, write_figure
 
 ROOT = Path(__file__).parents[1]
@@ -51,23 +52,19 @@ def picture(path: Path, seed: int = 3) -> None:
     write_figure(path, figure)
 
 
-def summary(tables: list[leaderboard.Table]) -> str:
-    """A line per system and estimator: divergence, settling, NRMSE and tail."""
+def summary(scored: list[rows.Row]) -> str:
+    """A line per estimator across the systems, and the table of ranks if there is one."""
     date = datetime.now(UTC).date().isoformat()
-    lines = [
+    told = (
         f"Measured on {date} with Python {platform.python_version()}, one thread a job "
-        f"({processor()}), by `make leaderboard`; medians of the episodes.",
-        "",
-        "| system | condition | estimator | track | episodes | diverged % | settled s | NRMSE | "
-        "tail NRMSE |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for table in tables:
-        name = table.env_id.removeprefix("pinnobs/")
-        for s, cells in zip(table.standings, leaderboard.cells(table, False), strict=True):
-            line = [name, table.condition, cells[1], s.track, str(s.episodes), *cells[4:8]]
-            lines.append("| " + " | ".join(line) + " |")
-    return "\n".join(lines)
+        f"({processor()}), by `make leaderboard`, which writes the details of each system to "
+        "`runs/leaderboard/leaderboard.md`."
+    )
+    parts = [told, overview.NOTE, markdown_table(*overview.cells(overview.lines(scored)))]
+    placed = overview.ranks(scored)
+    if len(placed) > 2:
+        parts += [overview.RANK_NOTE, markdown_table(*overview.rank_cells(placed))]
+    return "\n\n".join(parts)
 
 
 def replaced(text: str, name: str, content: str, heading: str) -> str:
@@ -103,8 +100,7 @@ def main(
     text = readme.read_text(encoding="utf-8")
     if scored:
         picture(ROOT / "docs" / "reverse_duffing.png")
-        table = summary(leaderboard.tables(scored))
-        text = replaced(text, "leaderboard", table, "## Leaderboard")
+        text = replaced(text, "leaderboard", summary(scored), "## Leaderboard")
     if section:
         text = replaced(text, "paper", section, PAPER_HEADING)
     with replacing(readme) as temporary:

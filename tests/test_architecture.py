@@ -23,6 +23,7 @@ ALLOWED = {
     "checks": {"checks", "system", "simulate", "estimator", "record"},
     "systems": {"system", "registry"},
     "bound": {"kalman", "metrics", "record", "simulate", "system"},
+    "consistency": {"estimator", "kalman"},
     "kalman": {"estimator", "record", "simulate", "system"},
     "gains": {"simulate", "system"},
     "least_squares": {"kalman", "simulate", "system"},

@@ -14,8 +14,10 @@ from PIL import Image
 
 from pinnobs_gym import rows
 from pinnobs_gym.cli import main
+from pinnobs_gym.conditions import CONDITIONS
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.suite import jobs_of
 
 QUICK = ["--systems", "ReverseDuffing", "--episodes", "4", "--jobs", "1"]
 
@@ -161,6 +163,42 @@ def test_leaderboard_prints_ranks_writes_and_resumes(folder, capsys):
     assert (folder / "lb" / "rows.jsonl").read_text() == stored
     assert "| ekf | online |" in (folder / "lb" / "leaderboard.md").read_text()
     assert list((folder / "lb" / "tensorboard").rglob("events.*"))
+
+
+def test_all_conditions_are_played_by_those_that_need_no_training(folder, capsys):
+    jobs = jobs_of(
+        ["ReverseDuffing", "InductionMotor"],
+        ["ekf", "pinn_gain", "pinn_obs"],
+        setup="benchmark",
+        conditions=["all"],
+        episodes=4,
+        trained_episodes=1,
+        seed=0,
+        folder=folder,
+        training={},
+    )
+    played = {
+        (system, estimator): [
+            job.condition for job in jobs if (job.system, job.estimator) == (system, estimator)
+        ]
+        for system in ("ReverseDuffing", "InductionMotor")
+        for estimator in ("ekf", "pinn_gain", "pinn_obs")
+    }
+    assert set(played["InductionMotor", "ekf"]) == set(CONDITIONS)
+    assert set(played["ReverseDuffing", "ekf"]) == set(CONDITIONS) - {"load_step"}
+    assert played["ReverseDuffing", "pinn_gain"] == played["ReverseDuffing", "pinn_obs"]
+    assert played["InductionMotor", "pinn_gain"] == ["nominal", "load_step"]
+
+
+def test_conditions_are_ranked(folder, capsys):
+    where = [*QUICK, "--estimators", "open_loop", "ekf", "--out", "lb"]
+    assert run("leaderboard", *where, "--condition", "nominal", "outliers+mismatch10") == 0
+    printed = capsys.readouterr().out
+    assert "Ranks" in printed
+    assert "outliers+mismatch10" in printed
+    text = (folder / "lb" / "leaderboard.md").read_text()
+    assert "| condition | ekf | open_loop |" in text
+    assert run("leaderboard", *where, "--condition", "all", "noise5") == 2
 
 
 def test_a_truncated_rows_file_is_refused_before_anything_runs(folder, capsys):

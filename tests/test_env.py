@@ -136,7 +136,16 @@ def test_unseeded_envs_differ() -> None:
     assert not np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("condition", ["nominal", "dropout30+noise5"])
+@pytest.mark.parametrize(
+    "condition",
+    [
+        "nominal",
+        "dropout30+noise5",
+        "mismatch30+outliers+delay2",
+        "process_noise1e-2+gap+xhat0_far",
+        "x0_outside+delay5",
+    ],
+)
 @pytest.mark.parametrize("name", IDS)
 def test_row_of_vector_env_is_the_single_env(name: str, condition: str) -> None:
     """Over several consecutive episodes: observations and initial states to the bit, later states

@@ -257,3 +257,64 @@ def test_block_diagonal_covariances_stay_apart():
     identity = np.eye(2)[..., None]
     x, _, _ = joseph_update(prior.mean, P, np.ones((1, 2)), identity, identity)
     np.testing.assert_allclose(x[0], 1 + np.diag(K))
+
+
+def short_record(name, **changes):
+    source = EpisodeSource(name, **changes)
+    record = record_of(source, 3)
+    return source, Record(record.t[:60], record.y[:, :60], record.u[:, :60], record.prior)
+
+
+@pytest.mark.parametrize("estimator", untrained())
+def test_without_any_output_the_model_alone_is_left(estimator):
+    """Every estimate is the model's from the prior's mean; of some filters, about it."""
+    source, record = short_record("Academic")
+    record = Record(record.t, np.full_like(record.y, np.nan), record.u, record.prior)
+    estimates = ESTIMATORS.resolve(estimator).for_setup(source.system, source.setup).run(record)
+    assert np.isfinite(estimates.xhat).all()
+    assert estimates.P is None or np.isfinite(estimates.P).all()
+    expected = OpenLoop(source.system).run(record).xhat
+    if estimator not in ("ukf", "ckf", "enkf", "particle"):  # whose mean moves with the spread
+        np.testing.assert_allclose(estimates.xhat, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("estimator", untrained())
+@pytest.mark.parametrize("name", ["Academic", "InductionMotor"])
+def test_a_singular_R_or_P0_is_taken(estimator, name):
+    """R is never below its floor, and what the prior knows exactly stays known."""
+    source, record = short_record(name)
+    cls = ESTIMATORS.resolve(estimator)
+    assert np.isfinite(cls(source.system, noise_std=0.0).run(record).xhat).all()
+    known = Record(record.t, record.y, record.u, Prior(record.prior.mean, 0 * record.prior.cov))
+    estimates = cls(source.system).run(known)
+    assert np.isfinite(estimates.xhat).all()
+    if estimator == "mhe":
+        np.testing.assert_array_equal(estimates.xhat[:, 0], record.prior.mean)
+
+
+@pytest.mark.parametrize("estimator", untrained())
+def test_an_indefinite_P0_is_refused_in_one_line(estimator):
+    source, record = short_record("Academic")
+    cls = ESTIMATORS.resolve(estimator)
+    cov = record.prior.cov.copy()
+    cov[1, 0, 0] = -1.0
+    wrong = Record(record.t, record.y, record.u, Prior(record.prior.mean, cov))
+    if cls(source.system).run(record).P is None:
+        assert np.isfinite(cls(source.system).run(wrong).xhat).all()  # it has no use for it
+        return
+    with pytest.raises(ValueError, match="P0 of row 1 has eigenvalue -1; expected a covariance"):
+        cls(source.system).run(wrong)
+
+
+def test_a_semidefinite_matrix_has_a_cholesky_factor_too():
+    rng = np.random.default_rng(0)
+    full = rng.standard_normal((4, 4))
+    thin = rng.standard_normal((4, 2))
+    gaps = np.diag([1.0, 0.0, 2.0, 0.0])
+    P = np.stack([full @ full.T, thin @ thin.T, gaps, 0 * gaps], axis=-1)
+    L = cholesky(P, semidefinite=True)
+    np.testing.assert_allclose(np.einsum("ikb,jkb->ijb", L, L), P, atol=1e-7)
+    assert (L[np.triu_indices(4, 1)] == 0).all()
+    with np.errstate(all="ignore"):
+        assert np.isnan(cholesky(P)[..., 3]).any()
+        assert np.isnan(cholesky(np.full((2, 2, 1), np.nan), semidefinite=True)).any()

@@ -137,3 +137,32 @@ def test_bad_input_is_one_clear_line(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         evaluate(arguments.pop("estimator"), arguments.pop("env_id"), **arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_the_reference_is_that_of_the_same_episodes():
+    """Least squares of noisy records without process noise attain it: errors at the last sample,
+    where smoother and filter are one, are as large as it says."""
+    ratios = [
+        row["reference_ratio_tail"]
+        for row in evaluate("mhe", "pinnobs/Academic-v0", episodes=60, options={"window": 60})
+    ]
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.25)
+
+
+def test_the_reference_knows_of_noise_gaps_and_process_noise():
+    """More noise, missing outputs and a disturbed state leave a filter that knows of it as near to
+    the reference as it was; one whose condition is not in the model has none."""
+    for condition, options in (
+        ("noise5", {}),
+        ("dropout50", {}),
+        ("process_noise1e-3", {"process_noise": 1e-3}),
+    ):
+        scored = evaluate(
+            "ekf", "pinnobs/Academic-v0", episodes=40, condition=condition, options=options
+        )
+        median = np.median([row["reference_ratio_tail"] for row in scored])
+        assert median == pytest.approx(1, abs=0.45), condition
+    (row,) = evaluate("ekf", "pinnobs/Academic-v0", episodes=1, condition="mismatch10")
+    assert row["reference_ratio"] is None
+    (row,) = evaluate("ekf", "pinnobs/Academic-v0", episodes=1, setup="paper")
+    assert row["reference_ratio"] is None

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
-from scipy.stats import binom
 
 from pinnobs_gym import leaderboard
-from pinnobs_gym.metrics import SCORES
+from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
 
 
 def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
@@ -11,6 +10,11 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
     return [
         {
             **dict.fromkeys(SCORES, value),
+            **dict.fromkeys(OPTIONAL_SCORES),
+            "ranked": True,
+            "nx": 2,
+            "options": {},
+            "training_seed": None,
             "nrmse_tail_modulo": value,
             "env_id": "pinnobs/X-v0",
             "setup": "benchmark",
@@ -40,35 +44,6 @@ def test_estimators_are_ranked_by_median_within_their_track():
     assert [s.estimator for s in table.standings] == ["better", "worse", "worst", "offline"]
     assert np.isinf(table.standings[2].nrmse.value)
     assert table.standings[2].diverged.value == pytest.approx(2 / 3)
-
-
-def test_the_median_interval_is_the_textbook_one():
-    # n = 100: the 40th and 61st smallest values; coverage 1 - 2 P(Binomial(100, 1/2) <= 39).
-    interval = leaderboard.median(np.arange(1.0, 101.0))
-    assert (interval.value, interval.low, interval.high) == (50.5, 40.0, 61.0)
-    assert 1 - 2 * binom.cdf(39, 100, 0.5) >= 0.95 > 1 - 2 * binom.cdf(40, 100, 0.5)
-
-
-def test_the_median_interval_covers_as_often_as_it_says():
-    rng = np.random.default_rng(0)
-    samples = rng.exponential(size=(2000, 25))
-    inside = [
-        m.low <= np.log(2) <= m.high for m in (leaderboard.median(sample) for sample in samples)
-    ]
-    assert 0.94 <= np.mean(inside) <= 0.99
-
-
-def test_infinite_scores_stay_in_the_median():
-    interval = leaderboard.median(np.array([1.0, np.inf, 2.0, np.inf, np.inf]))
-    assert np.isinf(interval.value)
-    assert interval.low == 1.0
-
-
-def test_wilsons_interval():
-    # Wilson 1927 as in Newcombe 1998, table I: 15 of 148, 95 %: 0.0624 to 0.1605.
-    interval = leaderboard.rate(15, 148)
-    assert interval.low == pytest.approx(0.0624, abs=5e-5)
-    assert interval.high == pytest.approx(0.1605, abs=5e-5)
 
 
 def test_markdown_has_a_table_per_game_with_all_columns():
@@ -104,3 +79,20 @@ def test_training_is_told_in_the_row():
 )
 def test_numbers(value, text):
     assert leaderboard.number(value) == text
+
+
+def test_optional_scores_are_shown_where_they_are(tmp_path):
+    facts = {"reference_ratio": 1.25, "anees": 1.5, "coverage": 0.876, "nis": 1.04}
+    (table,) = leaderboard.tables([*rows_of("ekf", [0.1] * 50, **facts), *rows_of("bare", [0.2])])
+    ekf, bare = (
+        dict(zip(leaderboard.HEADER, line, strict=True)) for line in leaderboard.cells(table)
+    )
+    # the band of 50 episodes and 2 states is 0.742 to 1.296
+    assert (ekf["/ CRR"], ekf["ANEES"], ekf["covers %"], ekf["NIS"]) == (
+        *("1.25", "1.5 ▲", "88", "1.04"),
+    )
+    assert ekf["tail / CRR"] == ""
+    assert {bare[name] for name in ("/ CRR", "ANEES", "covers %", "NIS", "corr.")} == {""}
+    for anees, shown in ((1.29, "1.29"), (0.7, "0.7 ▼"), (np.inf, "∞ ▲")):
+        (table,) = leaderboard.tables(rows_of("ekf", [0.1] * 50, anees=anees))
+        assert shown in leaderboard.cells(table)[0]

@@ -4,13 +4,14 @@ import multiprocessing
 import pytest
 
 from pinnobs_gym import rows
-from pinnobs_gym.metrics import SCORES
+from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
 
 
 def row(seed=0, **changes):
     scores = dict.fromkeys(SCORES, 0.5)
     names = dict.fromkeys(rows.KEY, "x")
-    base = {"schema": rows.SCHEMA, **names, **scores, "diverged": False, "episode_seed": seed}
+    facts = {"diverged": False, "episode_seed": seed, "ranked": True, "nx": 2}
+    base = {"schema": rows.SCHEMA, **names, **scores, **facts}
     return {**base, **changes}
 
 
@@ -28,6 +29,18 @@ def test_round_trip_keeps_infinity_as_valid_json(tmp_path):
     assert [r["episode_seed"] for r in back] == [0, 1, 2]
     assert back[0]["nrmse"] == float("inf")
     assert back[1]["nrmse"] == 0.5
+
+
+def test_optional_scores_are_absent_infinite_or_a_number(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    optional = dict.fromkeys(OPTIONAL_SCORES)
+    rows.append(path, [row(0, **{**optional, "anees": float("inf"), "nis": 1.5})])
+    assert '"anees": null' in path.read_text()
+    assert "coverage" not in path.read_text()
+    (back,) = rows.read(path)
+    assert back["anees"] == float("inf")
+    assert back["nis"] == 1.5
+    assert back["coverage"] is None
 
 
 def test_no_file_is_no_rows(tmp_path):
@@ -65,7 +78,7 @@ def test_rows_appended_after_a_cut_begin_on_a_line_of_their_own(tmp_path, cut):
 def test_another_schema_and_missing_fields_are_refused(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(schema=99)])
-    with pytest.raises(ValueError, match="schema 99; expected 1"):
+    with pytest.raises(ValueError, match="schema 99; expected 2: move the file"):
         rows.read(path)
     path.unlink()
     incomplete = row()

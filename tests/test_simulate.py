@@ -13,7 +13,8 @@ from array_api_compat import array_namespace
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from pinnobs_gym.simulate import model_step, model_step_jacobian, truth
+from pinnobs_gym.episodes import EpisodeSource
+from pinnobs_gym.simulate import disturbed_truth, model_step, model_step_jacobian, truth
 from pinnobs_gym.system import Setup, System, matrix, stack
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.academic import Academic
@@ -408,3 +409,21 @@ def test_known_input_is_taken_at_any_time() -> None:
 def test_measured_input_that_is_missing() -> None:
     with pytest.raises(ValueError, match="Linear has a measured input; u is missing"):
         model_step(Linear(measured_input=True), 0.0, 0.1, np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("condition", ["nominal", "load_step"])
+def test_a_truth_disturbed_by_nothing_is_the_truth(condition):
+    source = EpisodeSource("InductionMotor", condition=condition)
+    rngs = [np.random.default_rng(seed) for seed in range(3)]
+    plant = source.condition.plant(source.system, rngs)
+    x0 = np.random.default_rng(0).uniform(source.x0_low, source.x0_high, (3, 5))
+    expected = truth(plant, x0, source.times, source.setup.truth_step)
+    noise = np.zeros((len(source.times) - 1, 3, 5))
+    found = disturbed_truth(plant, x0, source.times, noise, source.setup.truth_step)
+    assert abs((found - expected) / np.array(plant.scale)).max() < 1e-8
+
+
+def test_a_disturbance_that_leads_out_of_the_finite_numbers_is_told():
+    noise = np.full((10, 1, 2), 1e200)
+    with pytest.raises(FloatingPointError, match="leaves the finite numbers from x0="):
+        disturbed_truth(ReverseDuffing(), np.ones((1, 2)), np.arange(11) * 0.1, noise)

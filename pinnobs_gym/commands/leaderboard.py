@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym import leaderboard, rows, suite
-from pinnobs_gym.console import console, print_table, progress
+from pinnobs_gym import leaderboard, overview, rows, suite
+from pinnobs_gym.console import console, print_grid, print_table, progress
 from pinnobs_gym.options import parse
 from pinnobs_gym.report import check_writable, replacing
 from pinnobs_gym.systems import SYSTEMS
@@ -23,8 +23,9 @@ class Leaderboard:
     """Names or module:Class of estimators; all that are known if empty."""
     setup: str = "benchmark"
     """Setup that is played."""
-    condition: str | None = None
-    """Condition; nominal, and the one that a system is ranked under, if none is given."""
+    condition: tuple[str, ...] = ()
+    """Conditions; nominal, and the one that a system is ranked under, if none is given. With "all",
+    those that need no training play every condition that fits the system as well."""
     episodes: int = 100
     """Episodes of each estimator and system."""
     trained_episodes: int = 5
@@ -51,7 +52,7 @@ class Leaderboard:
             self.systems or tuple(SYSTEMS.classes()),
             self.estimators or suite.default_estimators(),
             setup=self.setup,
-            condition=self.condition,
+            conditions=self.condition,
             episodes=self.episodes,
             trained_episodes=self.trained_episodes,
             seed=self.seed,
@@ -69,12 +70,21 @@ class Leaderboard:
         scored = rows.read(self.out / "rows.jsonl")
         suite.log_summaries(self.out, scored)
         tables = leaderboard.tables(scored)
-        for table in tables:
+        played = {job.condition for job in jobs}
+        shown = [table for table in tables if table.condition in played]
+        for table in shown if len(played) <= 2 else ():
             print_table(table)
-        console.print(leaderboard.NOTE)
+        console.print(leaderboard.NOTE if len(played) <= 2 else "")
+        print_grid("Across systems", *overview.cells(overview.lines(scored)))
+        console.print(overview.NOTE)
+        placed = overview.ranks(scored)
+        if len(placed) > 1:
+            print_grid("Ranks", *overview.rank_cells(placed))
+            console.print(overview.RANK_NOTE)
         path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
-            temporary.write_text(leaderboard.markdown(tables), encoding="utf-8")
+            text = overview.markdown(scored) + "\n" + leaderboard.markdown(tables)
+            temporary.write_text(text, encoding="utf-8")
         for what, where in (
             ("tables", path),
             ("rows", self.out / "rows.jsonl"),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import State
+from pinnobs_gym.estimator import Range, State
 from pinnobs_gym.kalman import GaussianEstimator, checked, divide, outer
 from pinnobs_gym.least_squares import root
 from pinnobs_gym.record import Prior
@@ -48,6 +48,7 @@ class EnKF(GaussianEstimator):
     """Of the random numbers."""
 
     name = "enkf"
+    tunable = {**GaussianEstimator.tunable, "inflation": Range(1.0, 1.1)}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import State
+from pinnobs_gym.estimator import Range, State
 from pinnobs_gym.gains import default_rate
 from pinnobs_gym.kalman import (
     GaussianEstimator,
@@ -39,6 +39,7 @@ class HighGain(GaussianEstimator):
     """θ in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "high_gain"
+    tunable = {"theta": Range(0.1, 1e3, log=True)}
 
     def __post_init__(self) -> None:
         super().__post_init__()

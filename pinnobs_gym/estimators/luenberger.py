@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import Estimator, Range, State
 from pinnobs_gym.gains import default_rate, injection, lmi_gain, placed_gain, settling_gain
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import model_step
@@ -37,6 +37,7 @@ class Luenberger(Estimator):
     """How fast errors should decay in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "luenberger"
+    tunable = {"rate": Range(0.1, 1e3, log=True)}
     knows = ("model", "prior")
 
     def __post_init__(self) -> None:

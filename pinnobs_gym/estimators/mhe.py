@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import State
+from pinnobs_gym.estimator import Range, State
 from pinnobs_gym.kalman import (
     GaussianEstimator,
     checked,
+    cholesky,
     divide,
     joseph_update,
     observe,
@@ -66,6 +67,7 @@ class MHE(GaussianEstimator):
     """Gauss-Newton steps at every sample; one is the real-time iteration of Diehl et al. 2005."""
 
     name = "mhe"
+    tunable = {**GaussianEstimator.tunable, "window": Range(2, 40, log=True)}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,21 +85,21 @@ class MHE(GaussianEstimator):
         if len(memory.t) == self.window:
             memory = self._moved(memory, t, u)
         memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
-        weight = divide(identity(self.system.nx), memory.P)
         start = memory.start
         fit = self._fit(memory, start)
-        innovation, _ = observe(self.system, fit.x[-1], y)
-        step, P = _step(fit, weight, memory.arrival - start)
+        innovation, H = observe(self.system, fit.x[-1], y)
+        step, P = _step(fit, memory.P, memory.arrival - start)
         for _ in range(self.steps - 1):
             start = start + step
             fit = self._fit(memory, start)
-            step, P = _step(fit, weight, memory.arrival - start)
+            step, P = _step(fit, memory.P, memory.arrival - start)
         start = start + step
         xhat = fit.x[-1] + np.einsum("ijb,bj->bi", fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
         memory = replace(memory, start=start)
+        S = _innovation_covariance(P, H, memory.R).transpose(2, 0, 1)
         P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, memory=memory)
+        return State(xhat, t, u, P, innovation, S, memory)
 
     def _fit(self, memory: Memory, start: np.ndarray) -> Fit:
         """The model's trajectory through the window from a state at its start."""
@@ -121,9 +123,20 @@ class MHE(GaussianEstimator):
         return replace(memory, arrival=arrival, P=P, start=start)
 
 
-def _step(fit: Fit, weight: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """S = HP⁻Hᵀ + R, (ny, ny, batch), of the covariance P after the update: R(R − HPHᵀ)⁻¹R."""
+    R = np.broadcast_to(R, (*R.shape[:2], P.shape[-1]))
+    S = product(divide(R, R - sandwich(H, P)), R)
+    return (S + S.transpose(1, 0, 2)) / 2
+
+
+def _step(fit: Fit, P: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The Gauss-Newton step (batch, nx) of the window's first state, with x̄ so far ahead of it, and
-    the covariance (nx, nx, batch) of where it leads."""
-    P = divide(identity(len(weight)), fit.information + weight)
-    right = fit.right + np.einsum("ijb,bj->ib", weight, ahead)
-    return np.einsum("ijb,jb->bi", P, right), P
+    the covariance (nx, nx, batch) of where it leads, (P̄⁻¹ + Λ)⁻¹ with Λ the information of the
+    window; without P̄⁻¹, because P̄ may be singular: what is known stays."""
+    L = cholesky(P, semidefinite=True)
+    L_transposed = L.transpose(1, 0, 2)
+    inner = identity(len(P)) + product(product(L_transposed, fit.information), L)
+    P = product(divide(L, inner), L_transposed)
+    right = fit.right - np.einsum("ijb,bj->ib", fit.information, ahead)
+    return ahead + np.einsum("ijb,jb->bi", P, right), P

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import Estimator, Range, State
 from pinnobs_gym.kalman import checked, factor
 from pinnobs_gym.least_squares import root
 from pinnobs_gym.record import Prior
@@ -57,6 +57,7 @@ class ParticleFilter(Estimator):
     """Of the random numbers."""
 
     name = "particle"
+    tunable = {"discount": Range(0.8, 0.999)}
 
     def __post_init__(self) -> None:
         if self.particles < 2:
@@ -80,7 +81,9 @@ class ParticleFilter(Estimator):
         if state.t is not None:
             x = model_step(self.system, state.t, t, x, state.u, u)
         missing = np.isnan(y)
-        yhat = np.einsum("nb,nbp->bp", np.exp(log_weights), np.asarray(self.system.h(x)))
+        outputs = np.where(missing, 0.0, np.asarray(self.system.h(x)))
+        yhat, S = _moments(np.exp(log_weights), outputs)
+        S = S + np.diag(self.output_variance)
         x, log_weights = self._tempered(x, log_weights, y, memory.sample)
         weights = np.exp(log_weights)
         xhat, P = _moments(weights, x)
@@ -89,7 +92,7 @@ class ParticleFilter(Estimator):
             x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
         memory = Memory(x, log_weights, memory.sample + 1)
         innovation = np.where(missing, 0.0, y - yhat)
-        return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, memory=memory)
+        return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 
     def _tempered(
         self, x: np.ndarray, log_weights: np.ndarray, y: np.ndarray, sample: int

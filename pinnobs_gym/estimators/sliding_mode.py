@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.estimator import Estimator, Range, State
 from pinnobs_gym.gains import default_rate, injection, settling_gain
 from pinnobs_gym.record import Prior
 from pinnobs_gym.simulate import model_step
@@ -35,6 +35,11 @@ class SlidingMode(Estimator):
     """ε over the standard deviation of the output noise."""
 
     name = "sliding_mode"
+    tunable = {
+        "rate": Range(0.1, 1e3, log=True),
+        "switching": Range(0.1, 100.0, log=True),
+        "layer": Range(0.5, 50.0, log=True),
+    }
 
     def __post_init__(self) -> None:
         for name in ("rate", "switching", "layer"):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import State
+from pinnobs_gym.estimator import Range, State
 from pinnobs_gym.kalman import (
     GaussianEstimator,
     checked,
@@ -38,6 +38,11 @@ class StrongTrackingEKF(GaussianEstimator):
     """What part of HPHᵀ is added to R."""
 
     name = "strong_tracking_ekf"
+    tunable = {
+        **GaussianEstimator.tunable,
+        "gamma": Range(1e-10, 1e-2, log=True),
+        "output_factor": Range(0.0, 3.0),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -74,6 +74,7 @@ class InductionMotor(System):
     scale = (100.0, 87.0, 0.65, 0.65, 270.0)
     state_bound = (470.0, 470.0, 1.1, 1.1, 310.0)
     ranked_condition = "load_step"
+    uncertain = ("R_s", "R_r", "J", "T_L")  # with M 10 % up the leakage factor would be negative
     model_step = 5e-4
     setups = {
         "benchmark": Setup(

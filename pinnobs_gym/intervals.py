@@ -1,0 +1,94 @@
+"""Numbers with their confidence intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binom, binomtest, trim_mean
+
+CONFIDENCE = 0.95
+REPLICATES = 2000
+"""Of a bootstrap."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def percent(self) -> Interval:
+        """The same in percent, rounded."""
+        return Interval(*(float(round(100 * part)) for part in (self.value, self.low, self.high)))
+
+    @property
+    def exp(self) -> Interval:
+        """That of the number of which this is the logarithm."""
+        with np.errstate(over="ignore"):
+            return Interval(*(float(np.exp(part)) for part in (self.value, self.low, self.high)))
+
+
+def median(values: np.ndarray) -> Interval:
+    """The median with its distribution-free interval from order statistics, which takes infinite
+    values as well (Conover, "Practical Nonparametric Statistics", section 3.2); the whole range
+    where there are too few values for it."""
+    ordered = np.sort(values)
+    low = max(int(binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)) - 1, 0)
+    return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[-1 - low]))
+
+
+def rate(hits: int, count: int) -> Interval:
+    """A proportion with Wilson's interval."""
+    interval = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(hits / count, float(interval.low), float(interval.high))
+
+
+def log_ratio(score: np.ndarray, peer: np.ndarray) -> np.ndarray:
+    """log(score/peer) of the same episodes; zero where both are infinite, which is a tie."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.log(score) - np.log(peer)
+    return np.where(score == peer, 0.0, ratio)
+
+
+def interquartile_mean(values: np.ndarray) -> np.ndarray:
+    """The mean over the last axis of what is left without the lowest and the highest quarter
+    (Agarwal et al. 2021). Infinite values are trimmed with the others; it is infinite where more of
+    them are on a side than are trimmed there, and not a number where that is so on both."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(trim_mean(values, 0.25, axis=-1))
+
+
+def improvement(values: np.ndarray) -> np.ndarray:
+    """The part of logarithms of ratios, over the last axis, that is below zero, a tie counting
+    half: the probability that a score is better than the peer's of the same episode."""
+    return np.mean((values < 0) + 0.5 * (values == 0), axis=-1)
+
+
+def bootstrapped(
+    strata: Sequence[np.ndarray], statistic: Callable[[np.ndarray], np.ndarray], seed: int = 0
+) -> Interval:
+    """A statistic of all values of some strata, with its interval from a stratified bootstrap.
+
+    In every stratum training seeds and episodes are drawn with replacement at levels of their own:
+    a replicate is of the drawn seeds on the drawn episodes (Efron & Tibshirani 1993, section 13.3,
+    for percentiles; Agarwal et al. 2021 for strata).
+
+    Args:
+        strata: one array (training seeds, episodes) per system.
+        statistic: of values (..., n) over the last axis.
+        seed: of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = []
+    for values in strata:
+        seeds, episodes = (rng.integers(0, size, (REPLICATES, size)) for size in values.shape)
+        drawn.append(values[seeds[:, :, None], episodes[:, None]].reshape(REPLICATES, -1))
+    found = np.sort(statistic(np.concatenate(drawn, axis=1)))
+    tail = int((1 - CONFIDENCE) / 2 * REPLICATES)
+    value = statistic(np.concatenate([values.ravel() for values in strata]))
+    return Interval(float(value), float(found[tail]), float(found[-1 - tail]))

@@ -1,0 +1,221 @@
+"""Estimators across systems and conditions, from stored scores. Nothing here runs an estimator."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.conditions import CONDITIONS
+from pinnobs_gym.intervals import (
+    Interval,
+    bootstrapped,
+    improvement,
+    interquartile_mean,
+    log_ratio,
+)
+from pinnobs_gym.leaderboard import Standing, markdown_table, number, standing
+from pinnobs_gym.rows import Row
+
+PEER = "ekf"
+"""The estimator that all are compared with."""
+
+Games = Mapping[str, Sequence[Row]]
+"""Rows of one estimator by what is played."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One estimator across systems."""
+
+    estimator: str
+    track: str
+    ratio: Interval | None
+    """exp of the interquartile mean, over all systems and episodes, of log(NRMSE/NRMSE of the
+    `PEER`), that of the same episode; None without common episodes."""
+    better: Interval | None
+    """Probability of a smaller NRMSE than the peer's of the same episode."""
+    games: Mapping[str, Standing]
+    """How it did on each game that it played."""
+    us_per_step: float
+    """Median over games."""
+
+    @property
+    def place(self) -> tuple[bool, int, float]:
+        """What lines are sorted by: online first, then those that played more, then the ratio."""
+        ratio = np.inf if self.ratio is None or np.isnan(self.ratio.value) else self.ratio.value
+        return self.track != "online", -len(self.games), ratio
+
+
+def lines(rows: Iterable[Row]) -> list[Line]:
+    """Every estimator on the systems under the conditions that these are ranked under, best first,
+    online before offline."""
+    contenders = _contenders(row for row in rows if row["ranked"])
+    peer = contenders.get(PEER, {})
+    found = []
+    for name, games in contenders.items():
+        standings = {game: standing(group) for game, group in games.items()}
+        strata = _strata(games, peer)
+        found.append(
+            Line(
+                estimator=name,
+                track=next(iter(games.values()))[0]["track"],
+                ratio=bootstrapped(strata, interquartile_mean).exp if strata else None,
+                better=bootstrapped(strata, improvement) if strata else None,
+                games=standings,
+                us_per_step=float(np.median([s.us_per_step for s in standings.values()])),
+            )
+        )
+    return sorted(found, key=lambda line: line.place)
+
+
+def ranks(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
+    """Each online estimator's rank under every condition, by the interquartile mean of
+    log(NRMSE/NRMSE of the `PEER`) over all systems and episodes; of those alone that played every
+    system that the peer did. By condition, in the order in which these are listed, and estimator.
+    """
+    online: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        if row["track"] == "online":
+            online[row["condition"]].append(row)
+    order = list(CONDITIONS)
+    found = {}
+    for condition in sorted(online, key=lambda c: (order.index(c) if c in order else 99, c)):
+        contenders = _contenders(online[condition])
+        peer = contenders.get(PEER, {})
+        values = {}
+        for name, games in contenders.items():
+            strata = _strata(games, peer)
+            if strata and len(strata) == len(peer):
+                value = float(interquartile_mean(np.concatenate([s.ravel() for s in strata])))
+                values[name] = np.inf if np.isnan(value) else value
+        if values:
+            found[condition] = {
+                name: 1 + sum(other < value for other in values.values())
+                for name, value in values.items()
+            }
+    return found
+
+
+def _contenders(rows: Iterable[Row]) -> dict[str, dict[str, list[Row]]]:
+    """Rows by the name of their estimator, and by what is played. Training seeds are of one name;
+    budgets of training are in it, and settings where they tell two of a name apart: all but those
+    that the most rows are of."""
+    groups: dict[tuple[str, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        budget = row["training"].get("config", {}).get("budget")
+        name = row["estimator"] if budget is None else f"{row['estimator']}, {budget:g} s"
+        settings = "" if row["training"] else json.dumps(row["options"], sort_keys=True)
+        game = row["env_id"].removeprefix("pinnobs/")
+        if row["condition"] != "nominal":
+            game += f" ({row['condition']})"
+        if row["setup"] != "benchmark":
+            game += f", {row['setup']}"
+        groups[name, settings][game].append(row)
+    found: dict[str, dict[str, list[Row]]] = {}
+    for (name, settings), games in sorted(groups.items(), key=_size, reverse=True):
+        found[f"{name} {settings}" if name in found else name] = dict(sorted(games.items()))
+    return found
+
+
+def _size(group: tuple[object, Games]) -> int:
+    """How many rows a group has."""
+    return sum(map(len, group[1].values()))
+
+
+def _strata(games: Games, peer: Games) -> list[np.ndarray]:
+    """For every game that both played, log(NRMSE/the peer's), shape (training seeds, episodes), of
+    the episodes that both played, all training seeds of one."""
+    strata = []
+    for game in sorted(games.keys() & peer.keys()):
+        theirs = {row["episode_seed"]: _score(row) for row in peer[game]}
+        own: dict[object, dict[int, float]] = defaultdict(dict)
+        for row in games[game]:
+            own[row["training_seed"]][row["episode_seed"]] = _score(row)
+        common = sorted(set(theirs).intersection(*own.values()))
+        if common:
+            mine = np.array([[scores[seed] for seed in common] for scores in own.values()])
+            strata.append(log_ratio(mine, np.array([theirs[seed] for seed in common])))
+    return strata
+
+
+def _score(row: Row) -> float:
+    return np.inf if row["diverged"] else row["nrmse"]
+
+
+NOTE = (
+    "Median NRMSE over the whole episode, under the condition that a system is ranked under; `div` "
+    "is the part of the episodes that diverged, which score infinity. Lines stand in the order of "
+    "`/ ekf`: the interquartile mean over all systems and episodes of log(NRMSE / the EKF's on the "
+    "same episode), as a factor, with its 95 % bootstrap interval. Infinite scores count: they are "
+    "trimmed only as part of the highest quarter. `better` is the part of the episodes with a "
+    "smaller NRMSE than the EKF's. Offline estimators see the whole record first."
+)
+"""How to read the overview."""
+
+
+def cells(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
+    """The overview's header and rows as text."""
+    games = sorted({game for line in found for game in line.games})
+    header = ["estimator", "track", "/ ekf", "better", *games, "µs/step"]
+    rows = []
+    for line in found:
+        shown = [_cell(line.games.get(game)) for game in games]
+        ratio = "" if line.ratio is None else _factor(line.ratio)
+        better = "" if line.better is None else f"{100 * line.better.value:.0f} %"
+        rows.append(
+            [line.estimator, line.track, ratio, better, *shown, number(line.us_per_step, 2)]
+        )
+    return header, rows
+
+
+def rank_cells(found: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[list[str]]]:
+    """The header and rows, as text, of a table of ranks: a column per estimator, those with the
+    better worst rank first, a row per condition, and last the worst."""
+    worst: dict[str, int] = {}
+    total: dict[str, int] = defaultdict(int)
+    for placed in found.values():
+        for name, rank in placed.items():
+            worst[name] = max(worst.get(name, 0), rank)
+            total[name] += rank
+    names = sorted(worst, key=lambda name: (worst[name], total[name]))
+    rows = [
+        [condition, *(str(placed.get(name, "")) for name in names)]
+        for condition, placed in found.items()
+    ]
+    return ["condition", *names], [*rows, ["worst", *(str(worst[name]) for name in names)]]
+
+
+RANK_NOTE = (
+    "Rank of each online estimator under every condition, by the same interquartile mean; of those "
+    "alone that played every system that the EKF did. Estimators stand in the order of their worst "
+    "rank."
+)
+"""How to read the table of ranks."""
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The overview and, if several conditions were played by estimators that can be ranked, the
+    table of ranks, in Markdown."""
+    parts = ["# Leaderboard\n", NOTE, "", markdown_table(*cells(lines(rows))), ""]
+    placed = ranks(rows)
+    if len(placed) > 1:
+        parts += ["# Conditions\n", RANK_NOTE, "", markdown_table(*rank_cells(placed)), ""]
+    return "\n".join(parts) + "\n"
+
+
+def _cell(s: Standing | None) -> str:
+    if s is None:
+        return ""
+    lost = f"div {s.diverged.percent.value:.0f} %" if s.diverged.value else ""
+    median = number(s.nrmse.value) if np.isfinite(s.nrmse.value) else ""
+    return ", ".join(filter(None, [median, lost]))
+
+
+def _factor(ratio: Interval) -> str:
+    if np.isnan(ratio.value):
+        return "?"
+    return f"{number(ratio.value, 2)} ({number(ratio.low, 2)}-{number(ratio.high, 2)})"
