@@ -22,6 +22,7 @@ ALLOWED = {
     "estimator": {"system", "record", "simulate"},
     "checks": {"checks", "system", "simulate", "estimator", "record"},
     "systems": {"system", "registry"},
+    "actions": {"estimator", "kalman", "simulate", "system"},
     "bound": {"kalman", "metrics", "record", "simulate", "system"},
     "kalman": {"estimator", "record", "simulate", "system"},
     "gains": {"simulate", "system"},
@@ -31,6 +32,7 @@ ALLOWED = {
     "network": {"system"},
     "quasi_newton": set(),
     "estimators": {
+        "actions",
         "estimator",
         "estimators",
         "gains",
@@ -51,6 +53,8 @@ ALLOWED = {
 """What a module or subpackage may import of ours; itself is a case of its own below."""
 FORBIDDEN = {
     "env": {"estimator", "estimators", "evaluation", "trainers"},
+    "wrappers": {"estimator", "estimators", "evaluation", "trainers"},
+    "sb3_env": {"estimator", "estimators", "evaluation", "trainers"},
     "episodes": {"env", "estimator", "estimators", "evaluation", "trainers"},
     "evaluation": {"trainers"},
 }
