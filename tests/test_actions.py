@@ -137,7 +137,7 @@ def test_typical_errors_of_a_linear_plant_are_kalmans() -> None:
 
 
 def test_kalman_gains_are_actions() -> None:
-    """On a linear plant the action that is Kalman's gain lies in [−1, 1] and gives its estimates."""
+    """On a linear plant Kalman's gain is an action in [−1, 1], and gives his estimates."""
     system, setup = Linear.configured()
     form = Gain(system, setup)
     rng = np.random.default_rng(0)
@@ -188,12 +188,12 @@ def test_improvement() -> None:
     """It is zero for a gain of zero, positive for the better of two and negative for the worse."""
     env = make(DUFFING, action_mode="gain", reward="improvement")
     _, info = env.reset(seed=3)
-    sigma, root_S = typical(env.unwrapped.source.system, env.unwrapped.source.setup)
+    sigma, _ = typical(env.unwrapped.source.system, env.unwrapped.source.setup)
     assert env.step(np.zeros(2))[1] == 0
     observation, info = env.reset(seed=3)
     before = info["xhat0"] - info["state"]
     nis = np.sinh(observation[0]) ** 2
-    after = before + [0.5 * sigma[0][0] * np.sinh(observation[0]), 0]
+    after = before + np.array([0.5 * sigma[0][0] * np.sinh(observation[0]), 0])
     expected = np.mean((before**2 - after**2) / sigma[0] ** 2) / (1 + nis)
     assert env.step(np.array([0.5, 0.0]))[1] == pytest.approx(expected, rel=1e-5)
     assert expected > 0
@@ -221,6 +221,7 @@ def test_row_of_vector_env_is_the_single_env_and_the_wrapped_one(name: str, mode
     singles = [make(IDS[name], **short(name), **arguments) for _ in range(2)]
     wrapped = [wrappers[mode](make(IDS[name], **short(name))) for _ in range(2)]
     rng = np.random.default_rng(0)
+    actions = np.zeros((2, *singles[0].action_space.shape))
     for episode, k in itertools.product(range(3), range(13)):
         if k == 0:
             both = [
@@ -234,7 +235,7 @@ def test_row_of_vector_env_is_the_single_env_and_the_wrapped_one(name: str, mode
         for i in range(2):
             assert np.array_equal(both[i][0], both[i][1])
             np.testing.assert_allclose(observations[i], both[i][0], rtol=1e-5, atol=1e-6)
-        actions = rng.uniform(-1, 1, (2, *singles[0].action_space.shape))
+        actions = rng.uniform(-1, 1, actions.shape)
         if k == 12:
             break
         observations, rewards, _, truncated, _ = envs.step(actions)
