@@ -103,7 +103,7 @@ class Form(ABC):
     def look(
         self, memory: Memory, t: np.ndarray, y: np.ndarray, u: np.ndarray
     ) -> tuple[np.ndarray, Memory]:
-        """The features (batch, num_features), in single precision, of the samples at times t.
+        """The features (batch, num_features) of the samples at times t.
 
         Args:
             memory: after the action before.
@@ -114,7 +114,7 @@ class Form(ABC):
         outputs = np.concatenate([y[:, None], memory.y[:, :-1]], axis=1)
         memory = self._predicted(replace(memory, y=outputs), t, u)
         memory = replace(memory, t=t, u=u)
-        return self._features(memory).astype(np.float32), memory
+        return self._features(memory), memory
 
     def _predicted(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
         """With what the model says of the samples at times t, whose outputs are there already."""

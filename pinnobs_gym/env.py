@@ -421,7 +421,8 @@ class AgentSide:
     def look(self, samples: np.ndarray, k: np.ndarray) -> np.ndarray:
         """The observations (batch, features) of the next samples; arguments as in `begin`."""
         with np.errstate(all="ignore"):  # rows whose action was not finite
-            self._features, self._memory = self.form.look(self._playing, *self._sample(samples, k))
+            features, self._memory = self.form.look(self._playing, *self._sample(samples, k))
+        self._features = features.astype(np.float32)
         return self._features.copy()
 
     def act(self, actions: np.ndarray) -> np.ndarray:
