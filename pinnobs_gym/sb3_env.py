@@ -23,8 +23,10 @@ class Sb3VecEnv(VecEnv):
 
     Args:
         env: the env; its autoreset is not used.
-        spread: cut the first episode of row i of n short after the (i+1)/n-th part of it, so that
-            a batch of rows holds samples of all times in an episode from then on.
+        spread: cut episodes short, so that a batch of rows holds samples of all times in an
+            episode, and more of the first ones, where most happens. Of n rows, those of even
+            number i play whole episodes but for their first, which ends after the part s = (i+1)/n;
+            those of odd number end every episode after the part s².
     """
 
     def __init__(self, env: EstimationVectorEnv, *, spread: bool = False) -> None:
@@ -45,9 +47,11 @@ class Sb3VecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         last = self.env.source.setup.num_steps
-        parts = np.arange(1, self.num_envs + 1) / self.num_envs
-        ends = np.maximum(1, np.round(parts * last)).astype(int)
-        self._cut = ends if self._spread else np.full(self.num_envs, last)
+        part = np.arange(1, self.num_envs + 1) / self.num_envs
+        early = np.arange(self.num_envs) % 2 == 1
+        first = np.where(early, part**2, part) if self._spread else np.ones(self.num_envs)
+        later = np.where(early, part**2, 1.0) if self._spread else first
+        self._cut, self._later = (np.ceil(p * last).astype(int) for p in (first, later))
         self._steps = np.zeros(self.num_envs, dtype=int)
         return observations
 
@@ -69,7 +73,7 @@ class Sb3VecEnv(VecEnv):
                 }
             observations, _ = self.env.reset(options={"reset_mask": over})
             self._steps[over] = 0
-            self._cut[over] = self.env.source.setup.num_steps
+            self._cut[over] = self._later[over]
         return observations, rewards.astype(np.float32), over, infos
 
     def close(self) -> None:

@@ -53,12 +53,13 @@ def train(
         progress: show a bar in the terminal.
 
     Raises:
-        ValueError: in one line, if recurrent_ppo is wanted without sb3-contrib, or the checkpoint
-            or its normalisation is missing or damaged, or of another system, algorithm, action mode
-            or major version of SB3.
+        ValueError: in one line, if settings do not fit each other, recurrent_ppo is wanted without
+            sb3-contrib, or the checkpoint or its normalisation is missing or damaged, or of another
+            system, algorithm, action mode or major version of SB3.
     """
     if resume and checkpoint is None:
         raise ValueError("resume=True without a checkpoint; name its file")
+    config = config.tuned()
     begun = time.process_time()
     if resume and checkpoint is not None:
         training = restore(system, config, played, checkpoint)

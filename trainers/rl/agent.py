@@ -97,7 +97,7 @@ def begin(system: System, config: Config, played: Played) -> Training:
     """An agent that knows nothing, and the env that it is to play."""
     venv = _venv(config, played, played.seed)
     env = VecNormalize(
-        venv, norm_reward=config.action_mode == "normalized", gamma=float(config.gamma or 0.0)
+        venv, norm_reward=config.action_mode == "normalized", gamma=config.gamma or 0.0
     )
     shape: Any = env.action_space.shape
     policy = "MlpLstmPolicy" if config.algorithm == "recurrent_ppo" else "MlpPolicy"

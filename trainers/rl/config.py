@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
 from pinnobs_gym.training import expect
@@ -97,17 +98,34 @@ class Config:
         for name, kind in (("algorithm", Algorithm), ("action_mode", Mode)):
             known = get_args(kind)
             expect(self, name, " or ".join(known), lambda v, known=known: v in known)
-        for name, value in TUNED[self.algorithm, self.action_mode].items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
-        counts = ("steps", "rows", "rollout", "batch", "epochs", "width", "stack")
-        for name in (*counts, "held_out", "check_every"):
-            expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
+        for name in ("steps", "held_out", "check_every", *_COUNTS):
+            self._expect(name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
         for name in ("seed", "buffer"):
-            expect(self, name, "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
-        expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
-        expect(self, "gamma", "a number from 0 to 1", lambda v: 0 <= v <= 1)
-        expect(self, "log_std", "a finite number", math.isfinite)
-        expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
+            self._expect(name, "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
+        self._expect("learning_rate", "a positive number", lambda v: 0 < v < math.inf)
+        self._expect("gamma", "a number from 0 to 1", lambda v: 0 <= v <= 1)
+        self._expect("log_std", "a finite number", math.isfinite)
+        self._expect("budget", "None or positive seconds", lambda v: v > 0)
         if self.action_mode != "normalized":
-            expect(self, "stack", "1, since there is a prediction", lambda v: v == 1)
+            self._expect("stack", "1, since there is a prediction", lambda v: v == 1)
+
+    def _expect(self, name: str, expected: str, fits: Callable[[Any], bool]) -> None:
+        expect(self, name, expected, lambda v: v is None or fits(v))
+
+    def tuned(self) -> Config:
+        """The same with every None but the budget replaced by the tuned default.
+
+        Raises:
+            ValueError: in one line, if settings do not fit each other.
+        """
+        defaults = TUNED[self.algorithm, self.action_mode]
+        left = {n: v for n, v in defaults.items() if getattr(self, n) is None}
+        config = replace(self, **left)
+        if self.algorithm in ("ppo", "recurrent_ppo"):
+            samples: int = config.rows * config.rollout  # pyright: ignore
+            expected = f"a divisor of rows·rollout = {samples}"
+            expect(config, "batch", expected, lambda v: v > 1 and samples % v == 0)
+        return config
+
+
+_COUNTS = ("rows", "rollout", "batch", "epochs", "width", "stack")
