@@ -15,7 +15,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +30,7 @@ from pinnobs_gym.log import Log
 from pinnobs_gym.report import check_writable
 from pinnobs_gym.rows import Row
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.trained_file import check_same
 from trainers.rl import Config
 
 
@@ -80,7 +81,9 @@ class Main:
                     progress=sys.stdout.isatty(),
                 )
             trained.save(path)
-        return Sb3.load(path, system)
+        made = Sb3.load(path, system)
+        check_same(path, made.trained.config, asdict(config.tuned()))
+        return made
 
     def _score(self, name: str, estimator: Estimator | str, label: str) -> None:
         results = self.out / "rows.jsonl"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_env import make
 
-from pinnobs_gym import cli, evaluate
+from pinnobs_gym import cli, env_id, evaluate
 from pinnobs_gym.checks import check_estimator
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
 from pinnobs_gym.log import Log
@@ -20,7 +25,7 @@ from pinnobs_gym.suite import TRAINING_SEED, Played, train
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from trainers.rl import Config
-from trainers.rl.agent import begin
+from trainers.rl.agent import begin, options
 
 DUFFING = Played("pinnobs/ReverseDuffing-v0", "benchmark", "nominal", TRAINING_SEED)
 SMALL = {"steps": 512, "rows": 4, "rollout": 16, "batch": 32, "epochs": 2, "width": 8}
@@ -263,3 +268,52 @@ def test_bad_checkpoints(tmp_path: Path) -> None:
 def test_bad_settings(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         Config(**arguments).tuned()
+
+
+# Scripts and hyperparameter files
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
+def test_the_zoos_files_name_all_envs_and_hold_our_defaults(algorithm: str) -> None:
+    read = yaml.safe_load((SCRIPTS / "zoo" / f"{algorithm}.yml").read_text(encoding="utf-8"))
+    assert set(read) == {env_id(cls) for cls in SYSTEMS.classes().values()}
+    config = Config(algorithm=algorithm).tuned()  # pyright: ignore
+    chosen = options(config, 2)
+    for name, held in read.items():
+        ((path, arguments),) = held["env_wrapper"][0].items()
+        module, _, wrapper = path.rpartition(".")
+        env = getattr(importlib.import_module(module), wrapper)(make(name), **arguments)
+        assert env.action_space.high.max() == 1
+        assert (held["n_envs"], held["n_timesteps"]) == (config.rows, config.steps)
+        schedule, rate = held["learning_rate"].split("_")
+        assert (schedule, float(rate)) == ("lin", config.learning_rate)
+        policy = eval(held["policy_kwargs"], {"nn": torch.nn, "dict": dict})  # as the Zoo does
+        assert policy == {**chosen["policy_kwargs"], **policy}
+        rest = set(held) & set(chosen) - {"learning_rate", "policy_kwargs"}
+        assert {"batch_size", "gamma"} < rest
+        assert all(held[key] == chosen[key] for key in rest)
+        if algorithm == "td3":
+            assert held["noise_std"] == pytest.approx(chosen["action_noise"]._sigma[0], abs=1e-4)
+
+
+def test_the_script_trains_scores_and_goes_on(tmp_path: Path) -> None:
+    arguments = ["--system", "ReverseDuffing", "--episodes", "3", "--out", str(tmp_path)]
+    arguments += [f"--{n.replace('_', '-')}={v}" for n, v in SMALL.items()]
+
+    def run(*more: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(SCRIPTS / "train_rl.py"), *arguments, *more]
+        return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+    first = run()
+    assert first.returncode == 0, first.stderr
+    lines = [line.split()[:3] for line in first.stdout.splitlines()[1:]]
+    assert [line[1] for line in lines] == ["open_loop", "ekf", "ppo"]
+    files = {p: p.stat().st_mtime_ns for p in tmp_path.glob("*.pt")}
+    assert run().stdout == first.stdout
+    assert files == {p: p.stat().st_mtime_ns for p in tmp_path.glob("*.pt")}
+    other = run("--width=9")
+    assert other.returncode != 0
+    assert "trained with width=8; expected 9" in other.stderr
+    assert "Traceback" not in other.stderr
