@@ -49,7 +49,7 @@ def figures(repeats: int) -> Iterator[Figure]:
             yield limited(
                 f"over the model alone's {open_loop:.4g}, {about}", over, 0.1 if own else None
             )
-            yield at_most(f"steps of training, {about}", trained.iterations, "", 300_000 + FRAMES)
+            yield at_most(f"steps of training, {about}", trained.iterations, "", 300_000)
             yield at_most(f"training, {about}", trained.seconds, "CPU s", 600.0)
             if own and not seed:
                 yield reproduced(name, trained)

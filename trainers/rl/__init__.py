@@ -70,7 +70,9 @@ def train(
     model.set_logger(
         Logger(None, []) if folder is None else configure(str(folder), ["tensorboard"])
     )
-    left = config.steps - model.num_timesteps
+    rollout: int = config.rows * config.rollout  # pyright: ignore[reportOptionalOperand]
+    whole = max(1, config.steps // rollout) * rollout  # SB3 would round up
+    left = whole - model.num_timesteps
     with bar(config.steps if progress else None) as show, interruption() as stopped:
         watch = Watch(training, begun, checkpoint, show, stopped)
         try:

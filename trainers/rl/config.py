@@ -60,7 +60,7 @@ class Config:
     action_mode: Mode = "gain"
     """What the agent's actions mean; see `pinnobs_gym.actions`."""
     steps: int = 300_000
-    """Steps of training, those of all rows together."""
+    """Most steps of training, those of all rows together; only whole rollouts are made."""
     rows: int | None = None
     """Episodes that are played side by side."""
     learning_rate: float | None = None
