@@ -127,18 +127,6 @@ class Form(ABC):
     def act(self, memory: Memory, actions: np.ndarray) -> Memory:
         """The memory with the estimates that actions (batch, ...) mean."""
 
-    def improvement_fits(self) -> None:
-        """Whether `improvement` has a meaning.
-
-        Raises:
-            ValueError: in one line, if it has none.
-        """
-        raise ValueError(f"reward='improvement' needs a prediction; {self.name!r} has none")
-
-    def improvement(self, memory: Memory, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """How much nearer to the true states x (batch, nx) estimates are than predictions."""
-        raise NotImplementedError
-
     def checked(self, actions: np.ndarray) -> np.ndarray:
         """Actions (batch, ...) in double precision.
 
@@ -190,6 +178,11 @@ class Normalized(Estimate):
 
     def act(self, memory: Memory, actions: np.ndarray) -> Memory:
         return replace(memory, xhat=self.bound * self.checked(actions))
+
+    def _features(self, memory: Memory) -> np.ndarray:
+        """Those of `Estimate`, but zero where an output is missing, which no network takes."""
+        features = super()._features(memory)
+        return np.where(np.isnan(features), 0.0, features)
 
 
 class Gain(Form):
@@ -245,9 +238,6 @@ class Gain(Form):
         largest = OUTSIDE * self.bound
         xhat = memory.xhat + share * self.sigma[self._samples(memory.t, memory)]
         return replace(memory, xhat=np.clip(xhat, -largest, largest))
-
-    def improvement_fits(self) -> None:
-        """It has: there is a prediction to improve on."""
 
     def improvement(self, memory: Memory, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
         """By how much the correction lessened the squared error, over the typical one, (batch,).

@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from pinnobs_gym.env import AgentSide, EstimationEnv
+from pinnobs_gym.agent_side import AgentSide
+from pinnobs_gym.env import EstimationEnv
 
 
 class _Wrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):

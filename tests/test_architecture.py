@@ -53,6 +53,7 @@ ALLOWED = {
 """What a module or subpackage may import of ours; itself is a case of its own below."""
 FORBIDDEN = {
     "env": {"estimator", "estimators", "evaluation", "trainers"},
+    "agent_side": {"env", "estimator", "estimators", "evaluation", "trainers"},
     "wrappers": {"estimator", "estimators", "evaluation", "trainers"},
     "sb3_env": {"estimator", "estimators", "evaluation", "trainers"},
     "episodes": {"env", "estimator", "estimators", "evaluation", "trainers"},
@@ -146,6 +147,12 @@ def test_nothing_imports_the_roof(module: str) -> None:
 def test_tables_name_modules_that_exist() -> None:
     tops = {name.split(".")[0] for name in modules()}
     assert set(ALLOWED) | set(FORBIDDEN) <= tops
+
+
+def test_finding_estimators_loads_no_agents_library() -> None:
+    code = "import sys; from pinnobs_gym.estimators import ESTIMATORS; ESTIMATORS.classes(); "
+    code += "sys.exit('stable_baselines3' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("heavy", ["torch", "matplotlib", "stable_baselines3"])

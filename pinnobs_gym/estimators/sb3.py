@@ -199,7 +199,7 @@ class Sb3(Estimator):
         else:
             memory, hidden = state.memory
         features, memory = self._form.look(memory, now, y, u)
-        actions, hidden = self.trained.act(np.nan_to_num(features), hidden)
+        actions, hidden = self.trained.act(features, hidden)
         memory = self._form.act(memory, actions)
         return State(memory.xhat, t, u, memory=(memory, hidden))
 

@@ -11,16 +11,12 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from stable_baselines3.common.logger import Logger, configure
-
 from pinnobs_gym.estimators.sb3 import TrainedAgent
 from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.suite import Played
 from pinnobs_gym.system import System
 from pinnobs_gym.training import bar, interruption
-from trainers.rl.agent import begin, restore
 from trainers.rl.config import Config
-from trainers.rl.watch import Watch
 
 __all__ = ["Config", "train"]
 
@@ -57,6 +53,12 @@ def train(
             sb3-contrib, or the checkpoint or its normalisation is missing or damaged, or of another
             system, algorithm, action mode or major version of SB3.
     """
+    # Everything that looks for estimators imports this module: SB3 is only loaded where it is used.
+    from stable_baselines3.common.logger import Logger, configure
+
+    from trainers.rl.agent import begin, restore
+    from trainers.rl.watch import Watch
+
     if resume and checkpoint is None:
         raise ValueError("resume=True without a checkpoint; name its file")
     config = config.tuned()
@@ -70,7 +72,9 @@ def train(
     model.set_logger(
         Logger(None, []) if folder is None else configure(str(folder), ["tensorboard"])
     )
-    rollout: int = config.rows * config.rollout  # pyright: ignore[reportOptionalOperand]
+    assert config.rows is not None
+    assert config.rollout is not None
+    rollout = config.rows * config.rollout
     whole = max(1, config.steps // rollout) * rollout  # SB3 would round up
     left = whole - model.num_timesteps
     with bar(config.steps if progress else None) as show, interruption() as stopped:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ from trainers.rl.config import Config
 
 SEEDS_APART = 1000
 """From the first seed of an agent's episodes to that of the agent trained with the next seed."""
+RESUMED = 10**9
+"""From these first seeds to those of episodes that are played after a resumption."""
 LAST_RATE = 0.02
 """The learning rate in the end, over that at first."""
 FACTS = "pinnobs"
@@ -126,7 +129,7 @@ def restore(system: System, config: Config, played: Played, checkpoint: Path) ->
         ) from None
     check_same(checkpoint, facts, _facts(system, config))
     # Other episodes than those played so far: the state of the env is not in the checkpoint.
-    venv = _venv(config, played, played.seed + model.num_timesteps)
+    venv = _venv(config, played, played.seed + RESUMED + model.num_timesteps)
     try:
         env = VecNormalize.load(str(parts["normalization"]), venv)
     except Exception as error:
@@ -200,7 +203,7 @@ def _layers(policy: Any) -> tuple[tuple[Layer, ...], bool, tuple[Layer, Layer] |
     return layers, False, ((W, b), (V, c))
 
 
-def _linear(parts: list[nn.Module]) -> tuple[Layer, ...]:
+def _linear(parts: Sequence[nn.Module]) -> tuple[Layer, ...]:
     found = [m for part in parts for m in part.modules() if isinstance(m, nn.Linear)]
     return tuple((_array(m.weight), _array(m.bias)) for m in found)
 

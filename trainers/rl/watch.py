@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +86,6 @@ class Watch(BaseCallback):
 
     def result(self) -> TrainedAgent:
         """The best agent, with what all of the training took."""
-        from dataclasses import asdict, replace
-
         if self._training.best is None or self._looked != self._training.model.num_timesteps:
             self.look()
         best = self._training.best
