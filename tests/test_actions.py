@@ -169,6 +169,16 @@ def test_a_missing_output_corrects_nothing() -> None:
     assert form.act(memory, np.ones((1, 2))).xhat.tolist() == [[1.0, 1.0]]
 
 
+@pytest.mark.parametrize("mode", OTHERS)
+def test_observations_are_finite_where_outputs_are_missing(mode: str) -> None:
+    env = make(DUFFING, action_mode=mode, condition="dropout50")
+    raw = make(DUFFING, condition="dropout50")
+    raw.reset(seed=0)
+    seen = [env.reset(seed=0)[0], *(env.step(np.zeros(2))[0] for _ in range(20))]
+    assert np.isfinite(seen).all()
+    assert any(np.isnan(raw.step(np.zeros(2))[0]).any() for _ in range(20))
+
+
 def test_estimates_stay_in_bounds() -> None:
     env = make(DUFFING, action_mode="gain")
     env.reset(seed=0)
