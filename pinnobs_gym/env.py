@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from pinnobs_gym.agent_side import AgentSide
 from pinnobs_gym.episodes import Changes, Draws, Episodes, EpisodeSource, Stream
 from pinnobs_gym.figures import EpisodePicture
 from pinnobs_gym.record import Prior, Record
@@ -33,10 +34,17 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
     ends the episode with `NOT_FINITE_REWARD`; otherwise only the time limit ends it. The
     observation after the last action is never scored.
 
+    For agents that learn, ``action_mode`` gives actions another meaning and, with it, observations:
+    `pinnobs_gym.actions` has the forms. What they make of an action is then the estimate.
+
     Args:
         system: name, ``module:Class`` or class of the system.
         setup: ``benchmark`` or ``paper``.
         condition: how episodes depart from the setup; see `pinnobs_gym.conditions`.
+        action_mode: ``estimate``, ``normalized``, ``gain`` or ``correction``.
+        reward: ``error``, as above, or ``improvement`` on the model's prediction, for training with
+            actions that are gains or corrections; see `pinnobs_gym.actions.Gain.improvement`.
+        stack_outputs: how many of the last outputs an observation holds.
         render_mode: ``rgb_array`` or ``human``.
         changes: ``dt``, ``duration``, ``noise_std``, ``parameters``; see `Changes`.
 
@@ -53,13 +61,18 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         setup: str = "benchmark",
         condition: str = "nominal",
         *,
+        action_mode: str = "estimate",
+        reward: str = "error",
+        stack_outputs: int = 1,
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
         _check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)
-        self.observation_space, self.action_space = _spaces(self.source.system)
+        self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)
+        self.observation_space = self.agent.form.observation_space
+        self.action_space = self.agent.form.action_space
         self._weights = _reward_weights(self.source.system)
         self._num_steps = self.source.setup.num_steps
         self._k = 0
@@ -92,7 +105,10 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode == "human":
             self.render()
         info = {"state": self._x[0].copy(), "xhat0": prior.mean[0], "P0": prior.cov[0]}
-        return self._observations[0].copy(), info
+        if self.agent.plain:
+            return self._observations[0].copy(), info
+        first = self.agent.begin(prior.mean, self._observations[:1], np.zeros(1, dtype=int))
+        return first[0], info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         k = self._k
@@ -100,11 +116,15 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
             raise RuntimeError("the episode is over; call reset before step")
         estimate = np.asarray(action, dtype=float)
         x = self._x[k]
-        if estimate.shape != x.shape:
+        if not self.agent.plain:
+            estimate = self.agent.act(estimate[None])[0]
+        elif estimate.shape != x.shape:
             raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
         with np.errstate(over="ignore", invalid="ignore"):
             error = estimate - x
             reward = -float((error * error).dot(self._weights))
+        if self.agent.improves:
+            reward = float(self.agent.improvement(estimate[None], x[None])[0])
         terminated = False
         if not math.isfinite(reward):
             terminated = not np.isfinite(estimate).all()
@@ -115,6 +135,8 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         truncated = self._k == self._num_steps
         info = {"state": self._x[self._k].copy()}
         observation = self._observations[self._k].copy()
+        if not self.agent.plain:
+            observation = self.agent.look(observation[None], np.array([self._k]))[0]
         self._over = terminated or truncated
         if self.render_mode == "human":
             self.render()
@@ -167,6 +189,9 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         setup: str = "benchmark",
         condition: str = "nominal",
         *,
+        action_mode: str = "estimate",
+        reward: str = "error",
+        stack_outputs: int = 1,
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
@@ -176,7 +201,9 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)
-        self.single_observation_space, self.single_action_space = _spaces(self.source.system)
+        self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)
+        self.single_observation_space = self.agent.form.observation_space
+        self.single_action_space = self.agent.form.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._weights = _reward_weights(self.source.system)
@@ -211,6 +238,8 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._seed(seed, rows)
         self._begin(rows, prior.mean[rows], None if x0 is None else x0[rows])
         observations, infos = self._look()
+        if not self.agent.plain:
+            observations = self.agent.begin(self._prior.mean, observations, self._k, rows)
         return observations, infos | self._begun(rows)
 
     def step(
@@ -219,13 +248,18 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if self._episodes is None:
             raise RuntimeError("no episode has begun; call reset before step")
         estimates = np.asarray(actions, dtype=float)
-        shape = (self.num_envs, self.source.system.nx)
+        shape = (self.num_envs, *self.agent.action_shape)
         if estimates.shape != shape:
-            raise ValueError(f"actions have shape {estimates.shape}; expected {shape}, estimates")
+            kind = f"as action_mode={self.agent.form.name!r} has them"
+            raise ValueError(f"actions have shape {estimates.shape}; expected {shape}, {kind}")
+        if not self.agent.plain:
+            estimates = self.agent.act(estimates)
         over = self._over
         with np.errstate(over="ignore", invalid="ignore"):
             error = estimates - self._state
             rewards = -((error * error) @ self._weights)
+        if self.agent.improves:
+            rewards = self.agent.improvement(estimates, self._state)
         terminated = np.zeros(self.num_envs, dtype=bool)
         if not math.isfinite(rewards.sum()):
             terminated = np.asarray(~np.isfinite(estimates).all(axis=1))
@@ -247,6 +281,10 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._over = terminated | truncated
         self._any_over = bool(self._over.any())
         observations, infos = self._look()
+        if not self.agent.plain:
+            if begun is not None:
+                self.agent.forget(self._prior.mean, begun)
+            observations = self.agent.look(observations, self._k)
         if begun is not None:
             infos |= self._begun(begun)
         return observations, rewards, terminated, truncated, infos
@@ -342,17 +380,6 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 def _reward_weights(system: System) -> np.ndarray:
     """What each squared error counts in minus the reward."""
     return 1 / (np.asarray(system.scale, dtype=float) ** 2 * system.nx)
-
-
-def _spaces(system: System) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """The spaces of observations and actions."""
-    width = system.ny + system.nu
-    low, high = np.full(width + 1, -np.inf), np.full(width + 1, np.inf)
-    low[-1], high[-1] = 0, 1
-    bound = system.state_bound or tuple(10 * s for s in system.scale)
-    largest = np.asarray(bound, dtype=np.float32)
-    observations = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
-    return observations, gym.spaces.Box(-largest, largest)
 
 
 def _seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:

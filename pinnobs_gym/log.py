@@ -43,6 +43,11 @@ class Log:
         """Whether anything is kept: what is costly to draw need not be drawn otherwise."""
         return self._folder is not None
 
+    @property
+    def folder(self) -> Path | None:
+        """Where the event files go, for libraries that write their own."""
+        return self._folder
+
     def scalar(self, tag: str, value: float, step: int) -> None:
         """Add the value of the curve ``tag`` at a step."""
         if writer := self._writer():

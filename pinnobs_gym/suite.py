@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import joblib
 
@@ -64,6 +64,15 @@ class Job:
     def name(self) -> str:
         """What the job does, in a few words."""
         return f"{self.estimator} on {self.system}, {self.condition}"
+
+
+class Played(NamedTuple):
+    """The episodes of an env: what is played, and from which seed on."""
+
+    env_id: str
+    setup: str
+    condition: str
+    seed: int
 
 
 def trainers() -> dict[str, ModuleType]:
@@ -203,18 +212,36 @@ def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
 
 def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on episodes that are never scored, loaded if that was done before."""
-    module = trainer(str(cls.needs_training))
-    recipe = module.Config(**{**cls.recipe, **job.training})
-    place = (env_id(job.system), job.setup, job.condition, TRAINING_SEED)
-    system, setup, record = record_of(*place, recipe.episodes)
-    label = f"{_played(job)}-{cls.needs_training}-{_digest(recipe)}"
+    name = str(cls.needs_training)
+    recipe = trainer(name).Config(**{**cls.recipe, **job.training})
+    played = Played(env_id(job.system), job.setup, job.condition, TRAINING_SEED)
+    label = f"{_played(job)}-{name}-{_digest(recipe)}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            told = setup.noise_std
-            result = module.train(system, recipe, record=record, noise_std=told, log=log)
-        result.save(path)
-    return load(cls, path, system, setup)
+            train(name, recipe, played, log=log).save(path)
+    source = make_vector_env(played.env_id, 1, played.setup, played.condition).source
+    return load(cls, path, source.system, source.setup)
+
+
+def train(name: str, config: Any, played: Played, **options: Any) -> Any:
+    """What the trainer of that name makes of a config: an object with `save`.
+
+    A trainer learns from the record of ``config.episodes`` episodes and is given it, with the noise
+    that the setup tells; or, if these are none, it plays episodes itself and is told of which env.
+
+    Args:
+        name: the trainer's.
+        config: its Config.
+        played: the episodes, or the first of them.
+        options: ``log``, ``checkpoint``, ``resume`` and ``progress``, as the trainer takes them.
+    """
+    module = trainer(name)
+    if not config.episodes:
+        system = make_vector_env(played.env_id, 1, played.setup, played.condition).source.system
+        return module.train(system, config, played=played, **options)
+    system, setup, record = record_of(*played, config.episodes)
+    return module.train(system, config, record=record, noise_std=setup.noise_std, **options)
 
 
 def _played(job: Job) -> str:

@@ -1,2 +1,3 @@
 """Trainers of learned estimators, a module or package each: a Config, whose ``episodes`` says how
-many episodes the training takes, and `train`."""
+many episodes the training takes, and `train`. One whose Config says 0 plays its own; see
+`pinnobs_gym.suite.train`."""

@@ -15,7 +15,7 @@ from pinnobs_gym import acceptance, env_id, suite
 from pinnobs_gym.console import console
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.evaluation import score_batch
+from pinnobs_gym.evaluation import make_vector_env, score_batch
 from pinnobs_gym.figures import state_figure
 from pinnobs_gym.log import Log
 from pinnobs_gym.options import parse
@@ -53,8 +53,9 @@ def run(arguments: Sequence[str]) -> int:
     chosen = _chosen_training(name, module.Config, arguments[1:])
     check_writable(chosen.out)
     env = env_id(chosen.system)
-    played = (env, chosen.setup, chosen.condition, chosen.episode)
-    system, setup, record = suite.record_of(*played, chosen.config.episodes)
+    played = suite.Played(env, chosen.setup, chosen.condition, chosen.episode)
+    source = make_vector_env(env, 1, chosen.setup, chosen.condition).source
+    system, setup = source.system, source.setup
     title = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
     stem = chosen.out / f"{title}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
@@ -65,11 +66,10 @@ def run(arguments: Sequence[str]) -> int:
                 f"{earlier} is there already; --resume goes on with it, --out names another folder"
             )
     with Log(chosen.out / "tensorboard" / stem.name) as log:
-        result = module.train(
-            system,
+        result = suite.train(
+            name,
             chosen.config,
-            record=record,
-            noise_std=setup.noise_std,
+            played,
             log=log,
             checkpoint=checkpoint,
             resume=chosen.resume,
@@ -107,7 +107,7 @@ def _chosen_training(name: str, config: type, arguments: Sequence[str]) -> Train
 
 
 def _report_training(
-    label: str, estimator: Estimator, played: tuple[str, str, str, int], loss: float
+    label: str, estimator: Estimator, played: suite.Played, loss: float
 ) -> dict[str, Any]:
     """Print how a trained estimator does; returns what `state_figure` draws of its own record."""
     if estimator.track == "online":

@@ -1,0 +1,233 @@
+"""An agent of Stable-Baselines3 as an estimator."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from pinnobs_gym.actions import Form, Memory, form_of
+from pinnobs_gym.estimator import Estimator, State
+from pinnobs_gym.record import Prior
+from pinnobs_gym.system import Setup, System
+from pinnobs_gym.trained_file import check_same, identity, read, write
+
+Layer = tuple[np.ndarray, np.ndarray]
+"""Weights (rows, columns) and biases (rows,)."""
+
+SETUP = ("xhat0", "P0_std", "dt", "duration", "noise_std")
+"""What a form takes from the setup of the training."""
+TINY = 1e-8
+"""Added to the variance of features by SB3's ``VecNormalize``."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedAgent:
+    """The part of an agent that chooses actions, and how its training went."""
+
+    layers: tuple[Layer, ...]
+    """From normalised features, or from the recurrent layer, to the action."""
+    recurrent: tuple[Layer, Layer] | None
+    """Weights on the input and on the state of a long short-term memory (gates in the order input,
+    forget, cell, output, as in torch), if it has one before the other layers."""
+    normalization: Layer
+    """Mean and variance of the features."""
+    clip: float
+    """Largest normalised feature."""
+    activation: str
+    """``tanh`` or ``relu``, of all layers but the last."""
+    squash: bool
+    """Whether the action is the hyperbolic tangent of the last layer; else it is cut off at ±1."""
+    algorithm: str
+    action_mode: str
+    stack: int
+    """How many of the last outputs the features hold."""
+    setup: Mapping[str, Any]
+    """The part of the training's setup that the form takes; see `SETUP`."""
+    system: str
+    """Class name of the system."""
+    parameters: Mapping[str, Any]
+    """The system's physical parameters, as JSON holds them."""
+    config: Mapping[str, Any]
+    """The trainer's settings."""
+    sb3: str
+    """Version of Stable-Baselines3 that trained it."""
+    loss: float
+    """The trainer's measure on episodes held out."""
+    iterations: int
+    """Steps that training took, of which the best agent is one."""
+    seconds: float
+    """CPU time in s that they took."""
+
+    def save(self, path: str | Path) -> None:
+        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
+
+        Raises:
+            ValueError: in one line, if the file cannot be written.
+        """
+        arrays = {n: _tensors(getattr(self, n)) for n in _ARRAYS}
+        facts = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
+        write(path, {"facts": json.dumps(facts), **arrays})
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """Read what `save` wrote, for the system it was trained on.
+
+        Raises:
+            ValueError: in one line, if there is no such file, if it is something else or damaged,
+                if it has no normalisation, or if it belongs to another system, other parameters or
+                another major version of Stable-Baselines3.
+        """
+        saved = read(path)
+        if "facts" in saved and saved.get("normalization") is None:
+            raise ValueError(f"{path} holds an agent without the normalisation of its features")
+        try:
+            facts = json.loads(saved["facts"])
+            agent = cls(**{n: _arrays(saved[n]) for n in _ARRAYS}, **facts)
+            found = {"system": agent.system, "parameters": agent.parameters}
+            check_same(path, found, {n: identity(system)[n] for n in found})
+            _check_version(path, agent.sb3)
+            form = agent.form(system)
+            sizes = [agent.normalization[0].size, *(len(b) for _, b in agent.layers[-1:])]
+        except (KeyError, TypeError, IndexError, AttributeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path} is not a saved agent: {reason}") from None
+        actions: int = form.action_space.shape[0]
+        check_same(path, {"sizes": sizes}, {"sizes": [form.num_features, actions]})
+        return agent
+
+    def form(self, system: System, noise_std: Any = None) -> Form:
+        """The form of its actions and features, told a noise; the training's if None."""
+        known = dict(self.setup) | ({} if noise_std is None else {"noise_std": noise_std})
+        setup = replace(system.setups["benchmark"], **known)
+        return form_of(self.action_mode, system, setup, self.stack)
+
+    def begin(self, batch: int) -> tuple[np.ndarray, np.ndarray]:
+        """The recurrent layer's first state, twice (batch, size); of size 0 if there is none."""
+        size = 0 if self.recurrent is None else self.recurrent[1][0].shape[1]
+        return np.zeros((batch, size)), np.zeros((batch, size))
+
+    def act(
+        self, features: np.ndarray, state: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """The actions (batch, n) for features (batch, m), without exploration, and the recurrent
+        layer's next state; computed in double precision, row by row alike in any batch."""
+        mean, variance = self.normalization
+        x = np.clip((features - mean) / np.sqrt(variance + TINY), -self.clip, self.clip)
+        if self.recurrent is not None:
+            x, state = _remember(self.recurrent, x, state)
+        for W, b in self.layers[:-1]:
+            z = x @ W.T + b
+            x = np.tanh(z) if self.activation == "tanh" else np.maximum(z, 0.0)
+        W, b = self.layers[-1]
+        z = x @ W.T + b
+        return np.tanh(z) if self.squash else np.clip(z, -1.0, 1.0), state
+
+
+_ARRAYS = ("layers", "recurrent", "normalization")
+
+
+def _remember(
+    layer: tuple[Layer, Layer], x: np.ndarray, state: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """A step of a long short-term memory (Hochreiter & Schmidhuber 1997, with a forget gate)."""
+    (W, b), (V, c) = layer
+    hidden, cell = state
+    gates = np.split(x @ W.T + b + hidden @ V.T + c, 4, axis=1)
+    enter, forget, leave = (0.5 + 0.5 * np.tanh(0.5 * gates[i]) for i in (0, 1, 3))
+    cell = forget * cell + enter * np.tanh(gates[2])
+    hidden = leave * np.tanh(cell)
+    return hidden, (hidden, cell)
+
+
+def _tensors(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return torch.tensor(value)
+    return None if value is None else [_tensors(part) for part in value]
+
+
+def _arrays(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        return value.numpy()
+    return None if value is None else tuple(_arrays(part) for part in value)
+
+
+def _check_version(path: str | Path, trained: str) -> None:
+    here = importlib.metadata.version("stable-baselines3")
+    if trained.partition(".")[0] != here.partition(".")[0]:
+        raise ValueError(
+            f"{path} was trained with stable-baselines3 {trained}; {here} is installed, of another "
+            "major version"
+        )
+
+
+@dataclass(frozen=True)
+class Sb3(Estimator):
+    """An agent that was trained by reinforcement learning with Stable-Baselines3, at work without
+    exploration. Its reward in training was made of the true states.
+
+    What its actions mean is a form of `pinnobs_gym.actions`: with ``gain`` it is an observer on the
+    model whose gain the agent chooses at every sample.
+    """
+
+    trained: TrainedAgent = field(kw_only=True, repr=False)
+    """The agent."""
+
+    name = "sb3"
+    needs_training = "rl"
+    knows = ("model", "prior", "noise", "true states in training")
+
+    @cached_property
+    def _form(self) -> Form:
+        return self.trained.form(self.system, self.noise_std)
+
+    def reset(self, prior: Prior) -> State:
+        return State(np.asarray(prior.mean, dtype=float))
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        now = np.full(len(y), t)
+        memory: Memory
+        if state.t is None:
+            memory, hidden = self._form.begin(state.xhat, now, u), self.trained.begin(len(y))
+        else:
+            memory, hidden = state.memory
+        features, memory = self._form.look(memory, now, y, u)
+        actions, hidden = self.trained.act(features, hidden)
+        memory = self._form.act(memory, actions)
+        return State(memory.xhat, t, u, memory=(memory, hidden))
+
+    def save(self, path: str | Path) -> None:
+        """Write the agent to a file; see `TrainedAgent.save`."""
+        self.trained.save(path)
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """The estimator with the agent in a file, told the noise of its training; see
+        `TrainedAgent.load`."""
+        trained = TrainedAgent.load(path, system)
+        return cls(system, trained.setup["noise_std"], trained=trained)
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How the agent was trained."""
+        names = ("algorithm", "action_mode", "loss", "iterations", "seconds", "config", "sb3")
+        facts = {name: getattr(self.trained, name) for name in names}
+        return {
+            "trainer": "rl",
+            "reward": "of the true states",
+            "seed": self.trained.config["seed"],
+            **facts,
+        }
+
+
+def setup_of(setup: Setup) -> dict[str, Any]:
+    """What a saved agent keeps of a setup, as JSON holds it."""
+    kept = {name: np.asarray(getattr(setup, name)).tolist() for name in SETUP}
+    return json.loads(json.dumps(kept))

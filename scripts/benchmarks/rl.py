@@ -1,0 +1,121 @@
+"""Agents of Stable-Baselines3: how fast they train, and their scores beside the EKF's."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from benchmarks import Figure, at_least, at_most, median_ratio
+from pinnobs_gym import env_id, evaluate, suite
+from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
+from pinnobs_gym.evaluation import make_vector_env
+from pinnobs_gym.rows import Row
+from pinnobs_gym.sb3_env import Sb3VecEnv
+from pinnobs_gym.systems import SYSTEMS
+from trainers.rl import Config
+
+SEEDS = 3
+"""Training seeds."""
+EPISODES = 100
+"""Episodes of seeds 0, 1, ..."""
+DUFFING = "ReverseDuffing"
+FRAMES = 16_384
+"""Frames of a rollout, and of a measurement."""
+
+
+def figures(repeats: int) -> Iterator[Figure]:
+    """Speed, then training and scores, system by system."""
+    yield from speed(repeats)
+    near = []
+    for name in SYSTEMS.classes():
+        open_loop, ekf = (tail(evaluate(e, env_id(name))) for e in ("open_loop", "ekf"))
+        ratios = []
+        for seed in range(SEEDS):
+            trained = trained_on(name, seed)
+            value = tail(scores(name, trained))
+            ratios.append(value / ekf)
+            about = f"{name}, seed {seed}"
+            own = name == DUFFING
+            yield Figure(f"tail NRMSE of the gain agent, {about}", value, "", "", None)
+            yield limited(f"over the EKF's {ekf:.4g}, {about}", ratios[-1], 5.0 if own else None)
+            over = value / open_loop
+            yield limited(
+                f"over the model alone's {open_loop:.4g}, {about}", over, 0.1 if own else None
+            )
+            yield at_most(f"steps of training, {about}", trained.iterations, "", 300_000)
+            yield at_most(f"training, {about}", trained.seconds, "CPU s", 600.0)
+            if own and not seed:
+                yield reproduced(name, trained)
+        near.append(float(np.median(ratios)) <= 10)
+    what = f"systems where the median of {SEEDS} seeds is at most 10 times the EKF's"
+    yield at_least(what, sum(near), "", 4)
+
+
+def trained_on(name: str, seed: int) -> TrainedAgent:
+    """An agent trained by the default recipe."""
+    played = suite.Played(env_id(name), "benchmark", "nominal", suite.TRAINING_SEED)
+    return suite.train("rl", Config(seed=seed), played)
+
+
+def scores(name: str, trained: TrainedAgent) -> list[Row]:
+    """The rows of an agent's episodes."""
+    system = SYSTEMS.resolve(name)()
+    estimator = Sb3(system, trained.setup["noise_std"], trained=trained)
+    return evaluate(estimator, env_id(name), episodes=EPISODES)
+
+
+def tail(rows: list[Row]) -> float:
+    """The median over episodes."""
+    return float(np.median([row["nrmse_tail_modulo"] for row in rows]))
+
+
+def limited(figure: str, value: float, bound: float | None) -> Figure:
+    """A figure with a limit, or none."""
+    return (
+        Figure(figure, value, "x", "", None)
+        if bound is None
+        else at_most(figure, value, "x", bound)
+    )
+
+
+def reproduced(name: str, trained: TrainedAgent) -> Figure:
+    """The largest difference of any score of the agent and of the same one saved and loaded."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "agent.pt"
+        trained.save(path)
+        again = TrainedAgent.load(path, SYSTEMS.resolve(name)())
+    pairs = zip(scores(name, trained), scores(name, again), strict=True)
+    largest = max(abs(a["nrmse"] - b["nrmse"]) for a, b in pairs)
+    return at_most(f"scores of the agent - of its file, {name}", largest, "", 0.0)
+
+
+def speed(repeats: int) -> Iterator[Figure]:
+    """PPO on the gain form through the adapter at 256 rows against SB3's way with 8 single envs:
+    the same frames of a rollout, gradients and network."""
+    name = env_id(DUFFING)
+    arguments: dict[str, Any] = {"action_mode": "gain", "reward": "improvement"}
+
+    def own() -> VecEnv:
+        return Sb3VecEnv(make_vector_env(name, 256, "benchmark", "nominal", **arguments))
+
+    def peer() -> VecEnv:
+        return DummyVecEnv([lambda: gym.make(name, **arguments) for _ in range(8)])
+
+    for label, epochs, asked in (("default PPO", 10, 3.0), ("one epoch", 1, None)):
+        ratio = median_ratio(learner(peer(), epochs), learner(own(), epochs), repeats)
+        what = f"frames per CPU-second, adapter at 256 rows / DummyVecEnv with 8 envs, {label}"
+        yield at_least(what, ratio, "x", asked)
+
+
+def learner(env: VecEnv, epochs: int) -> Callable[[], object]:
+    """A function that trains an agent for one rollout."""
+    steps = FRAMES // env.num_envs
+    model = PPO("MlpPolicy", env, n_steps=steps, batch_size=512, n_epochs=epochs, device="cpu")
+    return lambda: model.learn(FRAMES)
