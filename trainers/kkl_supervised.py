@@ -59,7 +59,7 @@ def labels(run: Run) -> Objective:
     known = run.labels
 
     def draw(generator: torch.Generator) -> Sequence[Equations]:
-        k, i = run.draw(generator, run.config.batch)
+        k, i = run.draw(generator, run.dynamics.size)
         return [Equations([Term(run.encoded(k, i))], known[k, i])]
 
     return draw

@@ -83,11 +83,10 @@ class Dynamics:
             z[k + 1] = z[k] @ flow.T + y[k] @ before.T + y[k + 1] @ after.T
         return z
 
-    def decay(self, elapsed: np.ndarray) -> np.ndarray:
-        """Φ over times (...) in s since some sample, (..., nz, nz): how much of z is left of it."""
-        if self.mode == "continuous":
-            return expm(self.A * np.asarray(elapsed, dtype=float)[..., None, None])
-        raise ValueError("mode='discrete'; a decay over any time needs continuous time")
+    def flows(self, t: np.ndarray) -> np.ndarray:
+        """Φ from the first of the times t (num_samples,) in s to each, (num_samples, nz, nz)."""
+        nothing = np.zeros((len(t), self.size, self.B.shape[1]))
+        return self.filtered(t, nothing, np.eye(self.size)).swapaxes(1, 2)
 
 
 @lru_cache(maxsize=512)

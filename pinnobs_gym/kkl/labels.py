@@ -220,9 +220,7 @@ def simulated(
         if T is not None and T0 is not None:
             T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
     u = np.asarray(system.input(t))[kept]
-    eye = np.eye(dynamics.size)
-    nothing = np.zeros((len(t), dynamics.size, system.ny))
-    flow = dynamics.filtered(t, nothing, eye)[kept].swapaxes(1, 2)
+    flow = dynamics.flows(t)[kept]
     return Episodes(t[kept] - t[0], u, x, z, x0, flow, T, drawn - len(x0), drawn)
 
 

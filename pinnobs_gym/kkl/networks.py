@@ -46,7 +46,6 @@ class Scaling:
         std = flat.std(axis=0)
         return Scaling(flat.mean(axis=0), np.diag(np.where(std > 0, std, 1.0)))
 
-
     @staticmethod
     def white(samples: np.ndarray, noise: np.ndarray) -> Scaling:
         """That which makes samples (..., size) with independent noise (..., size) added to them

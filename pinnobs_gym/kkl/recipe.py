@@ -45,6 +45,10 @@ _FREE = ("checkpoint_every", "log_every", "device", "budget")
 """Settings that may change when training is resumed."""
 MIN_SAMPLES = 20
 """Fewest samples of the record whose times are trained on."""
+_CYCLES = 4.0
+"""Periods of the cut-off in the benchmark's episodes, unless it is given."""
+_TICKS = 1000
+"""Steps of the progress bar."""
 _PARTS = 12
 """Parts of the episode whose errors are weighed alike."""
 _USUAL = 0.95
@@ -58,7 +62,6 @@ _SHARE = 0.02
 DEFAULT: Mapping[str, Any] = MappingProxyType(
     {
         "design": "bessel",
-        "cutoff": 0.35,
         "order": None,
         "mode": "continuous",
         "start": "output",
@@ -70,7 +73,7 @@ DEFAULT: Mapping[str, Any] = MappingProxyType(
         "activation": "tanh",
         "method": "gauss_newton",
         "learning_rate": 0.3,
-        "batch": 400,
+        "batch": 800,
         "iterations": 600,
         "share": 0.2,
         "noise": True,
@@ -97,8 +100,8 @@ class KKLConfig:
     design: Design = _PRESET
     """The poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or learned with the
     networks, beginning with ``poles``, real ones (autoencoder alone)."""
-    cutoff: float = _PRESET
-    """Cut-off of Bessel's poles in Hz."""
+    cutoff: float | None = None
+    """Cut-off of Bessel's poles in Hz; four over the benchmark's duration if None."""
     order: int | None = _PRESET
     """Bessel's poles for each output; nx + 1 if None."""
     poles: tuple[float, ...] = ()
@@ -129,7 +132,7 @@ class KKLConfig:
     learning_rate: float = _PRESET
     """The first step; it falls as a half cosine."""
     batch: int = _PRESET
-    """Samples in a step."""
+    """Equations in a step: samples times the outputs of the network."""
     iterations: int = _PRESET
     """Steps for T*."""
     share: float = _PRESET
@@ -173,8 +176,8 @@ class KKLConfig:
         expect(
             self, "order", "None or a whole number over 0", lambda v: v is None or v == int(v) > 0
         )
-        for name in ("cutoff", "learning_rate"):
-            expect(self, name, "a positive number", lambda v: 0 < v < math.inf)
+        expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
+        expect(self, "cutoff", "None or positive Hz", lambda v: v is None or 0 < v < math.inf)
         expect(self, "share", "a number over 0", lambda v: 0 < v < math.inf)
         expect(self, "patience", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
         expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
@@ -183,6 +186,10 @@ class KKLConfig:
         if (self.low is None) != (self.high is None):
             raise ValueError(f"low={self.low}, high={self.high}; expected both corners or none")
 
+    def cutoff_for(self, system: System) -> float:
+        """The cut-off for a system, in Hz."""
+        return self.cutoff or _CYCLES / system.setups["benchmark"].duration
+
     def dynamics(self, system: System) -> Dynamics:
         """A_z and B_z for a system.
 
@@ -190,7 +197,7 @@ class KKLConfig:
             ValueError: in one line, if they do not give an observer.
         """
         if self.design == "bessel":
-            poles: Sequence[complex] = bessel(self.order or system.nx + 1, self.cutoff)
+            poles: Sequence[complex] = bessel(self.order or system.nx + 1, self.cutoff_for(system))
         elif self.design == "niazi":
             poles = niazi(system.nx)
         else:
@@ -234,9 +241,8 @@ class Run:
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
         self._simulate(gap)
         self._prepare()
-        self.latest, self.stopped_early = math.nan, {}
+        self.latest = math.nan
         self.best: dict[str, Best] = {}
-        self.spent: dict[str, float] = {}
         self.facts: dict[str, Any] = {}
         self._begin("T")
 
@@ -253,7 +259,7 @@ class Run:
     @property
     def iterations(self) -> int:
         """Steps so far, for both networks."""
-        return self.fit.iteration + (self.best["T"].made if self.stage == "T*" else 0)
+        return self.fit.iteration + (self.best["T"].made if self.stage != "T" else 0)
 
     def _simulate(self, gap: int) -> None:
         config, system = self.config, self.system
@@ -305,8 +311,12 @@ class Run:
         """As a tensor of the training's precision, where the training runs."""
         return torch.tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
 
-    def draw(self, generator: torch.Generator, count: int) -> tuple[Tensor, Tensor]:
-        """Indices of kept samples and of episodes that are trained on, (count,) each."""
+    def draw(
+        self, generator: torch.Generator, outputs: int, part: float = 1.0
+    ) -> tuple[Tensor, Tensor]:
+        """Indices of kept samples and of episodes that are trained on, (count,) each: as many as
+        make a part of the batch with a network of so many outputs."""
+        count = max(8, round(part * self.config.batch / outputs))
         k = torch.randint(len(self.data.t), (count,), generator=generator)
         episodes = torch.randint(
             self.held.stop, self.data.x.shape[1], (count,), generator=generator
@@ -317,6 +327,25 @@ class Run:
         """What T is given at samples k of episodes i."""
         x = self.x[k, i]
         return torch.cat([x, self.times[k]], dim=-1) if self.driven else x
+
+    def pairs(self, gap: int) -> np.ndarray:
+        """Kept samples that are ``gap`` samples apart, as indices (pairs, 2)."""
+        where = {int(k): index for index, k in enumerate(self.kept)}
+        return np.array([[i, where[k + gap]] for k, i in where.items() if k + gap in where])
+
+    def rates(self) -> np.ndarray:
+        """Rates of change in 1/s of what T is given, at the kept samples: (kept, batch, size)."""
+        data, system = self.data, self.system
+        t = self.t[self.kept]
+        each = [system.f(t[k], data.x[k], data.u[k]) for k in range(len(t))]
+        rate = np.array(each) @ np.linalg.inv(self.x_scaling.root).T
+        if not self.driven:
+            return rate
+        h = 1e-4 * self.interval
+        after, before = (self.clock(data.t + d, system.input(t + d)) for d in (h, -h))
+        told = (after - before) / (2 * h) @ np.linalg.inv(self.clock_scaling.root).T
+        told = np.broadcast_to(told[:, None], (*rate.shape[:2], told.shape[-1]))
+        return np.concatenate([rate, told], axis=-1)
 
     def _begin(self, stage: str) -> None:
         self.stage, self._stage_start = stage, self.seconds
@@ -333,7 +362,7 @@ class Run:
             objective = self._encoding(self)
             self._checked = _held_equations(objective, config.seed)
         else:
-            if not self.labelled:
+            if not self.labelled:  # T is what it is now
                 self.z = self.tensor(self.whitening.scaled(self._own_z()))
             objective = self._decoding
             self._mse = torch.ones(int(self.parts[-1]) + 1, dtype=self.dtype, device=self.device)
@@ -364,7 +393,7 @@ class Run:
     def _decoding(self, generator: torch.Generator) -> Sequence[Equations]:
         """x̂ = x at samples of all parts of the episode, whose errors are divided by what is usual
         there: else the transient, which is never small, is all that counts."""
-        k, i = self.draw(generator, self.config.batch)
+        k, i = self.draw(generator, self.system.nx)
         rows = self.z_noise.shape[1]
         j = torch.randint(rows, (len(k),), generator=generator).to(self.device)
         a = torch.cat([self.z[k, i] + self.z_noise[k, j], self.times[k]], dim=-1)
@@ -386,7 +415,6 @@ class Run:
         if self._stage_over():
             self._look()
             self.best[self.stage].made = self.fit.iteration
-            self.spent[self.stage] = self.seconds - self._stage_start
             self._begin("T*") if self.stage == "T" else setattr(self, "stage", "done")
 
     @property
@@ -402,6 +430,29 @@ class Run:
             spent = self.seconds - self._stage_start
             done = max(done, spent / max(mine, 1e-9))
         return done
+
+    @property
+    def done(self) -> float:
+        """How much of the whole training is over."""
+        share = self.config.share / (1 + self.config.share)
+        if self.stage == "T":
+            return share * min(self.progress, 1.0)
+        return 1.0 if self.finished() else share + (1 - share) * min(self.progress, 1.0)
+
+    def traded(self) -> dict[str, float]:
+        """What a cut-off trades: see `sweep`."""
+        noisy, clean = (self._held_squares(noise).cpu().numpy() for noise in (True, False))
+        late = self.data.t >= self.data.t[0] + 0.75 * (self.data.t[-1] - self.data.t[0])
+        end, without = noisy[late].mean(), clean[late].mean()
+        above = np.flatnonzero(noisy > 4 * end)
+        scale = self.noise_std / output_scale(self.system)
+        own = float(np.sqrt(np.mean(scale**2)))
+        return {
+            "noisy": float(np.sqrt(end)),
+            "clean": float(np.sqrt(without)),
+            "noise_gain": float(np.sqrt(max(end - without, 0.0))) / own if own else 0.0,
+            "convergence": float(self.data.t[above[-1]]) if len(above) else 0.0,
+        }
 
     def _stage_over(self) -> bool:
         best = self.best[self.stage]
@@ -427,12 +478,76 @@ class Run:
         if self.stage == "T":
             found = [e.residual(net).square().mean() for e in self._checked]
             return float(torch.stack(found).sum())
-        z = self.z[:, self.held] + self.z_noise[:, : self.held.stop]
-        told = self.times[:, None].expand(-1, z.shape[1], -1)
-        square = (net(torch.cat([z, told], -1)) - self.x[:, self.held]).square().mean((1, 2))
+        square = self._held_squares(noise=True)
         parts = torch.zeros_like(self._mse).index_add_(0, self.parts.to(self.device), square)
         count = torch.bincount(self.parts, minlength=len(parts)).to(self.device)
         return float((parts / count).log().mean().exp())
+
+    def _held_squares(self, noise: bool) -> Tensor:
+        """Mean squared scaled errors of x̂ on the episodes held out, (kept,)."""
+        with torch.no_grad():
+            z = self.z[:, self.held]
+            if noise:
+                z = z + self.z_noise[:, : self.held.stop]
+            told = self.times[:, None].expand(-1, z.shape[1], -1)
+            error = self.fit.net(torch.cat([z, told], -1)) - self.x[:, self.held]
+            return error.square().mean((1, 2))
+
+    def save(self, path: Path) -> None:
+        """Write all that `restore` needs to go on exactly; the samples are simulated anew."""
+        facts = {
+            **self._expected(),
+            "stage": self.stage,
+            "seconds": self.seconds,
+            "stage_start": self._stage_start,
+            "best": {
+                stage: {"error": b.error, "iteration": b.iteration, "made": b.made}
+                for stage, b in self.best.items()
+            },
+            "facts": self.facts,
+        }
+        layers = {
+            stage: [[torch.tensor(a) for a in layer] for layer in b.layers]
+            for stage, b in self.best.items()
+        }
+        usual = self._mse if self.stage == "T*" else torch.empty(0)
+        tensors = {"t": torch.tensor(self.t), "layers": layers, "usual": usual}
+        write(path, {"checkpoint": json.dumps(facts), "fit": self.fit.state(), **tensors})
+
+    def restore(self, path: Path) -> None:
+        """Take up the training of a checkpoint.
+
+        Raises:
+            ValueError: in one line, if it cannot be read or belongs to another training.
+        """
+        saved = read(path)
+        try:
+            facts = json.loads(saved["checkpoint"])
+            check_same(path, facts, self._expected())
+            if not np.array_equal(saved["t"].numpy(), self.t):
+                raise ValueError(f"{path} was trained on a record of other sample times")
+            for stage, found in facts["best"].items():
+                layers = tuple((W.numpy(), b.numpy()) for W, b in saved["layers"][stage])
+                self.best[stage] = Best(layers=layers, **found)
+            kept = dict(self.best)
+            if facts["stage"] != "T":
+                self._begin("T*")
+            self.fit.take_up(saved["fit"])
+            self.best, self.stage = kept, facts["stage"]
+            if self.stage == "T*":
+                self._mse = saved["usual"].to(self.device)
+            self._earlier += facts["seconds"]
+            self._stage_start = facts["stage_start"]
+            self.facts = facts["facts"]
+        except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path} is not a checkpoint of this trainer: {reason}") from None
+
+    def _expected(self) -> dict[str, Any]:
+        """What a checkpoint must agree with."""
+        config = {k: v for k, v in asdict(self.config).items() if k not in _FREE}
+        told = {"trainer": self.trainer, "noise_std": self.noise_std.tolist()}
+        return {**identity(self.system), **told, "config": config}
 
     def result(self) -> TrainedKKL:
         """The observer of the least validation errors."""
@@ -530,19 +645,87 @@ def train(
         raise ValueError("resume=True without a checkpoint; name its file")
     told = system.setups["benchmark"].noise_std if noise_std is None else noise_std
     std = vector(told, system.ny, "noise_std")
-    run = Run(trainer, system, config, record, std, encoding, labelled, gap)
+
+    def make(config: Any) -> Run:
+        return Run(trainer, system, config, record, std, encoding, labelled, gap)
+
+    if resume and checkpoint is not None:
+        run = make(_as_swept(config, checkpoint))
+        run.restore(checkpoint)
+    else:
+        found = sweep(make, config, system, log, progress) if config.sweep == "cutoff" else []
+        if found:
+            cutoff = min(found, key=lambda point: point["loss"])["cutoff"]
+            left = None if config.budget is None else config.budget * (1 - SWEEP_SHARE)
+            config = replace(config, cutoff=cutoff, budget=left)
+        run = make(config)
+        run.facts["sweep"] = found
     try:
-        with bar(1000 if progress else None) as show, interruption() as stopped:
+        with bar(_TICKS if progress else None) as show, interruption() as stopped:
             while not run.finished() and not stopped:
                 run.step()
-                if run.finished() or run.fit.iteration % config.log_every == 0:
+                steps = run.iterations
+                if run.finished() or steps % config.log_every == 0:
                     _log(log, run)
-                    part = 0.0 if run.stage == "T" else config.share
-                    whole = (part + min(run.progress, 1.0) * (config.share or 1.0))
-                    show(int(1000 * whole), f"{run.stage} held out {run.latest:.3g}")
-    except KeyboardInterrupt:
+                    show(round(_TICKS * run.done), f"{run.stage}: held out {run.latest:.3g}")
+                if checkpoint is not None and steps % config.checkpoint_every == 0:
+                    run.save(checkpoint)
+        if checkpoint is not None:
+            run.save(checkpoint)
+    except KeyboardInterrupt:  # amid a step: the last checkpoint stays as it is
         pass
-    return run.result()
+    trained = run.result()
+    log.hparams(
+        {"system": trained.system, **trained.config},
+        {"end/loss": trained.loss, "end/iterations": float(trained.iterations)},
+    )
+    return trained
+
+
+SWEEP = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""The cut-offs of a sweep, over that of the recipe."""
+SWEEP_SHARE = 0.5
+"""Part of a budget that a sweep takes."""
+_SWEEP_STEPS = 120
+"""Steps of each training of a sweep that no budget limits."""
+
+
+def sweep(
+    make: Callable[[Any], Run], config: Any, system: System, log: Log, progress: bool
+) -> list[dict[str, float]]:
+    """Short trainings at several cut-offs, one after another.
+
+    Returns:
+        For each its ``cutoff`` in Hz; the ``loss`` that cut-offs are chosen by; the NRMSE at the
+        end of an episode without (``clean``) and with noise (``noisy``), their difference in
+        squares (``noise_gain``, over the NRMSE of the outputs' own noise); and the time in s after
+        which the error stays below twice that at the end (``convergence``).
+    """
+    found = []
+    budget = None if config.budget is None else config.budget * SWEEP_SHARE / len(SWEEP)
+    steps = min(config.iterations, _SWEEP_STEPS)
+    with bar(len(SWEEP) if progress else None) as show:
+        for number, factor in enumerate(SWEEP):
+            cutoff = factor * config.cutoff_for(system)
+            run = make(replace(config, cutoff=cutoff, iterations=steps, budget=budget))
+            while not run.finished():
+                run.step()
+            found.append({"cutoff": cutoff, "loss": run.best["T*"].error, **run.traded()})
+            for name, value in found[-1].items():
+                log.scalar(f"sweep/{name}", value, number)
+            show(number + 1, f"cut-off {cutoff:.3g} Hz: {found[-1]['noisy']:.3g}")
+    return found
+
+
+def _as_swept(config: Any, checkpoint: Path) -> Any:
+    """The recipe with the cut-off that a checkpoint's sweep found."""
+    if config.sweep == "none":
+        return config
+    try:
+        facts = json.loads(read(checkpoint)["checkpoint"])
+        return replace(config, cutoff=facts["config"]["cutoff"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{checkpoint} is not a checkpoint of this trainer: {error}") from None
 
 
 def _log(log: Log, run: Run) -> None:
