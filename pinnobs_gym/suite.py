@@ -84,6 +84,15 @@ def trainer(name: str) -> ModuleType:
     return known[name]
 
 
+def default_estimators() -> tuple[str, ...]:
+    """All that can be scored on episodes they have not seen."""
+    return tuple(
+        name
+        for name, cls in ESTIMATORS.classes().items()
+        if cls.needs_training is None or cls.track == "online"
+    )
+
+
 def jobs_of(
     systems: Sequence[str],
     estimators: Sequence[str],

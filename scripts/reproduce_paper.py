@@ -30,8 +30,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
-from pinnobs_gym.cli import check_writable
-from pinnobs_gym.report import replacing
+from pinnobs_gym.report import check_writable, replacing
 from pinnobs_gym.rows import Row, append
 from trainers.pinn_obs import Config
 

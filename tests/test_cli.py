@@ -104,7 +104,11 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["evaluate", "--system", "failing_plug_in:X"], "'failing_plug_in:X': SyntaxError"),
         (["evaluate", "--system", "Academic", "--set", "process_noise=a"], "expected a number"),
         (["evaluate", "--system", "Academic", "--set", "process_noise=-1"], "process_noise=-1"),
-        (["dance"], "unknown command 'dance'; known are systems, estimators, train"),
+        (["dance"], "unknown command 'dance'; known are estimate, estimators, evaluate"),
+        (["train", "pinn_obs", "--system", "Academic", "--budget", "-1"], "budget=-1.0; expected"),
+        (["evaluate", "--systm", "Academic"], "Missing from pinnobs evaluate: --system"),
+        (["evaluate", "--system", "Academic", "--episodes", "a"], "parsing --episodes: invalid"),
+        (["systems", "Academic", "b"], "Unrecognized options: b; see pinnobs systems --help"),
     ],
 )
 def test_mistakes_are_one_line_and_status_two(folder, capsys, arguments, message):

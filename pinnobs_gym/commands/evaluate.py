@@ -1,0 +1,77 @@
+"""`evaluate ...`: score one estimator on one system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pinnobs_gym import env_id, leaderboard, suite
+from pinnobs_gym.console import console, print_table, progress
+from pinnobs_gym.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.evaluation import evaluate, make_vector_env
+from pinnobs_gym.log import Log
+from pinnobs_gym.options import parse, settings_of
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score one estimator on one system, episode by episode."""
+
+    system: str
+    """Name or module:Class of the system."""
+    estimator: str = "ekf"
+    """Name or module:Class of the estimator."""
+    checkpoint: Path | None = None
+    """Trained estimator to load."""
+    set: tuple[str, ...] = ()
+    """Settings of the estimator, such as process_noise=1e-3."""
+    setup: str = "benchmark"
+    """Setup that is played."""
+    condition: str = "nominal"
+    """Condition, such as load_step, or noise5+dropout10."""
+    episodes: int = 100
+    """Number of episodes."""
+    seed: int = 0
+    """Seed of the first."""
+    out: Path = Path("runs/evaluate")
+    """Folder of rows and TensorBoard log."""
+
+    def run(self) -> int:
+        """Evaluate and print."""
+        name = env_id(self.system)
+        cls = ESTIMATORS.resolve(self.estimator)
+        estimator: Estimator | type[Estimator] = cls
+        options = settings_of(cls, self.set)
+        source = make_vector_env(name, 1, self.setup, self.condition).source
+        if self.checkpoint is not None:
+            estimator = suite.load(cls, self.checkpoint, source.system, source.setup)
+        episodes = 1 if source.deterministic else self.episodes
+        if episodes < self.episodes:
+            console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
+        folder = self.out / "tensorboard" / name.removeprefix("pinnobs/") / self.setup
+        with Log(folder / self.condition / ESTIMATORS.name_of(cls)) as log, progress() as bar:
+            task = bar.add_task("episodes", total=episodes)
+            scored = evaluate(
+                estimator,
+                name,
+                episodes=episodes,
+                seed=self.seed,
+                setup=self.setup,
+                condition=self.condition,
+                options=options,
+                results=self.out / "rows.jsonl",
+                log=log,
+                progress=lambda done: bar.advance(task, done),
+            )
+            bar.update(task, completed=episodes)
+        for table in leaderboard.tables(scored):
+            print_table(table)
+        console.print(f"rows: {self.out / 'rows.jsonl'}; TensorBoard: {self.out / 'tensorboard'}")
+        return 0
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns its exit status."""
+    return parse(Evaluate, "evaluate", arguments).run()
