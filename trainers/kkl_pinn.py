@@ -19,13 +19,14 @@ import torch
 from pinnobs_gym.kkl import recipe
 from pinnobs_gym.kkl.fitting import Equations, Objective, Term
 from pinnobs_gym.kkl.observer import TrainedKKL
+from pinnobs_gym.kkl.pictures import figures
 from pinnobs_gym.kkl.recipe import DEFAULT, KKLConfig, Run
 from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System
 from pinnobs_gym.training import expect
 
-__all__ = ["Config", "train"]
+__all__ = ["Config", "figures", "train"]
 
 
 @dataclass(frozen=True)

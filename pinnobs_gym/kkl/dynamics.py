@@ -17,12 +17,12 @@ Start: TypeAlias = Literal["output", "zero", "prior"]
 """z before the first sample: at rest under y₀; 0; or T(x̂₀)."""
 
 _REACH = 1e-6
-"""Least singular value in Hautus's test, over the eigenvalue, of a mode that y is taken to reach."""
+"""Least singular value in Hautus's test, over the eigenvalue, of a mode within y's reach."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """ż = Az + By, or its Euler step z⁺ = z + h(Az + By) in discrete time (Peralez & Nadri 2021).
+    """The system ż = Az + By, or its Euler step z⁺ = z + h(Az + By) in discrete time.
 
     Raises:
         ValueError: in one line, if A is not Hurwitz or (A, B) is not controllable.
@@ -44,8 +44,8 @@ class Dynamics:
         lost = [value for value in np.linalg.eigvals(self.A) if self._loses(value)]
         if lost:
             raise ValueError(
-                f"(A_z, B_z) is not controllable at the pole {lost[0]:.4g}: a pole that is repeated "
-                "adds nothing to z"
+                f"(A_z, B_z) is not controllable at the pole {lost[0]:.4g}: a pole that is "
+                "repeated adds nothing to z"
             )
 
     def _loses(self, value: complex) -> bool:
@@ -56,7 +56,7 @@ class Dynamics:
 
     @property
     def size(self) -> int:
-        """nz."""
+        """How many components z has."""
         return len(self.A)
 
     @property
@@ -74,8 +74,8 @@ class Dynamics:
         return _step(self.A.tobytes(), self.B.tobytes(), self.size, self.mode, h)
 
     def filtered(self, t: np.ndarray, y: np.ndarray, z0: np.ndarray | float = 0.0) -> np.ndarray:
-        """z (num_samples, batch, nz) driven by outputs y (num_samples, batch, ny) at times t (s)
-        from z0 at the first of them."""
+        """The z (num_samples, batch, nz) that outputs y (num_samples, batch, ny) at times t (s)
+        drive from z0 at the first of them."""
         z = np.empty((*y.shape[:2], self.size))
         z[0] = z0
         for k, h in enumerate(np.round(np.diff(t), 12)):
@@ -175,7 +175,7 @@ def enough(order: int, nx: int, ny: int) -> None:
 
 
 def at_rest(dynamics: Dynamics, start: Start) -> np.ndarray:
-    """z over a constant output that it begins at, (nz, ny)."""
+    """What z begins at over a constant output, (nz, ny)."""
     if start == "output":
         return -np.linalg.solve(dynamics.A, dynamics.B)
     return np.zeros_like(dynamics.B)

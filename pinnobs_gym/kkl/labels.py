@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -116,6 +115,17 @@ def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
             away |= ~(abs(now) < FAR * scale).all(axis=-1)
             now = np.where(away[:, None], x, now)
     return away
+
+
+def frequency(system: System) -> float:
+    """How fast the outputs of the benchmark's episodes change: the root mean square of their rate
+    over that of their departures from the mean, in Hz."""
+    setup = system.setups["benchmark"]
+    x0 = initial_states(system, None, None, 20, seed=0)
+    y = system.h(truth(system, x0, setup.times, setup.truth_step))
+    rate = (np.diff(y, axis=0) ** 2).mean() / setup.dt**2
+    spread = ((y - y.mean(axis=(0, 1))) ** 2).mean()
+    return float(np.sqrt(rate / spread) / (2 * np.pi)) if spread > 0 else 0.0
 
 
 def initial_states(

@@ -37,7 +37,7 @@ class Clock:
         return len(self.rates) + len(self.amplitudes)
 
     def __call__(self, t: Array, u: Array, xp: Any = np) -> Array:
-        """The numbers (..., size) at times t (...) in s since the first sample, inputs (..., nu)."""
+        """The numbers (..., size) at times t (...) since the first sample, inputs (..., nu)."""
         told = [xp.exp(-rate * t) for rate in self.rates]
         told += [u[..., i] / size for i, size in enumerate(self.amplitudes)]
         return xp.stack(told, -1)
@@ -88,11 +88,11 @@ class TrainedKKL:
 
     @cached_property
     def rest(self) -> np.ndarray:
-        """z over a constant output, (nz, ny), that z begins at; zero unless it begins at rest."""
+        """What z begins at over a constant output, (nz, ny); zero unless it begins at rest."""
         return at_rest(self.dynamics, self.start)
 
     def T(self, x: np.ndarray, t: float = 0.0, u: np.ndarray | None = None) -> np.ndarray:
-        """T(x), (..., nz), of states (..., nx); of a driven plant at time t under inputs u."""
+        """What z is at states (..., nx), (..., nz); of a driven plant at time t under inputs u."""
         if self.clock.amplitudes:
             u = np.zeros(len(self.clock.amplitudes)) if u is None else u
             told = self.clock(np.asarray(t), u)
@@ -100,7 +100,7 @@ class TrainedKKL:
         return evaluate(self.encoder, self.activation, x)
 
     def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:
-        """T*(z), (..., nx), at times t in s since the first sample, under inputs (..., nu)."""
+        """Estimates (..., nx) at z (..., nz), times t in s since the first sample, inputs (..., nu)."""
         if self.clock.size:
             shape = z.shape[:-1]
             t = np.broadcast_to(np.asarray(t, dtype=float), shape)
@@ -187,7 +187,7 @@ class KKL(Estimator):
         return y @ self.trained.rest.T
 
     def _complete(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """y with what the model predicts where it is missing."""
+        """Outputs with what the model predicts where it is missing."""
         missing = np.isnan(y)
         if not missing.any():
             return y

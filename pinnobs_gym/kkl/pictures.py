@@ -75,7 +75,7 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
     figure.colorbar(image, label="scaled error of x̂")
     low, high = (np.array(trained.facts[name]) for name in ("low", "high"))
     box = [low[0], high[0], high[0], low[0], low[0]], [low[1], low[1], high[1], high[1], low[1]]
-    panel.plot(*box, "w:", lw=1, label="states trained on")
+    panel.plot(*box, ":", color="0.7", lw=1.5, label="states trained on")
     path = truth(system, _starts(system, trained, 1), record.t)[:, 0]
     panel.plot(path[:, 0], path[:, 1], color="#d1495b", lw=1, label="an episode")
     panel.set_xlabel(system.state_names[0])

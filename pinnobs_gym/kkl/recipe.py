@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias, get_args
@@ -28,10 +28,10 @@ from pinnobs_gym.kkl.dynamics import (
     realised,
 )
 from pinnobs_gym.kkl.fitting import Equations, Fit, Method, Objective, Term
-from pinnobs_gym.kkl.labels import initial_states, noise_in_z, simulated
+from pinnobs_gym.kkl.labels import frequency, initial_states, noise_in_z, simulated
 from pinnobs_gym.kkl.networks import Activation, Layers, Mlp, Scaling, evaluate
 from pinnobs_gym.kkl.observer import Clock, TrainedKKL
-from pinnobs_gym.log import SILENT, Log
+from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
 from pinnobs_gym.trained_file import check_same, identity, read, write
@@ -46,7 +46,9 @@ _FREE = ("checkpoint_every", "log_every", "device", "budget")
 MIN_SAMPLES = 20
 """Fewest samples of the record whose times are trained on."""
 _CYCLES = 4.0
-"""Periods of the cut-off in the benchmark's episodes, unless it is given."""
+"""Fewest periods of the cut-off in the benchmark's episodes, unless it is given."""
+_PART = 0.4
+"""The cut-off over the frequency of the outputs, unless it is given."""
 _TICKS = 1000
 """Steps of the progress bar."""
 _PARTS = 12
@@ -101,9 +103,11 @@ class KKLConfig:
     """The poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or learned with the
     networks, beginning with ``poles``, real ones (autoencoder alone)."""
     cutoff: float | None = None
-    """Cut-off of Bessel's poles in Hz; four over the benchmark's duration if None."""
+    """Cut-off of Bessel's poles in Hz; if None, two fifths of the outputs' `labels.frequency`, but
+    not under four over the benchmark's duration."""
     order: int | None = _PRESET
-    """Bessel's poles for each output; nx + 1 if None."""
+    """Bessel's poles for each output; if None, as many as give z one component more than x. Ramos
+    et al. take nx + 1 for each."""
     poles: tuple[float, ...] = ()
     """Given poles in 1/s, all real, for each output."""
     mode: Mode = _PRESET
@@ -186,9 +190,15 @@ class KKLConfig:
         if (self.low is None) != (self.high is None):
             raise ValueError(f"low={self.low}, high={self.high}; expected both corners or none")
 
+    def filters(self, system: System) -> int:
+        """Bessel's poles for each output."""
+        return self.order or math.ceil((system.nx + 1) / system.ny)
+
     def cutoff_for(self, system: System) -> float:
         """The cut-off for a system, in Hz."""
-        return self.cutoff or _CYCLES / system.setups["benchmark"].duration
+        if self.cutoff is not None:
+            return self.cutoff
+        return max(_CYCLES / system.setups["benchmark"].duration, _PART * frequency(system))
 
     def dynamics(self, system: System) -> Dynamics:
         """A_z and B_z for a system.
@@ -197,7 +207,7 @@ class KKLConfig:
             ValueError: in one line, if they do not give an observer.
         """
         if self.design == "bessel":
-            poles: Sequence[complex] = bessel(self.order or system.nx + 1, self.cutoff_for(system))
+            poles: Sequence[complex] = bessel(self.filters(system), self.cutoff_for(system))
         elif self.design == "niazi":
             poles = niazi(system.nx)
         else:
@@ -370,8 +380,8 @@ class Run:
         self._look()
 
     def _own_z(self) -> np.ndarray:
-        """z along the episodes if T is right: T(x(t)) + Φ(t)(z₀ − T(x₀)), or T(t, x(t)) of a driven
-        plant."""
+        """The z along the episodes if T is right: T(x(t)) + Φ(t)(z₀ − T(x₀)), or T(t, x(t)) of a
+        driven plant."""
         data, map_of = self.data, self.encoder
         if self.driven:
             told = self.clock(data.t, data.u)[:, None]
