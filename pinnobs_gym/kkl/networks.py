@@ -42,7 +42,7 @@ class Scaling:
     @staticmethod
     def of(samples: np.ndarray) -> Scaling:
         """That which makes samples (..., size) have mean zero and unit variance each."""
-        flat = samples.reshape(-1, samples.shape[-1])
+        flat = samples.reshape(int(np.prod(samples.shape[:-1])), samples.shape[-1])
         std = flat.std(axis=0)
         return Scaling(flat.mean(axis=0), np.diag(np.where(std > 0, std, 1.0)))
 

@@ -100,7 +100,7 @@ class TrainedKKL:
         return evaluate(self.encoder, self.activation, x)
 
     def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Estimates (..., nx) at z (..., nz), times t in s since the first sample, inputs (..., nu)."""
+        """Estimates (..., nx) at z (..., nz), times t (s) since the first sample, inputs (..., nu)."""
         if self.clock.size:
             shape = z.shape[:-1]
             t = np.broadcast_to(np.asarray(t, dtype=float), shape)
