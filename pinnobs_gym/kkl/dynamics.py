@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.linalg import expm
@@ -125,7 +125,7 @@ def realised(poles: Sequence[complex], ny: int, mode: Mode = "continuous") -> Dy
     Raises:
         ValueError: in one line, if they are not stable, not in pairs, or repeated.
     """
-    values = np.asarray(poles, dtype=complex)
+    values: Any = np.asarray(poles, dtype=complex)
     if not np.isfinite(values).all():
         raise ValueError(f"poles={list(poles)}; expected finite numbers")
     upper = np.sort_complex(values[values.imag > 0])

@@ -66,7 +66,7 @@ class Equations:
                 value, slope = _times(term.matrix, value), term.matrix @ slope
             total, J = total + value, slope if J is None else J + slope
         assert J is not None
-        weight = self.weight if isinstance(self.weight, float) else self.weight[..., None]
+        weight = self.weight[..., None] if isinstance(self.weight, Tensor) else self.weight
         return self.weight * total, weight * J
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -149,7 +149,8 @@ class Mlp:
         self, a: Tensor, da: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """What `jacobian` returns, and its directional derivative along da."""
-        return torch.func.jvp(self.jacobian, (a,), (da,))
+        both: Any = torch.func.jvp(self.jacobian, (a,), (da,))
+        return both
 
     def _slope(self, pre: Tensor) -> Tensor:
         if self.activation == "tanh":

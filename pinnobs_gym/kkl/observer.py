@@ -92,7 +92,7 @@ class TrainedKKL:
         return at_rest(self.dynamics, self.start)
 
     def T(self, x: np.ndarray, t: float = 0.0, u: np.ndarray | None = None) -> np.ndarray:
-        """What z is at states (..., nx), (..., nz); of a driven plant at time t under inputs u."""
+        """What z is at states (..., nx), (..., nz); of a driven plant at time t, inputs u."""
         if self.clock.amplitudes:
             u = np.zeros(len(self.clock.amplitudes)) if u is None else u
             told = self.clock(np.asarray(t), u)
@@ -100,7 +100,7 @@ class TrainedKKL:
         return evaluate(self.encoder, self.activation, x)
 
     def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Estimates (..., nx) at z (..., nz), times t (s) since the first sample, inputs (..., nu)."""
+        """Estimates (..., nx) at z (..., nz), times t since the first sample, inputs (..., nu)."""
         if self.clock.size:
             shape = z.shape[:-1]
             t = np.broadcast_to(np.asarray(t, dtype=float), shape)

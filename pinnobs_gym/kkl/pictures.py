@@ -15,11 +15,11 @@ from pinnobs_gym.system import System, vector
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-GRID = 61
+GRID = 51
 """Points along each side of a map."""
-RADII = np.linspace(0.1, 2.0, 20)
+RADII = np.linspace(0.1, 2.0, 14)
 """Sizes of initial states, over that of the training set's edge."""
-_RAYS = 24
+_RAYS = 12
 _FLOOR = 1e-6
 """Least error that is shown."""
 
@@ -74,8 +74,9 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
     image = panel.pcolormesh(first, second, shown, norm=LogNorm(_FLOOR, 1.0), cmap="viridis")
     figure.colorbar(image, label="scaled error of x̂")
     low, high = (np.array(trained.facts[name]) for name in ("low", "high"))
-    box = [low[0], high[0], high[0], low[0], low[0]], [low[1], low[1], high[1], high[1], low[1]]
-    panel.plot(*box, ":", color="0.7", lw=1.5, label="states trained on")
+    across, up = [0, 1, 1, 0, 0], [0, 0, 1, 1, 0]
+    box = np.stack([low, high])
+    panel.plot(box[across, 0], box[up, 1], ":", color="0.7", lw=1.5, label="states trained on")
     path = truth(system, _starts(system, trained, 1), record.t)[:, 0]
     panel.plot(path[:, 0], path[:, 1], color="#d1495b", lw=1, label="an episode")
     panel.set_xlabel(system.state_names[0])
@@ -91,8 +92,8 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
 
 def _starts(system: System, trained: TrainedKKL, count: int) -> np.ndarray:
     """Initial states (count, nx) of the set that was trained on, others than those."""
-    corners = (trained.config.get(name) for name in ("low", "high"))
-    return initial_states(system, *corners, count, 10**6 + 7)
+    low, high = (trained.config[name] for name in ("low", "high"))
+    return initial_states(system, low, high, count, 10**6 + 7)
 
 
 def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:

@@ -29,6 +29,7 @@ from pinnobs_gym.kkl.dynamics import (
 )
 from pinnobs_gym.kkl.fitting import Equations, Fit, Method, Objective, Term
 from pinnobs_gym.kkl.labels import frequency, initial_states, noise_in_z, simulated
+from pinnobs_gym.kkl.learned_poles import EPISODES, learn
 from pinnobs_gym.kkl.networks import Activation, Layers, Mlp, Scaling, evaluate
 from pinnobs_gym.kkl.observer import Clock, TrainedKKL
 from pinnobs_gym.log import Log
@@ -100,8 +101,8 @@ class KKLConfig:
     preset: Preset = "default"
     """Where the other settings come from: the paper's recipe, or a better one."""
     design: Design = _PRESET
-    """The poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or learned with the
-    networks, beginning with ``poles``, real ones (autoencoder alone)."""
+    """The poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or learned
+    beforehand with a small T*, beginning with ``poles`` (see `learned_poles`)."""
     cutoff: float | None = None
     """Cut-off of Bessel's poles in Hz; if None, two fifths of the outputs' `labels.frequency`, but
     not under four over the benchmark's duration."""
@@ -141,7 +142,7 @@ class KKLConfig:
     """Steps for T*."""
     share: float = _PRESET
     """Steps for T over those for T*; so for their CPU time if there is a budget."""
-    patience: float = 0.4
+    patience: float = 0.6
     """Part of the steps without a lower validation error after which a network is done."""
     noise: bool = _PRESET
     """Whether z is trained on with the output noise that is told."""
@@ -246,7 +247,13 @@ class Run:
         self.noise_std, self._encoding, self.labelled = noise_std, encoding, labelled
         self.driven = system.nu > 0
         self.t, self.prior = record.t, record.prior.mean[:1]
-        self.dynamics = config.dynamics(system)
+        if config.design == "learned":
+            x0 = initial_states(system, config.low, config.high, EPISODES, config.seed)
+            std = noise_std if config.noise else np.zeros(system.ny)
+            poles = learn(system, config.poles, self.t, std, x0, config.seed)
+            self.dynamics = realised(poles, system.ny, config.mode)
+        else:
+            self.dynamics = config.dynamics(system)
         self.dynamics.step(self.interval)  # a bad one is told before anything is simulated
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
         self._simulate(gap)
@@ -578,7 +585,7 @@ class Run:
             system=about["system"],
             parameters=about["parameters"],
             noise_std=tuple(self.noise_std.tolist()),
-            config=asdict(self.config),
+            config=json.loads(json.dumps(asdict(self.config))),
             seed=self.config.seed,
             loss=self.best["T*"].error,
             iterations=self.iterations,
