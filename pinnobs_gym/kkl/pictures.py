@@ -106,7 +106,8 @@ def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure
     reach = (x0.max(axis=0) - x0.min(axis=0)) / 2
     size = abs((x0 - middle) / np.where(reach > 0, reach, 1.0)).max(axis=1)
     outer = x0[np.argsort(-size)[:_RAYS]]
-    errors = np.array([_tail(system, trained, record, middle, r * (outer - middle)) for r in RADII])
+    x0 = middle + RADII[:, None, None] * (outer - middle)
+    errors = _tails(system, trained, record, x0)
     figure = Figure(figsize=(6.5, 4), layout="constrained")
     panel = figure.subplots()
     low, mid, high = np.nanquantile(errors, [0.1, 0.5, 0.9], axis=1)
@@ -121,23 +122,24 @@ def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure
     return figure
 
 
-def _tail(
-    system: System, trained: TrainedKKL, record: Record, middle: np.ndarray, from_it: np.ndarray
-) -> np.ndarray:
-    """NRMSE of the last quarter of episodes from states, (batch,); not a number where they run
-    away."""
-    x0 = middle + from_it
+def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) -> np.ndarray:
+    """NRMSE of the last quarter of episodes from states (groups, batch, nx): (groups, batch), not a
+    number in groups of which an episode runs away."""
+    states = x0.reshape(-1, system.nx)
     try:
-        x = truth(system, x0, record.t).swapaxes(0, 1)
+        x = truth(system, states, record.t).swapaxes(0, 1)
     except FloatingPointError:
-        return np.full(len(x0), np.nan)
-    mean = np.broadcast_to(record.prior.mean[:1], x0.shape)
-    cov = np.broadcast_to(record.prior.cov[:1], (len(x0), system.nx, system.nx))
-    u = np.broadcast_to(system.input(record.t), (len(x0), len(record.t), system.nu))
+        if len(x0) == 1:
+            return np.full(x0.shape[:2], np.nan)
+        return np.concatenate([_tails(system, trained, record, group[None]) for group in x0])
+    mean = np.broadcast_to(record.prior.mean[:1], states.shape)
+    cov = np.broadcast_to(record.prior.cov[:1], (len(states), system.nx, system.nx))
+    u = np.broadcast_to(system.input(record.t), (len(states), len(record.t), system.nu))
     xhat = KKL(system, trained=trained).run(Record(record.t, system.h(x), u, Prior(mean, cov))).xhat
     late = slice(3 * len(record.t) // 4, None)
     scale = vector(system.scale, system.nx, "scale")
-    return np.sqrt((((xhat - x)[:, late] / scale) ** 2).mean(axis=(1, 2)))
+    square = (((xhat - x)[:, late] / scale) ** 2).mean(axis=(1, 2))
+    return np.sqrt(square).reshape(x0.shape[:2])
 
 
 def maps_figure(system: System, trained: TrainedKKL) -> Figure:
