@@ -84,7 +84,7 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["evaluate", "--system", "Academic", "--checkpoint", "x"], "is not one that is trained"),
         (["evaluate", "--system", "Academic", "--out", "file/x"], "cannot write"),
         (["systems", "Duffing"], "unknown system 'Duffing'"),
-        (["train"], "name a trainer first: pinnobs train pinn_gain | pinn_obs"),
+        (["train"], "name a trainer first: pinnobs train kkl_autoencoder | kkl_pinn | "),
         (
             ["train", "gpt", "--system", "Academic"],
             "unknown trainer 'gpt'; known are pinn_gain, pinn_obs",

@@ -202,6 +202,16 @@ def test_escaping_samples_are_dropped_counted_and_refused_if_many():
     x0 = np.append(np.linspace(-0.9, 0.9, 19), 2.0)[:, None]
     found = simulated(Cubic(), dynamics, t, x0, np.arange(50))
     assert (found.dropped, found.drawn, found.x.shape[1]) == (1, 20, 19)
+    config = trainer("kkl_supervised").Config(
+        low=(-1.05,), high=(1.05,), **{**SMALL, "iterations": 3, "cutoff": 0.5}
+    )
+    t = 0.05 * np.arange(50)
+    prior = Prior(np.zeros((1, 1)), np.eye(1)[None])
+    record = Record(t, np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), prior)
+    with pytest.warns(UserWarning, match=r"of 100 initial states of Cubic escape .* left out"):
+        trained = trainer("kkl_supervised").train(Cubic(), config, record=record)
+    assert 0 < trained.facts["dropped"] <= 10
+    assert trained.facts["drawn"] == 100
     x0 = np.linspace(-2, 2, 20)[:, None]
     with pytest.raises(ValueError, match=r"10 of 20 initial states of Cubic escape .* at most 10%"):
         simulated(Cubic(), dynamics, t, x0, np.arange(50))

@@ -214,4 +214,5 @@ class KKL(Estimator):
     def training(self) -> dict[str, Any]:
         """How it was trained."""
         names = ("trainer", "seed", "loss", "iterations", "seconds", "config")
-        return {name: getattr(self.trained, name) for name in names}
+        dropped = {name: self.trained.facts[name] for name in ("dropped", "drawn")}
+        return {**{name: getattr(self.trained, name) for name in names}, **dropped}

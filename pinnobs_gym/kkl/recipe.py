@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -149,7 +150,7 @@ class KKLConfig:
     dtype: Literal["float32", "float64"] = _PRESET
     """Precision of the networks; labels are always in double."""
     device: Device = "auto"
-    """Where networks are trained; ``auto`` takes a GPU if there is one and batches are large."""
+    """Where networks are trained; ``auto`` takes a GPU if there is one."""
     sweep: Literal["none", "cutoff"] = "none"
     """Whether the cut-off is first chosen by short trainings over many."""
     seed: int = 0
@@ -293,6 +294,12 @@ class Run:
         self.data = simulated(
             system, self.dynamics, self.t, x0, self.kept, config.start, self.prior
         )
+        if self.data.dropped:
+            warnings.warn(
+                f"{self.data.dropped} of {self.data.drawn} initial states of "
+                f"{type(system).__name__} escape when integrated backward, and are left out",
+                stacklevel=2,
+            )
         batch = self.data.x.shape[1]
         self.held = slice(0, min(held, batch // 2))
         std = self.noise_std if config.noise else np.zeros(system.ny)

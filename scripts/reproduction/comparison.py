@@ -90,9 +90,9 @@ class Comparison:
             "their true states, without noise, and run online on every record from z₀ = 0; T* is "
             "not told the time. Training is CPU seconds of one thread, for PINN-Obs those of one "
             "record (the median).",
-            "The paper's: one bar for each method and metric. It does not state its initial states, "
-            "z₀, window or noise, and whether they are of one record; its figures of PINN-Obs cannot "
-            "include the sample at t₀ (see the table of examples).",
+            "The paper's: one bar for each method and metric. It does not state its initial "
+            "states, z₀, window or noise, and whether they are of one record; its figures of "
+            "PINN-Obs cannot include the sample at t₀ (see the table of examples).",
         ]
 
 
