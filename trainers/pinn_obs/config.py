@@ -24,7 +24,7 @@ PRESETS = MappingProxyType(
             "train_fraction": 1.0,
             "points": 300,
             "guide": 10.0,
-            "gain_penalty": 0.1,
+            "gain_penalty": 0.1,  # _TRANSFER with `Config.transfer`
             "dtype": "float64",
             "checkpoint_every": 200,
             "log_every": 20,
@@ -48,6 +48,8 @@ PRESETS = MappingProxyType(
 """The settings in which the presets differ. Those of ``paper`` are from the paper's "Ablation
 studies"."""
 
+_TRANSFER = 0.3
+"""``gain_penalty`` of a gain that is meant for other records: there the gain is the aim."""
 _PRESET: Any = None  # stands for what the preset says, which `Config` puts in its place
 
 
@@ -118,7 +120,10 @@ class Config:
 
     def __post_init__(self) -> None:
         expect(self, "preset", " or ".join(get_args(Preset)), lambda v: v in PRESETS)
-        for name, value in PRESETS[self.preset].items():
+        preset: dict[str, Any] = PRESETS[self.preset]
+        if self.transfer:
+            preset = preset | {"gain_penalty": _TRANSFER}
+        for name, value in preset.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
         Architecture(1, 1, self.depth, self.width, self.activation, self.dtype)

@@ -9,11 +9,11 @@ single valley, the same from every seed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.record import Record
+from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.smoother import Filtered
 from pinnobs_gym.system import System
 from trainers.pinn_obs.objective import Points
@@ -29,6 +29,8 @@ _CLEAR = 1e-3
 """Least innovation that tells something, over the output's scale."""
 _TOLD = 5.0
 """How many times that, or the noise, the first innovation has to be to lead x̂ away at once."""
+_LEFT_OVER = 0.3
+"""Part of the prior's deviation that the gains after the first interval reckon with."""
 _LAYER = 10.0
 """How many time constants long x̂ is taken to be leaving x̂₀."""
 
@@ -61,8 +63,10 @@ def guide_of(
 
     x̂ has to begin at x̂₀. Where the first innovation tells more than noise, a finite gain can lead
     it away from there at once: it goes to the smoothed states within the first interval, and the
-    gain that this takes, good for this record alone, is added to Riccati's. Otherwise it has to
-    wait for the outputs to show what is wrong, and goes with the filter.
+    gain that this takes, good for this record alone, is added to Riccati's. Of noisy outputs that
+    is Riccati's from a part of the prior: from the whole it would give away to the noise of the
+    next samples what is known by then. Otherwise x̂ has to wait for the outputs to show what is
+    wrong, and goes with the filter.
 
     Args:
         system: the model.
@@ -81,10 +85,15 @@ def guide_of(
         return None
     smoothed, P = path.xhat[:, 0], path.P[..., 0]
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
-    L = on_lines(t, samples.t, observer_gain(samples.t, along))
     first = abs(points.y[0] - system.h(points.xhat0)) * points.there[0]
     if transfer or not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
+        L = on_lines(t, samples.t, observer_gain(samples.t, along))
         return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
+    if noise.any():
+        prior = Prior(samples.prior.mean, P[0] + _LEFT_OVER**2 * samples.prior.cov)
+        begun = replace(samples, prior=prior)
+        along = forward(system, begun, told, about=path.xhat, caution=_CAUTION)
+    L = on_lines(t, samples.t, observer_gain(samples.t, along))
     left = np.exp((t[0] - t) / tau)[:, None]
     goal = on_lines(t, samples.t, smoothed)
     xhat = left * points.xhat0 + (1 - left) * goal
@@ -92,7 +101,7 @@ def guide_of(
     innovation = (points.y - system.h(xhat)) * points.there / y_scale
     residual = rate - system.f(t, xhat, points.u)
     residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
-    floor = max(_CLEAR, 3 * float((noise / y_scale).max()))
+    floor = max(_CLEAR, float((noise / y_scale).max()))
     share = (innovation / y_scale) / ((innovation**2).sum(-1, keepdims=True) + floor**2)
     inside = (t < t[0] + _LAYER * tau)[:, None, None]
     L = L + inside * residual[:, :, None] * share[:, None, :]
