@@ -87,7 +87,7 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["train"], "name a trainer first: pinnobs train kkl_autoencoder | kkl_pinn | "),
         (
             ["train", "gpt", "--system", "Academic"],
-            "unknown trainer 'gpt'; known are pinn_gain, pinn_obs",
+            "unknown trainer 'gpt'; known are kkl_autoencoder, kkl_pinn, ",
         ),
         (["leaderboard", "--out", "file/x"], "cannot write to folder file/x"),
         (["leaderboard", "--jobs", "0"], "jobs=0"),

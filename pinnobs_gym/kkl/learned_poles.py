@@ -59,8 +59,8 @@ def learn(
     generator = torch.Generator().manual_seed(seed)
     ny, number = system.ny, len(sizes)
     logs = torch.tensor(np.log(sizes), requires_grad=True)
-    unit = [Scaling(np.zeros(n), np.eye(n)) for n in (ny * number, system.nx)]
-    net = Mlp(*unit, 2, _WIDTH, "tanh", generator)
+    inputs, outputs = (Scaling(np.zeros(n), np.eye(n)) for n in (ny * number, system.nx))
+    net = Mlp(inputs, outputs, 2, _WIDTH, "tanh", generator)
     adam = torch.optim.Adam([*net.parameters, logs], _RATE)
     std = torch.tensor(noise_std)
     steps = torch.arange(window + 1)
