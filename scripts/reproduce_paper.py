@@ -1,6 +1,6 @@
 """Make the paper's tables and examples anew, its figures beside ours.
 
-    python scripts/reproduce_paper.py depth | activation | weights | examples
+    python scripts/reproduce_paper.py depth | activation | weights | examples | comparison
 
 Each case is trained once and kept, whichever table asks for it: what is there is not run again, and
 a training that was stopped, or that is given a larger budget, goes on from its checkpoint. Results
@@ -22,7 +22,8 @@ from typing import Annotated, Any
 
 import joblib
 import tyro
-from reproduction import report
+from reproduction import comparison, report
+from reproduction.comparison import METHODS, Comparison
 from reproduction.running import Job, run
 from reproduction.tables import TABLES, Table
 from rich import box
@@ -34,6 +35,9 @@ from pinnobs_gym.report import check_writable, replacing
 from pinnobs_gym.rows import Row, append
 from trainers.pinn_obs import Config
 
+COMPARISON = "comparison"
+"""The table that is none of `TABLES`: its methods are several."""
+
 console = Console() if Console().is_terminal else Console(width=150)
 
 
@@ -42,7 +46,8 @@ class Options:
     """Make one of the paper's tables anew, its figures beside ours."""
 
     table: Annotated[str, tyro.conf.Positional]
-    """depth, activation, weights, or examples, which are the six systems."""
+    """depth, activation, weights, examples, which are the six systems, or comparison, of four
+    methods."""
     preset: str = "fast"
     """Recipe: fast, or the paper's own, paper."""
     budget: str = "120"
@@ -51,6 +56,8 @@ class Options:
     """Seed of the first weights."""
     jobs: int = 2
     """Trainings at a time, one thread each."""
+    records: int = 10
+    """Records that the methods are compared on."""
     only: tuple[str, ...] = ()
     """Names of cases, such as 9x20; all if none is named."""
     out: Path = Path("runs/paper")
@@ -63,7 +70,8 @@ class Options:
             ValueError: in one line, for a case or setting that cannot be.
         """
         if self.table not in TABLES:
-            raise ValueError(f"unknown table {self.table!r}; known are {', '.join(TABLES)}")
+            known = ", ".join([*TABLES, COMPARISON])
+            raise ValueError(f"unknown table {self.table!r}; known are {known}")
         cases = {case.name: case for case in TABLES[self.table].cases}
         for name in self.only:
             if name not in cases:
@@ -71,14 +79,28 @@ class Options:
                 raise ValueError(f"unknown case {name!r} of {self.table}; known are {known}")
         if self.jobs < 1:
             raise ValueError(f"jobs={self.jobs}; expected at least 1")
-        free: dict[str, Any] = {"preset": self.preset, "seed": self.seed, "budget": None}
-        if self.budget != "none":
-            free["budget"] = _number(self.budget)
+        free: dict[str, Any] = {"preset": self.preset, "seed": self.seed}
+        free["budget"] = _number(self.budget)
         names = self.only or cases
         return [Job(cases[n], Config(**free, **cases[n].settings), self.out) for n in names]
 
+    def compared(self) -> Comparison:
+        """The comparison asked for.
 
-def _number(budget: str) -> float:
+        Raises:
+            ValueError: in one line, for a setting that cannot be.
+        """
+        if self.records < 1:
+            raise ValueError(f"records={self.records}; expected at least 1")
+        chosen = Comparison(self.preset, _number(self.budget), self.seed, self.records)
+        for method in METHODS:
+            chosen.config(method)
+        return chosen
+
+
+def _number(budget: str) -> float | None:
+    if budget == "none":
+        return None
     try:
         return float(budget)
     except ValueError:
@@ -161,10 +183,38 @@ def reproduce(options: Options) -> int:
     return status
 
 
+def compare(options: Options) -> int:
+    """Run what is missing of the comparison and show its table; returns the exit status."""
+    chosen, results = options.compared(), options.out / "comparison.jsonl"
+    check_writable(options.out)
+    status = 0
+    try:
+        for done in comparison.run(chosen, results, set(comparison.read(results))):
+            console.print(done)
+    except KeyboardInterrupt:
+        print("stopped; run again to go on", file=sys.stderr)
+        status = 130
+    rows = comparison.read(results)
+    shown = RichTable(title="Comparison", title_justify="left", box=box.SIMPLE)
+    for i, name in enumerate(comparison.HEADER):
+        shown.add_column(name, justify="left" if i < 4 else "right")
+    for line in comparison.lines(chosen, rows):
+        shown.add_row(*line)
+    console.print(shown)
+    for note in chosen.protocol():
+        console.print(note, style="dim", markup=False, highlight=False)
+    path = options.out / f"{COMPARISON}.md"
+    with replacing(path) as temporary:
+        temporary.write_text(comparison.markdown(chosen, rows), encoding="utf-8")
+    console.print(f"table: {path}", soft_wrap=True)
+    return status
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status: 0, 1 if a case failed, 2 for bad input."""
     try:
-        return reproduce(tyro.cli(Options, args=arguments))
+        options = tyro.cli(Options, args=arguments)
+        return (compare if options.table == COMPARISON else reproduce)(options)
     except ValueError as error:
         print(f"reproduce_paper: error: {error}", file=sys.stderr)
         return 2

@@ -86,10 +86,10 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["evaluate", "--system", "Academic", "--checkpoint", "x"], "is not one that is trained"),
         (["evaluate", "--system", "Academic", "--out", "file/x"], "cannot write"),
         (["systems", "Duffing"], "unknown system 'Duffing'"),
-        (["train"], "name a trainer first: pinnobs train pinn_gain | pinn_obs"),
+        (["train"], "name a trainer first: pinnobs train kkl_autoencoder | kkl_pinn | "),
         (
             ["train", "gpt", "--system", "Academic"],
-            "unknown trainer 'gpt'; known are pinn_gain, pinn_obs",
+            "unknown trainer 'gpt'; known are kkl_autoencoder, kkl_pinn, ",
         ),
         (["leaderboard", "--out", "file/x"], "cannot write to folder file/x"),
         (["leaderboard", "--jobs", "0"], "jobs=0"),

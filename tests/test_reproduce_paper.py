@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
 import pinnobs_gym
@@ -17,7 +19,7 @@ sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 
 import readme
 import reproduce_paper
-from reproduction import report, running
+from reproduction import comparison, report, running
 from reproduction.tables import TABLES, Case, Printed, Table
 
 from trainers.pinn_obs import Config
@@ -259,3 +261,30 @@ def test_a_damaged_results_file_is_one_line(line, capsys, tmp_path):
     error = capsys.readouterr().err
     assert "results.jsonl, line 1, is cut off or no result" in error
     assert error.count("\n") == 1
+
+
+def test_the_comparison_keeps_what_is_there_and_shows_both(tmp_path, capsys):
+    options = ["comparison", "--records", "2", "--budget", "0.5", "--out", str(tmp_path)]
+    assert reproduce_paper.main(options) == 0
+    shown = capsys.readouterr().out
+    assert "kkl_autoencoder: trained in" in shown
+    assert "record 1 of 2" in shown
+    text = (tmp_path / "comparison.md").read_text()
+    assert "| pinn_obs | the paper | not stated | not stated | 5.56e-06 | 0.00236 |" in text
+    assert "z₀ = 0" in text
+    for method in comparison.METHODS:
+        for statistic in ("mean", "median"):
+            assert f"| {method} | ours | from 10 s | {statistic} |" in text
+    assert reproduce_paper.main(options) == 0
+    assert "trained in" not in capsys.readouterr().out
+    assert (tmp_path / "comparison.md").read_text() == text
+    assert reproduce_paper.main(["comparison", "--records", "0"]) == 2
+    assert "records=0; expected at least 1" in capsys.readouterr().err
+
+
+def test_the_compared_records_are_the_env_s():
+    record, x = comparison.played(2)
+    np.testing.assert_array_equal(record.y, x[..., :1])
+    env = gym.make("pinnobs/ReverseDuffing-v0", noise_std=0.0)
+    _, info = env.reset(seed=1)
+    np.testing.assert_array_equal(x[1, 0], info["state"])

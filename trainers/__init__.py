@@ -1,3 +1,4 @@
 """Trainers of learned estimators, a module or package each: a Config, whose ``episodes`` says how
 many episodes the training takes, and `train`. One whose Config says 0 plays its own; see
-`pinnobs_gym.suite.train`."""
+`pinnobs_gym.suite.train`. If there is more to see of what `train` returns than its estimates, there
+is ``figures(system, trained, record)``, too: pictures by name."""

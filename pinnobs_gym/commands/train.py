@@ -75,10 +75,16 @@ def run(arguments: Sequence[str]) -> int:
             resume=chosen.resume,
             progress=True,
         )
-    result.save(path)
+        result.save(path)
+        pictures = module.figures(system, result, record) if hasattr(module, "figures") else {}
+        for kind, figure in pictures.items():
+            log.figure(f"trained/{kind}", figure, result.iterations)
+            write_figure(stem.with_name(f"{stem.name}-{kind}.png"), figure)
     console.print(
         f"loss {result.loss:.3g} after {result.iterations} iterations, {result.seconds:.1f} CPU s"
     )
+    for kind in pictures:
+        console.print(f"picture: {stem.with_name(f'{stem.name}-{kind}.png')}", soft_wrap=True)
     for label, cls in ESTIMATORS.classes().items():
         if cls.needs_training == name:
             estimator = suite.load(cls, path, system, setup)

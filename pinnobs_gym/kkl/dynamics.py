@@ -1,0 +1,181 @@
+"""The linear dynamics of a KKL observer: the choice of (A, B) and the exact integration of z."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.signal import besselap
+
+Design: TypeAlias = Literal["bessel", "niazi", "poles", "learned"]
+Mode: TypeAlias = Literal["continuous", "discrete"]
+Start: TypeAlias = Literal["output", "zero", "prior"]
+"""z before the first sample: at rest under y₀; 0; or T(x̂₀)."""
+
+_REACH = 1e-6
+"""Least singular value in Hautus's test, over the eigenvalue, of a mode within y's reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """The system ż = Az + By, or its Euler step z⁺ = z + h(Az + By) in discrete time.
+
+    Raises:
+        ValueError: in one line, if A is not Hurwitz or (A, B) is not controllable.
+    """
+
+    A: np.ndarray
+    """Shape (nz, nz), in 1/s."""
+    B: np.ndarray
+    """Shape (nz, ny), in 1/s per output unit."""
+    mode: Mode = "continuous"
+
+    def __post_init__(self) -> None:
+        slowest = float(np.linalg.eigvals(self.A).real.max())
+        if not slowest < 0:
+            raise ValueError(
+                f"A_z is not Hurwitz: it has an eigenvalue of real part {slowest:.4g}; expected "
+                "all below 0"
+            )
+        lost = [value for value in np.linalg.eigvals(self.A) if self._loses(value)]
+        if lost:
+            raise ValueError(
+                f"(A_z, B_z) is not controllable at the pole {lost[0]:.4g}: a pole that is "
+                "repeated adds nothing to z"
+            )
+
+    def _loses(self, value: complex) -> bool:
+        """Whether the mode of an eigenvalue is out of the output's reach (Hautus's test)."""
+        size = abs(value)
+        test = np.concatenate([value * np.eye(self.size) - self.A, self.B], axis=1) / size
+        return float(np.linalg.svd(test, compute_uv=False)[-1]) < _REACH
+
+    @property
+    def size(self) -> int:
+        """How many components z has."""
+        return len(self.A)
+
+    @property
+    def slowest(self) -> float:
+        """The smallest abs Re λ of A's eigenvalues, in 1/s."""
+        return float(abs(np.linalg.eigvals(self.A).real).min())
+
+    def step(self, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Φ (nz, nz), Γ₀ and Γ₁ (nz, ny) of z(t + h) = Φz(t) + Γ₀y(t) + Γ₁y(t + h), exact for an
+        output that is a straight line between the two.
+
+        Raises:
+            ValueError: in one line, in discrete time, if I + hA is not Schur.
+        """
+        return _step(self.A.tobytes(), self.B.tobytes(), self.size, self.mode, h)
+
+    def filtered(self, t: np.ndarray, y: np.ndarray, z0: np.ndarray | float = 0.0) -> np.ndarray:
+        """The z (num_samples, batch, nz) that outputs y (num_samples, batch, ny) at times t (s)
+        drive from z0 at the first of them."""
+        z = np.empty((*y.shape[:2], self.size))
+        z[0] = z0
+        for k, h in enumerate(np.round(np.diff(t), 12)):
+            flow, before, after = self.step(float(h))
+            z[k + 1] = z[k] @ flow.T + y[k] @ before.T + y[k + 1] @ after.T
+        return z
+
+    def flows(self, t: np.ndarray) -> np.ndarray:
+        """Φ from the first of the times t (num_samples,) in s to each, (num_samples, nz, nz)."""
+        nothing = np.zeros((len(t), self.size, self.B.shape[1]))
+        return self.filtered(t, nothing, np.eye(self.size)).swapaxes(1, 2)
+
+
+@lru_cache(maxsize=512)
+def _step(
+    A_bytes: bytes, B_bytes: bytes, size: int, mode: Mode, h: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    A = np.frombuffer(A_bytes).reshape(size, size)
+    B = np.frombuffer(B_bytes).reshape(size, -1)
+    ny = B.shape[1]
+    if mode == "discrete":
+        flow = np.eye(size) + h * A
+        largest = float(abs(np.linalg.eigvals(flow)).max())
+        if not largest < 1:
+            raise ValueError(
+                f"A_z is not Schur in discrete time: I + {h:g} s·A_z has an eigenvalue of size "
+                f"{largest:.4g}; expected all below 1"
+            )
+        return flow, h * B, np.zeros_like(B)
+    # The exponential that also integrates the input and its ramp (Van Loan 1978).
+    block = np.zeros((size + 2 * ny,) * 2)
+    block[:size, :size], block[:size, size : size + ny] = h * A, h * B
+    block[size : size + ny, size + ny :] = np.eye(ny)
+    whole = expm(block)
+    held, ramp = whole[:size, size : size + ny], whole[:size, size + ny :]
+    return whole[:size, :size], held - ramp, ramp
+
+
+def realised(poles: Sequence[complex], ny: int, mode: Mode = "continuous") -> Dynamics:
+    """One filter per output with these poles, each in real modal form with unit gain at rest.
+
+    Args:
+        poles: in 1/s, complex ones in conjugate pairs.
+        ny: number of outputs.
+        mode: continuous or discrete time.
+
+    Raises:
+        ValueError: in one line, if they are not stable, not in pairs, or repeated.
+    """
+    values: Any = np.asarray(poles, dtype=complex)
+    if not np.isfinite(values).all():
+        raise ValueError(f"poles={list(poles)}; expected finite numbers")
+    upper = np.sort_complex(values[values.imag > 0])
+    lower = np.sort_complex(values[values.imag < 0].conj())
+    if len(upper) != len(lower) or not np.allclose(upper, lower):
+        raise ValueError(f"poles={list(poles)}; expected complex ones in conjugate pairs")
+    blocks: list[tuple[np.ndarray, np.ndarray]] = []
+    for pole in np.sort(values[values.imag == 0].real)[::-1]:
+        blocks.append((np.array([[pole]]), np.array([abs(pole)])))
+    for pole in upper:
+        a, b = pole.real, pole.imag
+        turn = np.array([[a, b], [-b, a]])
+        blocks.append((turn, np.array([abs(pole), 0.0])))
+    size = len(values)
+    A, B = np.zeros((size, size)), np.zeros((size, 1))
+    row = 0
+    for block, gain in blocks:
+        part = slice(row, row + len(block))
+        A[part, part], B[part, 0] = block, gain
+        row += len(block)
+    eye = np.eye(ny)
+    return Dynamics(np.kron(eye, A), np.kron(eye, B), mode)
+
+
+def bessel(order: int, cutoff: float) -> tuple[complex, ...]:
+    """The poles of Bessel's filter of an order with a cut-off in Hz (Ramos et al. 2020)."""
+    _, poles, _ = besselap(order, norm="mag")
+    return tuple(2 * np.pi * cutoff * np.asarray(poles))
+
+
+def niazi(nx: int) -> tuple[complex, ...]:
+    """The poles −1, −2, ... of Niazi et al. (2023), 2nx + 1 of them."""
+    return tuple(complex(-k) for k in range(1, 2 * nx + 2))
+
+
+def enough(order: int, nx: int, ny: int) -> None:
+    """Whether filters of an order, one per output, can tell nx states apart.
+
+    Raises:
+        ValueError: in one line, if z has fewer components than a state and one more.
+    """
+    if order * ny < nx + 1:
+        raise ValueError(
+            f"n_z={order * ny} ({order} for each of {ny} outputs); expected at least nx + 1 = "
+            f"{nx + 1}"
+        )
+
+
+def at_rest(dynamics: Dynamics, start: Start) -> np.ndarray:
+    """What z begins at over a constant output, (nz, ny)."""
+    if start == "output":
+        return -np.linalg.solve(dynamics.A, dynamics.B)
+    return np.zeros_like(dynamics.B)

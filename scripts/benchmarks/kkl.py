@@ -1,0 +1,190 @@
+"""The learned KKL observers: accuracy, noise, states never trained on, the benchmark, cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+import trainers.kkl_autoencoder
+import trainers.kkl_pinn
+import trainers.kkl_supervised
+from benchmarks import Figure, at_most
+from pinnobs_gym import env_id, evaluate
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.kkl.observer import KKL, TrainedKKL
+from pinnobs_gym.record import Prior, Record
+from pinnobs_gym.simulate import truth
+from pinnobs_gym.suite import TRAINING_SEED, record_of
+from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+
+MODULES: dict[str, ModuleType] = {
+    "kkl_supervised": trainers.kkl_supervised,
+    "kkl_pinn": trainers.kkl_pinn,
+    "kkl_autoencoder": trainers.kkl_autoencoder,
+}
+SEEDS = range(3)
+"""Training seeds, of which the worst counts."""
+TIMES = 0.05 * np.arange(1001)
+"""Samples of the episodes on ReverseDuffing, in s."""
+FROM = 10.0
+"""When scoring begins there, in s."""
+STATES = 400
+"""Initial states that are scored there."""
+BUDGET = 40.0
+"""CPU seconds of each training there."""
+SETTINGS: dict[str, Any] = {"start": "zero", "transient": False, "budget": BUDGET}
+ACCURACY = {"kkl_supervised": 2e-6, "kkl_pinn": 1e-5, "kkl_autoencoder": 2e-5}
+"""Asked of the mean squared error without noise."""
+TAIL = {
+    **{"ReverseDuffing": 0.005, "ModifiedAcademic": 0.005},
+    **{"HarmonicOscillator": 0.01, "Satellite": 0.01},
+}
+"""Asked of the median tail NRMSE of the best of the three on the benchmark."""
+EPISODES = 100
+"""Episodes of the benchmark, of seeds 0, 1, ..."""
+BENCHMARK_BUDGET = 45.0
+"""CPU seconds of each training on the benchmark, as the leaderboard gives."""
+COST_BATCH = 256
+
+
+def figures(repeats: int) -> Iterator[Figure]:
+    """All figures of the group."""
+    trained = yield from accuracy()
+    yield from cost(trained, repeats)
+    yield from noisy()
+    yield from outside()
+    yield from benchmark()
+
+
+def accuracy() -> Iterator[Figure]:
+    """Without noise on [−1, 1]²."""
+    trained: Any = None
+    for name, bound in ACCURACY.items():
+        box = {"low": (-1.0, -1.0), "high": (1.0, 1.0), "cutoff": 0.35, "noise": False}
+        found = []
+        for seed in SEEDS:
+            trained = fitted(name, 0.0, seed=seed, **box, **SETTINGS)
+            found.append(mse(trained, inside(1.0), 0.0))
+            yield Figure(f"{name}, MSE without noise, seed {seed}", found[-1], "", "", None)
+            title = f"{name}, training, seed {seed}"
+            yield at_most(title, trained.seconds, "CPU s", 100.0)
+        yield at_most(f"{name}, MSE without noise, worst seed", max(found), "", bound)
+    return trained
+
+
+def noisy() -> Iterator[Figure]:
+    """With output noise of 0.1 on [−1, 1]², trained with that noise."""
+    box = {"low": (-1.0, -1.0), "high": (1.0, 1.0), "cutoff": 0.1, "order": 5}
+    found = []
+    for seed in SEEDS:
+        trained = fitted("kkl_supervised", 0.1, seed=seed, **box, **SETTINGS)
+        found.append(mse(trained, inside(1.0), 0.1))
+        yield Figure(f"kkl_supervised, MSE at noise 0.1, seed {seed}", found[-1], "", "", None)
+    yield at_most("kkl_supervised, MSE at noise 0.1, worst seed", max(found), "", 5e-4)
+
+
+def outside() -> Iterator[Figure]:
+    """Beyond [−1, 1]², trained on [−3, 3]²."""
+    box = {"low": (-3.0, -3.0), "high": (3.0, 3.0), "cutoff": 0.35, "noise": False}
+    found = []
+    for seed in SEEDS:
+        trained = fitted("kkl_supervised", 0.0, seed=seed, **box, **SETTINGS)
+        found.append(mse(trained, beyond(), 0.0))
+        title = f"kkl_supervised, MSE from 1.5 <= abs x0 <= 3, seed {seed}"
+        yield Figure(title, found[-1], "", "", None)
+    title = "kkl_supervised, MSE from 1.5 <= abs x0 <= 3, worst seed"
+    yield at_most(title, max(found), "", 5e-5)
+
+
+def inside(side: float) -> np.ndarray:
+    """Initial states uniform in a square."""
+    return np.random.default_rng(12345).uniform(-side, side, (STATES, 2))
+
+
+def beyond() -> np.ndarray:
+    """Initial states of both components between 1.5 and 3 in size."""
+    rng = np.random.default_rng(12345)
+    return rng.uniform(1.5, 3.0, (STATES, 2)) * rng.choice([-1.0, 1.0], (STATES, 2))
+
+
+def fitted(name: str, noise_std: float, **settings: Any) -> TrainedKKL:
+    """A training on ReverseDuffing."""
+    module = MODULES[name]
+    torch.set_num_threads(1)
+    return module.train(
+        ReverseDuffing(),
+        module.Config(**settings),
+        record=played(np.zeros((1, 2)), 0.0),
+        noise_std=noise_std,
+    )
+
+
+def played(x0: np.ndarray, noise_std: float) -> Record:
+    """Episodes of ReverseDuffing from initial states."""
+    return _with_states(x0, noise_std)[0]
+
+
+def _with_states(x0: np.ndarray, noise_std: float) -> tuple[Record, np.ndarray]:
+    system = ReverseDuffing()
+    x = truth(system, x0, TIMES).swapaxes(0, 1)
+    y = system.h(x) + noise_std * np.random.default_rng(54321).standard_normal((*x.shape[:2], 1))
+    setup = system.setups["benchmark"]
+    return Record(TIMES, y, np.empty((*x.shape[:2], 0)), Prior.of(system, setup, len(x0))), x
+
+
+def mse(trained: TrainedKKL, x0: np.ndarray, noise_std: float) -> float:
+    """Mean squared error over both states, all episodes and all samples from `FROM` on."""
+    record, x = _with_states(x0, noise_std)
+    xhat = KKL(ReverseDuffing(), trained=trained).run(record).xhat
+    late = record.t >= FROM - 1e-9
+    return float(((xhat - x)[:, late] ** 2).mean())
+
+
+def cost(trained: TrainedKKL, repeats: int) -> Iterator[Figure]:
+    """CPU time of an update, per step and episode."""
+    record = played(inside(1.0)[:COST_BATCH], 0.0)
+    observer = KKL(ReverseDuffing(), trained=trained)
+    taken = []
+    for _ in range(repeats):
+        start = time.process_time()
+        observer.run(record)
+        taken.append(time.process_time() - start)
+    each = 1e6 * float(np.median(taken)) / (record.batch * record.num_samples)
+    title = f"online cost per step and episode, batch {COST_BATCH}"
+    yield at_most(title, each, "µs", 5.0)
+
+
+def benchmark() -> Iterator[Figure]:
+    """The benchmark's episodes, with the default recipes."""
+    for name in SYSTEMS.classes():
+        tails, diverged = {}, {}
+        for trainer in MODULES:
+            rows = _scored(name, trainer)
+            tails[trainer] = float(np.median([row["nrmse_tail"] for row in rows]))
+            diverged[trainer] = 100 * float(np.mean([row["diverged"] for row in rows]))
+            whole = float(np.median([row["nrmse"] for row in rows]))
+            yield Figure(f"{trainer} on {name}, NRMSE", whole, "", "", None)
+            yield Figure(f"{trainer} on {name}, tail NRMSE", tails[trainer], "", "", None)
+            yield Figure(f"{trainer} on {name}, diverged", diverged[trainer], "%", "", None)
+        best = min(tails, key=lambda trainer: (diverged[trainer], tails[trainer]))
+        if name in TAIL:
+            yield at_most(f"best of three on {name}, diverged", diverged[best], "%", 0.0)
+            yield at_most(f"best of three on {name}, tail NRMSE", tails[best], "", TAIL[name])
+
+
+def _scored(name: str, trainer: str) -> list[dict[str, Any]]:
+    module = MODULES[trainer]
+    torch.set_num_threads(1)
+    system, setup, record = record_of(env_id(name), "benchmark", "nominal", TRAINING_SEED)
+    config = module.Config(budget=BENCHMARK_BUDGET)
+    trained = module.train(system, config, record=record, noise_std=setup.noise_std)
+    observer: Any = ESTIMATORS.resolve(trainer)
+    return evaluate(
+        observer(system, setup.noise_std, trained=trained), env_id(name), episodes=EPISODES
+    )

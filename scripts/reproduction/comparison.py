@@ -1,0 +1,209 @@
+"""PINN-Obs and the three learned KKL observers on the same records of ReverseDuffing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+import trainers.kkl_autoencoder
+import trainers.kkl_pinn
+import trainers.kkl_supervised
+import trainers.pinn_obs
+from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
+from pinnobs_gym.evaluation import canonical
+from pinnobs_gym.kkl.observer import KKL
+from pinnobs_gym.metrics import score
+from pinnobs_gym.record import Record
+from pinnobs_gym.rows import Row, append
+
+METHODS: Mapping[str, ModuleType] = {
+    "pinn_obs": trainers.pinn_obs,
+    "pinn_obs_replay": trainers.pinn_obs,
+    "kkl_pinn": trainers.kkl_pinn,
+    "kkl_supervised": trainers.kkl_supervised,
+    "kkl_autoencoder": trainers.kkl_autoencoder,
+}
+METRICS = ("mse", "rmse", "mae", "smape")
+PRINTED: Mapping[str, tuple[float | None, ...]] = {
+    "pinn_obs": (5.56e-6, 0.00236, 0.00175, 1.18),
+    "kkl_pinn": (3.54e-5, 0.00595, None, None),
+    "kkl_supervised": (3.94e-5, 0.00628, None, None),
+    "kkl_autoencoder": (4.39e-5, 0.00663, None, None),
+}
+"""What the paper prints, "Comparison with Existing Methods", in the order of `METRICS`; the others
+are bars of a figure."""
+WINDOWS = {"whole": 0.0, "from 10 s": 10.0}
+"""Windows that are scored, by when they begin in s."""
+HEADER = ("method", "by", "window", "statistic", "MSE", "RMSE", "MAE", "SMAPE %", "training s")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is compared."""
+
+    preset: str
+    """PINN-Obs' recipe: fast or paper."""
+    budget: float | None
+    """CPU seconds of each training."""
+    seed: int
+    """Seed of the weights."""
+    records: int
+    """Initial states: episodes of the benchmark's seeds 0, 1, ..."""
+
+    def config(self, method: str) -> Any:
+        """A method's recipe."""
+        common = {"seed": self.seed, "budget": self.budget}
+        if method.startswith("pinn_obs"):
+            transfer = method == "pinn_obs_replay" and self.preset == "fast"
+            return METHODS[method].Config(self.preset, transfer=transfer, **common)
+        return METHODS[method].Config(start="zero", transient=False, noise=False, **common)
+
+    def key(self, method: str, episode: int) -> str:
+        """What decides a method's scores on an episode."""
+        text = json.dumps([method, episode, canonical(self.config(method))], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def protocol(self) -> list[str]:
+        """What the figures are of, a paragraph each."""
+        source = _source()
+        setup = source.setup
+        return [
+            f"Ours: ReverseDuffing without noise, {self.records} initial states of the benchmark's "
+            f"set (episodes of seeds 0 to {self.records - 1}), {setup.num_steps} samples over "
+            f"{setup.duration:g} s. Every method sees the same records. Errors are over both "
+            "states, in state units; mean and median are over the records. SMAPE is large wherever "
+            "a state passes zero.",
+            "PINN-Obs is trained on each record by itself, from x̂₀ = [1, 1], and scored offline by "
+            "the network's own x̂(t). pinn_obs_replay is the observer with the learned L(t) on the "
+            "same record, online; its gain is trained to transfer, where the recipe can. The KKL "
+            "observers are each trained once, on simulated episodes of the benchmark's set with "
+            "their true states, without noise, and run online on every record from z₀ = 0; T* is "
+            "not told the time. Training is CPU seconds of one thread, for PINN-Obs those of one "
+            "record (the median).",
+            "The paper's: one bar for each method and metric. It does not state its initial "
+            "states, z₀, window or noise, and whether they are of one record; its figures of "
+            "PINN-Obs cannot include the sample at t₀ (see the table of examples).",
+        ]
+
+
+def _source() -> EpisodeSource:
+    return EpisodeSource("ReverseDuffing", noise_std=0.0)
+
+
+def played(records: int) -> tuple[Record, np.ndarray]:
+    """The records, and the true states (records, num_samples, nx)."""
+    source = _source()
+    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(records)]
+    episodes = source.play(source.draw(streams))
+    record = source.record(episodes)
+    return record, episodes.x[: record.num_samples].swapaxes(0, 1)
+
+
+def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]:
+    """Train and score what is missing, keeping each row as it is made; yields what was done."""
+    torch.set_num_threads(1)
+    record, x = played(comparison.records)
+    system = _source().system
+    for method, module in METHODS.items():
+        config = comparison.config(method)
+        keys = [comparison.key(method, i) for i in range(comparison.records)]
+        missing = [i for i, key in enumerate(keys) if key not in known]
+        if not missing:
+            continue
+        if not method.startswith("pinn_obs"):
+            first = record.rows(slice(0, 1))
+            trained = module.train(system, config, record=first, noise_std=0.0)
+            xhat = KKL(system, trained=trained).run(record).xhat
+            rows = [_row(comparison, method, i, trained, record.t, x[i], xhat[i]) for i in missing]
+            append(results, rows)
+            yield f"{method}: trained in {trained.seconds:.0f} CPU s, run on {len(rows)} records"
+            continue
+        for i in missing:
+            own = record.rows(slice(i, i + 1))
+            trained = module.train(system, config, record=own)
+            replayed = method == "pinn_obs_replay"
+            observer = PinnObsReplay.of(system, trained)
+            xhat = observer.run(own).xhat[0] if replayed else trained.xhat(record.t)
+            append(results, [_row(comparison, method, i, trained, record.t, x[i], xhat)])
+            yield f"{method}: record {i} of {comparison.records}, {trained.seconds:.1f} CPU s"
+
+
+def _row(
+    comparison: Comparison,
+    method: str,
+    episode: int,
+    trained: Any,
+    t: np.ndarray,
+    x: np.ndarray,
+    xhat: np.ndarray,
+) -> Row:
+    scores = {}
+    for window, start in WINDOWS.items():
+        late = t >= start - 1e-9
+        values = score(t[late], x[None, late], xhat[None, late], (1.0, 1.0))
+        scores[window] = {metric: float(values[metric][0]) for metric in METRICS}
+    key = comparison.key(method, episode)
+    seconds = trained.seconds
+    config = asdict(comparison.config(method))
+    return {"key": key, "method": method, "scores": scores, "seconds": seconds, "config": config}
+
+
+def read(path: Path) -> dict[str, Row]:
+    """Rows by key; none if the file is not there.
+
+    Raises:
+        ValueError: in one line, if a line of it is not a row.
+    """
+    found: dict[str, Row] = {}
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+            found[row["key"]] = row
+        except (ValueError, TypeError, KeyError):
+            raise ValueError(
+                f"{path}, line {number}, is cut off or no result: {line[:40]!r}; delete that line "
+                "and run again"
+            ) from None
+    return found
+
+
+def lines(comparison: Comparison, rows: Mapping[str, Row]) -> list[tuple[str, ...]]:
+    """The table's cells: for each method the paper's line, then ours."""
+    table: list[tuple[str, ...]] = []
+    for method in METHODS:
+        if method in PRINTED:
+            printed = ["" if value is None else f"{value:.3g}" for value in PRINTED[method]]
+            table.append((method, "the paper", "not stated", "not stated", *printed, ""))
+        own = [rows.get(comparison.key(method, i)) for i in range(comparison.records)]
+        there = [row for row in own if row is not None]
+        seconds = f"{np.median([row['seconds'] for row in there]):.0f}" if there else ""
+        for window in WINDOWS if there else ():
+            for statistic, of in (("mean", np.mean), ("median", np.median)):
+                values = [of(_values(there, window, metric)) for metric in METRICS]
+                shown = [f"{value:.3g}" for value in values]
+                table.append((method, "ours", window, statistic, *shown, seconds))
+    return table
+
+
+def _values(rows: Sequence[Row], window: str, metric: str) -> list[float]:
+    values = [row["scores"][window][metric] for row in rows]
+    return [math.inf if value is None else value for value in values]
+
+
+def markdown(comparison: Comparison, rows: Mapping[str, Row]) -> str:
+    """The table with its protocol as Markdown."""
+    cells = [HEADER, ("---",) * 4 + ("---:",) * 5, *lines(comparison, rows)]
+    body = "\n".join("| " + " | ".join(line) + " |" for line in cells)
+    title = "# PINN-Obs and learned KKL observers on ReverseDuffing"
+    return "\n\n".join([title, body, *comparison.protocol()]) + "\n"

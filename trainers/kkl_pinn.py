@@ -1,0 +1,118 @@
+"""A KKL observer whose T also satisfies its partial differential equation (Niazi, Cao, Sun, Das &
+Johansson, "Learning-based design of Luenberger observers for autonomous nonlinear systems", ACC
+2023).
+
+T is fitted to simulated pairs of x and z, and to (∂T/∂x) f = A_z T + B_z h (of a driven plant, with
+∂T/∂t) at other states; T* to simulated z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import torch
+
+from pinnobs_gym.kkl import recipe
+from pinnobs_gym.kkl.fitting import Equations, Objective, Term
+from pinnobs_gym.kkl.observer import TrainedKKL
+from pinnobs_gym.kkl.pictures import figures
+from pinnobs_gym.kkl.recipe import DEFAULT, KKLConfig, Run
+from pinnobs_gym.log import SILENT, Log
+from pinnobs_gym.record import Record
+from pinnobs_gym.system import System
+from pinnobs_gym.training import expect
+
+__all__ = ["Config", "figures", "train"]
+
+
+@dataclass(frozen=True)
+class Config(KKLConfig):
+    """The recipe of a physics-informed KKL observer. ``faithful`` is Niazi et al.'s: poles −1, −2,
+    ..., z from 0, no noise, Adam."""
+
+    equation: float = 0.3
+    """Weight of the equation's residual, taken over z's slowest time constant, beside the
+    labels'."""
+
+    PRESETS = MappingProxyType(
+        {
+            "default": {**DEFAULT, "share": 0.6},
+            "faithful": {
+                **DEFAULT,
+                "design": "niazi",
+                "start": "zero",
+                "transient": False,
+                "depth": 3,
+                "width": 50,
+                "activation": "relu",
+                "method": "adam",
+                "learning_rate": 1e-3,
+                "batch": 256,
+                "iterations": 12_000,
+                "share": 1.0,
+                "noise": False,
+                "dtype": "float32",
+            },
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expect(self, "equation", "a number of at least 0", lambda v: 0 <= v < np.inf)
+
+
+def physics(run: Run) -> Objective:
+    """T(x) = z at samples of simulated episodes, and the equation of T at others."""
+    assert run.labels is not None
+    known, config, data = run.labels, run.config, run.data
+    assert isinstance(config, Config)
+    scaling, dynamics = run.z_scaling, run.dynamics
+    unit = config.equation**0.5 / dynamics.slowest
+    root = np.linalg.inv(scaling.root)
+    matrix = run.tensor(-unit * root @ dynamics.A @ scaling.root)
+    y = run.system.h(data.x)
+    target = run.tensor(unit * (y @ dynamics.B.T + dynamics.A @ scaling.mean) @ root.T)
+    rate = run.tensor(unit * run.rates())
+
+    def draw(generator: torch.Generator) -> Sequence[Equations]:
+        k, i = run.draw(generator, dynamics.size, 0.5)
+        found = [Equations([Term(run.encoded(k, i))], known[k, i])]
+        if config.equation:
+            k, i = run.draw(generator, dynamics.size, 0.5)
+            a = run.encoded(k, i)
+            terms = [Term(a, along=rate[k, i]), Term(a, matrix)]
+            found.append(Equations(terms, target[k, i]))
+        return found
+
+    return draw
+
+
+def train(
+    system: System,
+    config: Config,
+    *,
+    record: Record,
+    noise_std: Sequence[float] | float | None = None,
+    log: Log = SILENT,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: bool = False,
+) -> TrainedKKL:
+    """Train T and T* on simulated episodes of the model; see `pinnobs_gym.kkl.recipe.train`."""
+    return recipe.train(
+        "kkl_pinn",
+        physics,
+        True,
+        system,
+        config,
+        record=record,
+        noise_std=noise_std,
+        log=log,
+        checkpoint=checkpoint,
+        resume=resume,
+        progress=progress,
+    )
