@@ -76,7 +76,10 @@ def run(arguments: Sequence[str]) -> int:
             progress=True,
         )
         result.save(path)
-        pictures = module.figures(system, result, record) if hasattr(module, "figures") else {}
+        pictures = {}
+        if hasattr(module, "figures"):
+            record = suite.record_of(*played)[2]
+            pictures = module.figures(system, result, record)
         for kind, figure in pictures.items():
             log.figure(f"trained/{kind}", figure, result.iterations)
             write_figure(stem.with_name(f"{stem.name}-{kind}.png"), figure)
