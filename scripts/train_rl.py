@@ -82,7 +82,7 @@ class Main:
                 )
             trained.save(path)
         made = Sb3.load(path, system)
-        check_same(path, made.trained.config, asdict(config.tuned()))
+        check_same(path, made.trained.config, asdict(config.filled()))
         return made
 
     def _score(self, name: str, estimator: Estimator | str, label: str) -> None:

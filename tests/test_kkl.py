@@ -25,7 +25,7 @@ from pinnobs_gym.kkl.labels import (
 )
 from pinnobs_gym.kkl.learned_poles import _response
 from pinnobs_gym.kkl.networks import Mlp, Scaling, evaluate
-from pinnobs_gym.kkl.recipe import Run, kept_samples
+from pinnobs_gym.kkl.run import Run, kept_samples
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import truth
 from pinnobs_gym.suite import record_of, trainer

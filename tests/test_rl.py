@@ -41,7 +41,7 @@ KINDS = [
 def small(algorithm: str = "ppo", mode: str = "gain", **changes: Any) -> Config:
     buffer = {"buffer": 1000} if algorithm in ("sac", "td3") else {}
     given: Any = {**SMALL, **buffer, **changes}
-    return Config(algorithm=algorithm, action_mode=mode, **given).tuned()  # pyright: ignore
+    return Config(algorithm=algorithm, action_mode=mode, **given).filled()  # pyright: ignore
 
 
 @pytest.fixture(scope="module")
@@ -267,7 +267,7 @@ def test_bad_checkpoints(tmp_path: Path) -> None:
 )
 def test_bad_settings(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        Config(**arguments).tuned()
+        Config(**arguments).filled()
 
 
 # Scripts and hyperparameter files
@@ -279,7 +279,7 @@ SCRIPTS = Path(__file__).parents[1] / "scripts"
 def test_the_zoos_files_name_all_envs_and_hold_our_defaults(algorithm: str) -> None:
     read = yaml.safe_load((SCRIPTS / "zoo" / f"{algorithm}.yml").read_text(encoding="utf-8"))
     assert set(read) == {env_id(cls) for cls in SYSTEMS.classes().values()}
-    config = Config(algorithm=algorithm).tuned()  # pyright: ignore
+    config = Config(algorithm=algorithm).filled()  # pyright: ignore
     chosen = options(config, 2)
     for name, held in read.items():
         ((path, arguments),) = held["env_wrapper"][0].items()

@@ -16,11 +16,12 @@ from types import MappingProxyType
 import numpy as np
 import torch
 
-from pinnobs_gym.kkl import recipe
+from pinnobs_gym.kkl import course
+from pinnobs_gym.kkl.config import DEFAULT, KKLConfig
 from pinnobs_gym.kkl.fitting import Equations, Objective, Term
 from pinnobs_gym.kkl.observer import TrainedKKL
 from pinnobs_gym.kkl.pictures import figures
-from pinnobs_gym.kkl.recipe import DEFAULT, KKLConfig, Run
+from pinnobs_gym.kkl.run import Run
 from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System
@@ -102,8 +103,8 @@ def train(
     resume: bool = False,
     progress: bool = False,
 ) -> TrainedKKL:
-    """Train T and T* on simulated episodes of the model; see `pinnobs_gym.kkl.recipe.train`."""
-    return recipe.train(
+    """Train T and T* on simulated episodes of the model; see `pinnobs_gym.kkl.course.train`."""
+    return course.train(
         "kkl_pinn",
         physics,
         True,

@@ -8,6 +8,7 @@ input, and how long ago z began, and starts at the first sample instead of in th
 nothing is integrated backward, along which a dissipative plant would run away.
 
 `dynamics` has (A, B) and the exact integration of z, `labels` the simulated states and their T(x),
-`networks` the maps T and T*, `observer` the estimator and its file, `fitting` one training of one
-network, `recipe` the settings and the course of a training, `pictures` the figures.
+`networks` the maps T and T*, `observer` the estimator and its file, `config` the settings,
+`fitting` one training of one network, `run` that of both, `course` how it begins, goes on and
+ends, `pictures` the figures.
 """

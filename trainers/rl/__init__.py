@@ -61,7 +61,7 @@ def train(
 
     if resume and checkpoint is None:
         raise ValueError("resume=True without a checkpoint; name its file")
-    config = config.tuned()
+    config = config.filled()
     begun = time.process_time()
     if resume and checkpoint is not None:
         training = restore(system, config, played, checkpoint)

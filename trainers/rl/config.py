@@ -33,7 +33,7 @@ _OFF_POLICY = {
     "buffer": 300_000,
 }
 _STACK = {"stack": 8}
-TUNED: dict[tuple[str, str], dict[str, Any]] = {
+DEFAULTS: dict[tuple[str, str], dict[str, Any]] = {
     ("ppo", "gain"): _ON_POLICY,
     ("ppo", "correction"): _ON_POLICY,
     ("ppo", "normalized"): {**_ON_POLICY, **_STACK, "width": 64},
@@ -47,13 +47,14 @@ TUNED: dict[tuple[str, str], dict[str, Any]] = {
     ("recurrent_ppo", "correction"): _ON_POLICY,
     ("recurrent_ppo", "normalized"): {**_ON_POLICY, "width": 64},
 }
-"""What a setting left at None becomes, by algorithm and action mode; the same for all systems."""
+"""What a setting left at None becomes, by algorithm and action mode; the same for all systems.
+Those of PPO with gains were tuned, on episodes that are not scored; the others begin from there."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """How an agent is trained. What is left at None is a tuned default of the algorithm and action
-    mode."""
+    """How an agent is trained. What is left at None is the default of the algorithm and action
+    mode, see `DEFAULTS`."""
 
     algorithm: Algorithm = "ppo"
     """The algorithm; recurrent_ppo needs the extra ``rl``."""
@@ -112,13 +113,13 @@ class Config:
     def _expect(self, name: str, expected: str, fits: Callable[[Any], bool]) -> None:
         expect(self, name, expected, lambda v: v is None or fits(v))
 
-    def tuned(self) -> Config:
-        """The same with every None but the budget replaced by the tuned default.
+    def filled(self) -> Config:
+        """The same with every None but the budget replaced by its default.
 
         Raises:
             ValueError: in one line, if settings do not fit each other.
         """
-        defaults = TUNED[self.algorithm, self.action_mode]
+        defaults = DEFAULTS[self.algorithm, self.action_mode]
         left = {n: v for n, v in defaults.items() if getattr(self, n) is None}
         config = replace(self, **left)
         if self.algorithm in ("ppo", "recurrent_ppo"):

@@ -1,4 +1,4 @@
-"""The settings that the KKL trainers share, and the course of a training."""
+"""A training in progress: of T, then of T*."""
 
 from __future__ import annotations
 
@@ -6,53 +6,32 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, ClassVar, Literal, TypeAlias, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pinnobs_gym.estimator import output_scale
+from pinnobs_gym.kkl.config import KKLConfig
 from pinnobs_gym.kkl.dynamics import (
-    Design,
-    Dynamics,
-    Mode,
-    Start,
     at_rest,
-    bessel,
-    enough,
-    niazi,
     realised,
 )
-from pinnobs_gym.kkl.fitting import Equations, Fit, Method, Objective, Term
-from pinnobs_gym.kkl.labels import frequency, initial_states, noise_in_z, simulated
+from pinnobs_gym.kkl.fitting import Equations, Fit, Objective, Term
+from pinnobs_gym.kkl.labels import initial_states, noise_in_z, simulated
 from pinnobs_gym.kkl.learned_poles import EPISODES, learn
-from pinnobs_gym.kkl.networks import Activation, Layers, Mlp, Scaling, evaluate
+from pinnobs_gym.kkl.networks import Layers, Mlp, Scaling, evaluate
 from pinnobs_gym.kkl.observer import Clock, TrainedKKL
-from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
 from pinnobs_gym.trained_file import check_same, identity, read, write
-from pinnobs_gym.training import bar, expect, interruption
 
-Device: TypeAlias = Literal["auto", "cpu", "cuda"]
-Preset: TypeAlias = Literal["default", "faithful"]
-
-_PRESET: Any = None  # stands for what the preset says, which `KKLConfig` puts in its place
 _FREE = ("checkpoint_every", "log_every", "device", "budget")
 """Settings that may change when training is resumed."""
-MIN_SAMPLES = 20
-"""Fewest samples of the record whose times are trained on."""
-_CYCLES = 4.0
-"""Fewest periods of the cut-off in the benchmark's episodes, unless it is given."""
-_PART = 0.4
-"""The cut-off over the frequency of the outputs, unless it is given."""
-_TICKS = 1000
-"""Steps of the progress bar."""
 _PARTS = 12
 """Parts of the episode whose errors are weighed alike."""
 _USUAL = 0.95
@@ -61,161 +40,6 @@ _FORGOTTEN = 8.0
 """How long z's beginning is waited for to be forgotten, over its slowest time constant."""
 _SHARE = 0.02
 """Part of the mean squared error that is added to each part's before it is divided by."""
-
-
-DEFAULT: Mapping[str, Any] = MappingProxyType(
-    {
-        "design": "bessel",
-        "order": None,
-        "mode": "continuous",
-        "start": "output",
-        "transient": True,
-        "trajectories": 1000,
-        "samples": 200,
-        "depth": 2,
-        "width": 28,
-        "activation": "tanh",
-        "method": "gauss_newton",
-        "learning_rate": 0.3,
-        "batch": 800,
-        "iterations": 600,
-        "share": 0.2,
-        "noise": True,
-        "dtype": "float64",
-    }
-)
-"""The settings of the default presets."""
-
-
-@dataclass(frozen=True)
-class KKLConfig:
-    """What the recipes of the learned KKL observers share.
-
-    Settings that are not given are those of the preset; see the trainer's ``PRESETS``.
-    """
-
-    episodes: ClassVar[int] = 1
-    """How many episodes of the env it looks at: their sample times alone."""
-    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
-    """The settings of each preset."""
-
-    preset: Preset = "default"
-    """Where the other settings come from: the paper's recipe, or a better one."""
-    design: Design = _PRESET
-    """The poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or learned
-    beforehand with a small T*, beginning with ``poles`` (see `learned_poles`)."""
-    cutoff: float | None = None
-    """Cut-off of Bessel's poles in Hz; if None, two fifths of the outputs' `labels.frequency`, but
-    not under four over the benchmark's duration."""
-    order: int | None = _PRESET
-    """Bessel's poles for each output; if None, as many as give z one component more than x. Ramos
-    et al. take nx + 1 for each."""
-    poles: tuple[float, ...] = ()
-    """Given poles in 1/s, all real, for each output."""
-    mode: Mode = _PRESET
-    """Continuous time, exact for outputs joined by straight lines; or discrete, by Euler steps."""
-    start: Start = _PRESET
-    """z before the first sample: at rest under y₀ (output), 0 (zero), or T(x̂₀) (prior)."""
-    transient: bool = _PRESET
-    """Whether T* is told the time since the first sample, as e^(−rt), so that it inverts z from the
-    start on and not only when its beginning is forgotten."""
-    low: tuple[float, ...] | None = None
-    """Lower corner of a box of initial states to train on instead of the benchmark's set."""
-    high: tuple[float, ...] | None = None
-    """Upper corner."""
-    trajectories: int = _PRESET
-    """Episodes that are simulated, a tenth more to validate."""
-    samples: int = _PRESET
-    """Samples of each that are kept."""
-    depth: int = _PRESET
-    """Hidden layers of T and of T*."""
-    width: int = _PRESET
-    """Neurons in each."""
-    activation: Activation = _PRESET
-    """Of the hidden layers."""
-    method: Method = _PRESET
-    """Averaged Gauss-Newton steps, or Adam."""
-    learning_rate: float = _PRESET
-    """The first step; it falls as a half cosine."""
-    batch: int = _PRESET
-    """Equations in a step: samples times the outputs of the network."""
-    iterations: int = _PRESET
-    """Steps for T*."""
-    share: float = _PRESET
-    """Steps for T over those for T*; so for their CPU time if there is a budget."""
-    patience: float = 0.6
-    """Part of the steps without a lower validation error after which a network is done."""
-    noise: bool = _PRESET
-    """Whether z is trained on with the output noise that is told."""
-    dtype: Literal["float32", "float64"] = _PRESET
-    """Precision of the networks; labels are always in double."""
-    device: Device = "auto"
-    """Where networks are trained; ``auto`` takes a GPU if there is one."""
-    sweep: Literal["none", "cutoff"] = "none"
-    """Whether the cut-off is first chosen by short trainings over many."""
-    seed: int = 0
-    """What weights, initial states and noise are drawn from."""
-    budget: float | None = None
-    """CPU seconds by which the step's cosine has come to its end, and training with it."""
-    check_every: int = 20
-    """Steps from one validation to the next."""
-    checkpoint_every: int = 100
-    """Steps from one checkpoint to the next."""
-    log_every: int = 20
-    """Steps from one point of the logged curves to the next."""
-
-    def __post_init__(self) -> None:
-        expect(self, "preset", " or ".join(self.PRESETS), lambda v: v in self.PRESETS)
-        for name, value in self.PRESETS[self.preset].items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
-        choices = {"design": Design, "mode": Mode, "start": Start, "activation": Activation}
-        choices |= {"method": Method, "device": Device}
-        for name, kind in choices.items():
-            expect(self, name, ", ".join(get_args(kind)), lambda v, k=kind: v in get_args(k))
-        expect(self, "sweep", "none or cutoff", lambda v: v in ("none", "cutoff"))
-        expect(self, "dtype", "float32 or float64", lambda v: v in ("float32", "float64"))
-        whole = ("trajectories", "samples", "depth", "width", "batch", "iterations")
-        for name in (*whole, "check_every", "checkpoint_every", "log_every"):
-            expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
-        expect(self, "seed", "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
-        expect(
-            self, "order", "None or a whole number over 0", lambda v: v is None or v == int(v) > 0
-        )
-        expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
-        expect(self, "cutoff", "None or positive Hz", lambda v: v is None or 0 < v < math.inf)
-        expect(self, "share", "a number over 0", lambda v: 0 < v < math.inf)
-        expect(self, "patience", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
-        expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
-        if self.design in ("poles", "learned"):
-            expect(self, "poles", f"numbers, for design={self.design!r}", lambda v: len(v) > 0)
-        if (self.low is None) != (self.high is None):
-            raise ValueError(f"low={self.low}, high={self.high}; expected both corners or none")
-
-    def filters(self, system: System) -> int:
-        """Bessel's poles for each output."""
-        return self.order or math.ceil((system.nx + 1) / system.ny)
-
-    def cutoff_for(self, system: System) -> float:
-        """The cut-off for a system, in Hz."""
-        if self.cutoff is not None:
-            return self.cutoff
-        return max(_CYCLES / system.setups["benchmark"].duration, _PART * frequency(system))
-
-    def dynamics(self, system: System) -> Dynamics:
-        """A_z and B_z for a system.
-
-        Raises:
-            ValueError: in one line, if they do not give an observer.
-        """
-        if self.design == "bessel":
-            poles: Sequence[complex] = bessel(self.filters(system), self.cutoff_for(system))
-        elif self.design == "niazi":
-            poles = niazi(system.nx)
-        else:
-            poles = self.poles
-        enough(len(poles), system.nx, system.ny)
-        return realised(poles, system.ny, self.mode)
 
 
 class Run:
@@ -646,125 +470,3 @@ def _device(config: KKLConfig) -> torch.device:
         raise ValueError("device='cuda', but there is no GPU here; expected cpu or auto")
     there = config.device != "cpu" and torch.cuda.is_available()
     return torch.device("cuda" if there else "cpu")
-
-
-def train(
-    trainer: str,
-    encoding: Callable[[Run], Objective],
-    labelled: bool,
-    system: System,
-    config: Any,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None,
-    log: Log,
-    checkpoint: Path | None,
-    resume: bool,
-    progress: bool,
-    gap: int = 0,
-) -> TrainedKKL:
-    """The course of a training; see the trainers."""
-    _check(system, record, config)
-    if resume and checkpoint is None:
-        raise ValueError("resume=True without a checkpoint; name its file")
-    told = system.setups["benchmark"].noise_std if noise_std is None else noise_std
-    std = vector(told, system.ny, "noise_std")
-
-    def make(config: Any) -> Run:
-        return Run(trainer, system, config, record, std, encoding, labelled, gap)
-
-    if resume and checkpoint is not None:
-        run = make(_as_swept(config, checkpoint))
-        run.restore(checkpoint)
-    else:
-        found = sweep(make, config, system, log, progress) if config.sweep == "cutoff" else []
-        if found:
-            cutoff = min(found, key=lambda point: point["loss"])["cutoff"]
-            left = None if config.budget is None else config.budget * (1 - SWEEP_SHARE)
-            config = replace(config, cutoff=cutoff, budget=left)
-        run = make(config)
-        run.facts["sweep"] = found
-    try:
-        with bar(_TICKS if progress else None) as show, interruption() as stopped:
-            while not run.finished() and not stopped:
-                run.step()
-                steps = run.iterations
-                if run.finished() or steps % config.log_every == 0:
-                    _log(log, run)
-                    show(round(_TICKS * run.done), f"{run.stage}: held out {run.latest:.3g}")
-                if checkpoint is not None and steps % config.checkpoint_every == 0:
-                    run.save(checkpoint)
-        if checkpoint is not None:
-            run.save(checkpoint)
-    except KeyboardInterrupt:  # amid a step: the last checkpoint stays as it is
-        pass
-    trained = run.result()
-    log.hparams(
-        {"system": trained.system, **trained.config},
-        {"end/loss": trained.loss, "end/iterations": float(trained.iterations)},
-    )
-    return trained
-
-
-SWEEP = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""The cut-offs of a sweep, over that of the recipe."""
-SWEEP_SHARE = 0.5
-"""Part of a budget that a sweep takes."""
-_SWEEP_STEPS = 120
-"""Steps of each training of a sweep that no budget limits."""
-
-
-def sweep(
-    make: Callable[[Any], Run], config: Any, system: System, log: Log, progress: bool
-) -> list[dict[str, float]]:
-    """Short trainings at several cut-offs, one after another.
-
-    Returns:
-        For each its ``cutoff`` in Hz; the ``loss`` that cut-offs are chosen by; the NRMSE at the
-        end of an episode without (``clean``) and with noise (``noisy``), their difference in
-        squares (``noise_gain``, over the NRMSE of the outputs' own noise); and the time in s after
-        which the error stays below twice that at the end (``convergence``).
-    """
-    found = []
-    budget = None if config.budget is None else config.budget * SWEEP_SHARE / len(SWEEP)
-    steps = min(config.iterations, _SWEEP_STEPS)
-    with bar(len(SWEEP) if progress else None) as show:
-        for number, factor in enumerate(SWEEP):
-            cutoff = factor * config.cutoff_for(system)
-            run = make(replace(config, cutoff=cutoff, iterations=steps, budget=budget))
-            while not run.finished():
-                run.step()
-            found.append({"cutoff": cutoff, "loss": run.best["T*"].error, **run.traded()})
-            for name, value in found[-1].items():
-                log.scalar(f"sweep/{name}", value, number)
-            show(number + 1, f"cut-off {cutoff:.3g} Hz: {found[-1]['noisy']:.3g}")
-    return found
-
-
-def _as_swept(config: Any, checkpoint: Path) -> Any:
-    """The recipe with the cut-off that a checkpoint's sweep found."""
-    if config.sweep == "none":
-        return config
-    try:
-        facts = json.loads(read(checkpoint)["checkpoint"])
-        return replace(config, cutoff=facts["config"]["cutoff"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{checkpoint} is not a checkpoint of this trainer: {error}") from None
-
-
-def _log(log: Log, run: Run) -> None:
-    name = {"T": "T", "T*": "T_star"}.get(run.stage, "T_star")
-    log.scalar(f"loss/{name}", run.fit.loss, run.fit.iteration)
-    log.scalar(f"loss/{name}_held_out", run.latest, run.fit.iteration)
-
-
-def _check(system: System, record: Record, config: KKLConfig) -> None:
-    if system.measured_input:
-        raise ValueError(
-            f"{type(system).__name__} has a measured input; a KKL observer is trained on simulated "
-            "episodes and needs u(t) to be known beforehand"
-        )
-    if record.num_samples < MIN_SAMPLES:
-        raise ValueError(
-            f"the record has {record.num_samples} samples; a KKL observer needs {MIN_SAMPLES}"
-        )
