@@ -18,13 +18,15 @@ from rich.table import Table as RichTable
 
 from pinnobs_gym import leaderboard
 
-console = Console() if Console().is_terminal else Console(width=150)
+WIDE = 190
+"""Columns that a leaderboard's table takes with its intervals."""
+console = Console() if Console().is_terminal else Console(width=WIDE)
 """Where everything is printed; wide enough for the tables where there is no terminal."""
 
 
 def print_table(table: leaderboard.Table) -> None:
     """Print a leaderboard's table; a narrow terminal is spared the intervals."""
-    wide = console.width >= 145
+    wide = console.width >= WIDE
     shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
     hidden = {"is told", "training", "NIS", "corr.", "tail / CRR"}
     hidden |= {"track"} if wide else {"90th pct.", "µs/step", "/ CRR", "ANEES", "covers %"}
