@@ -1,6 +1,8 @@
-"""Measured figures, one JSON line each: figure, value, unit, asked, holds.
+"""Measured figures, one JSON line each: group, figure, value, unit, asked, holds, date.
 
-    python scripts/benchmark.py [core ...] [--repeats 5]
+    python scripts/benchmark.py [core ...] [--repeats 5] >> runs/benchmark.jsonl
+
+`scripts/readme.py` makes tables of such a file, the last line of a figure counting.
 
 Speeds are ratios to a named peer, taken side by side in one run: one thread, CPU time, the median
 of the repeats. Nothing here is a test: a figure that does not hold is printed as it is. A group is
@@ -18,6 +20,7 @@ import json
 import pkgutil
 import sys
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Annotated
 
 import benchmarks
@@ -39,8 +42,10 @@ def main(groups: Annotated[tuple[str, ...], tyro.conf.Positional] = (), repeats:
             return 2
     for name in groups or GROUPS:
         for figure in importlib.import_module(f"benchmarks.{name}").figures(repeats):
-            shown = asdict(figure) | {"value": float(f"{figure.value:.4g}")}
-            print(json.dumps(shown), flush=True)
+            value = float(f"{figure.value:.4g}")
+            date = datetime.now(UTC).date().isoformat()
+            shown = {"group": name, **asdict(figure), "value": value, "date": date}
+            print(json.dumps(shown, ensure_ascii=False), flush=True)
     return 0
 
 

@@ -1,9 +1,10 @@
 """Make the README's picture and tables from stored scores.
 
     python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
-        [--paper-file runs/paper/results.jsonl]
+        [--paper-file runs/paper/results.jsonl] [--figures-file runs/benchmark.jsonl]
 
-What has no stored scores stays as it is.
+All measured figures go to docs/benchmarks.md, the README gets a summary of them. What has no stored
+scores stays as it is.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+import measured
 import numpy as np
 import tyro
 from machine import processor
@@ -29,6 +31,7 @@ from pinnobs_gym.report import replacing, write_figure
 ROOT = Path(__file__).parents[1]
 END = "<!-- end -->"
 PAPER_HEADING = "## The paper's figures"
+FIGURES_HEADING = "## Measured figures"
 BEFORE = "## Development"
 """The heading before which a section goes that is not there yet."""
 
@@ -81,18 +84,22 @@ def replaced(text: str, name: str, content: str, heading: str) -> str:
 def main(
     rows_file: Path = ROOT / "runs/leaderboard/rows.jsonl",
     paper_file: Path = ROOT / "runs/paper/results.jsonl",
+    figures_file: Path = ROOT / "runs/benchmark.jsonl",
 ) -> int:
     """Rewrite the picture and the tables.
 
     Args:
         rows_file: the leaderboard's scores.
         paper_file: the results of reproduce_paper.py.
+        figures_file: what benchmark.py printed.
     """
     scored = rows.read(rows_file)
     section = paper.readme_section(paper.read(paper_file), TABLES.values())
-    if not scored and not section:
+    figures = measured.read(figures_file)
+    if not scored and not section and not figures:
         print(
-            f"nothing in {rows_file} or {paper_file}; run make leaderboard or reproduce_paper.py",
+            f"nothing in {rows_file}, {paper_file} or {figures_file}; run make leaderboard, "
+            "reproduce_paper.py or benchmark.py",
             file=sys.stderr,
         )
         return 2
@@ -103,6 +110,10 @@ def main(
         text = replaced(text, "leaderboard", summary(scored), "## Leaderboard")
     if section:
         text = replaced(text, "paper", section, PAPER_HEADING)
+    if figures:
+        text = replaced(text, "figures", measured.readme_section(figures), FIGURES_HEADING)
+        with replacing(ROOT / "docs" / "benchmarks.md") as temporary:
+            temporary.write_text(measured.page(figures), encoding="utf-8")
     with replacing(readme) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return 0

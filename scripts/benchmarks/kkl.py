@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -17,6 +17,7 @@ from benchmarks import Figure, at_most
 from pinnobs_gym import env_id, evaluate
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.kkl.observer import KKL, TrainedKKL
+from pinnobs_gym.leaderboard import markdown_table
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import truth
 from pinnobs_gym.suite import TRAINING_SEED, record_of
@@ -62,6 +63,32 @@ def figures(repeats: int) -> Iterator[Figure]:
     yield from noisy()
     yield from outside()
     yield from benchmark()
+
+
+def readme_table(lines: Sequence[dict[str, Any]]) -> str:
+    """The figures with a bound in a table, those of the benchmark's episodes in another."""
+    asked = [line for line in lines if line["asked"] and "training" not in line["figure"]]
+    scores = {line["figure"]: line["value"] for line in lines}
+    table = []
+    for name in SYSTEMS.classes():
+        cells = []
+        for trainer in MODULES:
+            whole, tail, lost = (
+                scores.get(f"{trainer} on {name}, {what}", float("nan"))
+                for what in ("NRMSE", "tail NRMSE", "diverged")
+            )
+            cells.append(f"{whole:.3g} / {tail:.2g}" + (f", div {lost:g} %" if lost else ""))
+        table.append((name, *cells))
+    what = (
+        "**Learned KKL observers.** ReverseDuffing from 400 initial states, and below it the "
+        f"benchmark's {EPISODES} episodes after {BENCHMARK_BUDGET:g} CPU s of training each: "
+        "median NRMSE, whole episode / tail."
+    )
+    first = markdown_table(
+        ("figure", "measured", "asked"),
+        [(f["figure"], f"{f['value']:g} {f['unit']}".strip(), f["asked"]) for f in asked],
+    )
+    return "\n\n".join([what, first, markdown_table(("system", *MODULES), table)])
 
 
 def accuracy() -> Iterator[Figure]:

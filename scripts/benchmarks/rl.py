@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from benchmarks import Figure, at_least, at_most, median_ratio
 from pinnobs_gym import env_id, evaluate, suite
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
 from pinnobs_gym.evaluation import make_vector_env
+from pinnobs_gym.leaderboard import markdown_table
 from pinnobs_gym.rows import Row
 from pinnobs_gym.sb3_env import Sb3VecEnv
 from pinnobs_gym.systems import SYSTEMS
@@ -56,6 +57,38 @@ def figures(repeats: int) -> Iterator[Figure]:
         near.append(float(np.median(ratios)) <= 10)
     what = f"systems where the median of {SEEDS} seeds is at most 10 times the EKF's"
     yield at_least(what, sum(near), "", 4)
+
+
+def readme_table(lines: Sequence[dict[str, Any]]) -> str:
+    """The agents' tail NRMSE, system by system and seed by seed, over the EKF's."""
+    values = {line["figure"]: line["value"] for line in lines}
+    table = []
+    for name in SYSTEMS.classes():
+        tails = [
+            _of(values, f"tail NRMSE of the gain agent, {name}, seed {s}") for s in range(SEEDS)
+        ]
+        over = [_of(values, "over the EKF's", f", {name}, seed {s}") for s in range(SEEDS)]
+        cost = [_of(values, f"training, {name}, seed {s}") for s in range(SEEDS)]
+        table.append(
+            (
+                name,
+                *(f"{tail:.3g}" for tail in tails),
+                " / ".join(f"{ratio:.2g}" for ratio in over),
+                f"{np.median(cost):.0f}",
+            )
+        )
+    what = (
+        "**Agents.** PPO with gain actions, 299,008 steps, three training seeds: median tail NRMSE "
+        f"of the benchmark's {EPISODES} episodes, that over the EKF's, CPU s of training."
+    )
+    seeds = (f"seed {seed}" for seed in range(SEEDS))
+    return f"{what}\n\n{markdown_table(('system', *seeds, '/ EKF', 'training s'), table)}"
+
+
+def _of(values: dict[str, float], start: str, end: str = "") -> float:
+    return next(
+        (v for name, v in values.items() if name.startswith(start) and name.endswith(end)), np.nan
+    )
 
 
 def trained_on(name: str, seed: int) -> TrainedAgent:

@@ -1,0 +1,81 @@
+"""What `benchmark.py` printed, as tables."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from machine import processor
+
+from pinnobs_gym.leaderboard import markdown_table
+
+HEADER = ("figure", "measured", "asked")
+
+
+def read(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """The figures of a file by group, in the file's order; the last line of each counts."""
+    if not path.exists():
+        return {}
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        figure = json.loads(line)
+        found[figure["group"], figure["figure"]] = figure
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for (group, _), figure in found.items():
+        groups.setdefault(group, []).append(figure)
+    return dict(sorted(groups.items()))
+
+
+def cells(figures: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """A line per figure: what it is, its value, and what is asked of it."""
+    shown = []
+    for figure in figures:
+        missed = " **missed**" if figure["holds"] is False else ""
+        value = f"{figure['value']:g} {figure['unit']}".strip()
+        shown.append((figure["figure"], value, figure["asked"] + missed))
+    return shown
+
+
+def page(groups: dict[str, list[dict[str, Any]]]) -> str:
+    """All figures as one page of Markdown."""
+    parts = ["# Measured figures", _told(groups)]
+    for group, figures in groups.items():
+        what = (_module(group).__doc__ or "").strip()
+        parts += [f"## {group}", what, markdown_table(HEADER, cells(figures))]
+    return "\n\n".join(parts) + "\n"
+
+
+def readme_section(groups: dict[str, list[dict[str, Any]]]) -> str:
+    """How many figures hold and which do not, and the tables that groups have for the README
+    (``readme_table`` of their module)."""
+    lines, tables = [], []
+    for group, figures in groups.items():
+        asked = [figure for figure in figures if figure["holds"] is not None]
+        missed = [figure for figure in asked if not figure["holds"]]
+        names = "; ".join(f"{name}: {value}, asked {bound}" for name, value, bound in cells(missed))
+        names = names.replace(" **missed**", "")
+        held = f"{len(asked) - len(missed)} of {len(asked)}"
+        lines.append((f"`{group}`", held, names))
+        table = getattr(_module(group), "readme_table", None)
+        if table is not None:
+            tables.append(table(figures))
+    summary = markdown_table(("group", "hold", "missed"), lines)
+    link = "All of them are in [docs/benchmarks.md](docs/benchmarks.md)."
+    return "\n\n".join([f"{_told(groups)} {link}", summary, *tables])
+
+
+def _told(groups: dict[str, list[dict[str, Any]]]) -> str:
+    dates = sorted({figure["date"] for figures in groups.values() for figure in figures})
+    when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    return (
+        f"Measured on {when} by `python scripts/benchmark.py`, one thread, CPU time "
+        f"(Python {platform.python_version()}, {processor()})."
+    )
+
+
+def _module(group: str) -> Any:
+    return importlib.import_module(f"benchmarks.{group}")
