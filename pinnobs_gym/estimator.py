@@ -232,12 +232,18 @@ class PerEpisode(Estimator):
 
 
 def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:
-    """Arrays (num_samples, batch, ...) for what the state has, laid out in memory as it is."""
-    columns = {}
-    for name in (f.name for f in fields(Estimates)):
-        array = getattr(state, name)
-        if array is not None:
-            order = np.argsort([-stride for stride in array.strides], kind="stable")
-            column = np.empty((num_samples, *(array.shape[axis] for axis in order)))
-            columns[name] = column.transpose(0, *(1 + np.argsort(order)))
+    """Arrays (num_samples, batch, ...) for what the state has, laid out in memory as it is.
+
+    They are parts of one, because only of large arrays the memory comes in large pages: without,
+    its first use took a tenth of the time of an extended Kalman filter.
+    """
+    held = {f.name: getattr(state, f.name) for f in fields(Estimates)}
+    held = {name: array for name, array in held.items() if array is not None}
+    room, used, columns = np.empty(num_samples * sum(a.size for a in held.values())), 0, {}
+    for name, array in held.items():
+        order = np.argsort([-stride for stride in array.strides], kind="stable")
+        part = room[used : used + num_samples * array.size]
+        column = part.reshape(num_samples, *(array.shape[axis] for axis in order))
+        columns[name] = column.transpose(0, *(1 + np.argsort(order)))
+        used += part.size
     return columns

@@ -26,9 +26,9 @@ class Memory:
     """What the filter keeps besides the state's own fields; the batch comes last."""
 
     Q: np.ndarray
-    """Covariance of the process noise, shape (nx, nx, 1)."""
+    """Covariance of the process noise, shape (nx, nx, batch)."""
     R: np.ndarray
-    """Covariance of the output noise, shape (ny, ny, 1)."""
+    """Covariance of the output noise, shape (ny, ny, batch)."""
     points: tuple[np.ndarray, np.ndarray, np.ndarray]
     """What `SigmaPointFilter.points` returns."""
     jitter: np.ndarray
@@ -53,7 +53,8 @@ class SigmaPointFilter(GaussianEstimator):
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
-        memory = Memory(*self.tuning(), self.points(), np.zeros(len(prior.mean)))
+        batch = len(prior.mean)
+        memory = Memory(*self.tuning(batch), self.points(), np.zeros(batch))
         return State(prior.mean, P=prior.cov, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
@@ -63,26 +64,30 @@ class SigmaPointFilter(GaussianEstimator):
         weights = np.sqrt(cov_weights)[:, None]
         L, jitter = factor(P, memory.jitter)
         if state.t is not None:
-            points = np.add(xhat, (unit @ L).transpose(1, 2, 0), order="C")
-            points = model_step(self.system, state.t, t, points, state.u, u)
+            points = unit @ L  # (nx, num_points, batch)
+            points += xhat.T[:, None]
+            points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
             points = np.ascontiguousarray(points.transpose(2, 0, 1))
             mean = mean_weights @ points  # (nx, batch)
             X = (points - mean[:, None]) * weights
             xhat, P = mean.T, outer(X, X) + memory.Q
             L, jitter = factor(P, jitter)
         X = unit @ L  # (nx, num_points, batch)
-        outputs = np.asarray(self.system.h(xhat + X.transpose(1, 2, 0))).transpose(2, 0, 1)
+        points = X + xhat.T[:, None]
+        outputs = np.asarray(self.system.h(points.transpose(1, 2, 0))).transpose(2, 0, 1)
         mean = mean_weights @ outputs
         X, Y = X * weights, (outputs - mean[:, None]) * weights
         innovation, missing = y - mean.T, np.isnan(y)
-        if missing.any():
+        if np.count_nonzero(missing):
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
-        S = outer(Y, Y) + memory.R
+        S = outer(Y, Y)
+        S += memory.R
         K = divide(outer(X, Y), S)
-        X = X - product(K, Y)
-        P = outer(X, X) + sandwich(K, memory.R)
-        xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
+        X -= product(K, Y)
+        P = outer(X, X)
+        P += sandwich(K, memory.R)
+        xhat = (xhat.T + product(K, innovation.T[:, None])[:, 0]).T
         if jitter is not memory.jitter:
             memory = replace(memory, jitter=jitter)
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)

@@ -3,6 +3,7 @@ estimators share."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -356,33 +357,60 @@ def model_step_jacobian(
     """What `model_step` returns for x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape
     (batch, nx, nx), with the batch innermost in memory."""
     F = None
-    for t, step, u in substeps(system, t0, t1, x, u0, u1):
-        points = np.empty((4, *x.shape))
+    batch, nx = x.shape
+    x = np.ascontiguousarray(x.T)  # the batch comes last here; the system is shown transposed views
+    for t, step, u in substeps(system, t0, t1, x.T, u0, u1):
+        by_row = t.ndim == 2
+        h = step[:, 0] if by_row else step
+        points = np.empty((4, nx, batch))
+        at = points.transpose(0, 2, 1)
         points[0] = x
-        k1 = system.f(t[0], x, u[0])
-        np.add(x, (step / 2) * k1, out=points[1])
-        k2 = system.f(t[1], points[1], u[1])
-        np.add(x, (step / 2) * k2, out=points[2])
-        k3 = system.f(t[1], points[2], u[1])
-        np.add(x, step * k3, out=points[3])
-        k4 = system.f(t[2], points[3], u[2])
-        x = x + (step / 6) * (k1 + 2 * (k2 + k3) + k4)
+        k1 = system.f(t[0], at[0], u[0]).T
+        np.add(x, h / 2 * k1, out=points[1])
+        k2 = system.f(t[1], at[1], u[1]).T
+        np.add(x, h / 2 * k2, out=points[2])
+        k3 = system.f(t[1], at[2], u[1]).T
+        np.add(x, h * k3, out=points[3])
+        k4 = system.f(t[2], at[3], u[2]).T
+        x = x + _increment(h, k1, k2, k3, k4)
         # The variational equation Φ' = A(t)Φ, by the same method along the same stages.
-        stage_times, stage_inputs = t[_STAGES], u[_STAGES]
-        if t.ndim == 1:
-            stage_times = stage_times[:, None]
-        if u.ndim == 2:
-            stage_inputs = stage_inputs[:, None]
-        A = system.f_jacobian(stage_times, points, stage_inputs)
-        half = step / 2 if t.ndim == 1 else step[:, 0] / 2
-        A = np.multiply(A.transpose(0, 2, 3, 1), half, order="C")  # (4, nx, nx, batch)
-        K2 = A[1] + product(A[1], A[0])
-        K3 = A[2] + product(A[2], K2)
-        K4 = A[3] + 2 * product(A[3], K3)
-        flow = identity(x.shape[1]) + (A[0] + K4 + 2 * (K2 + K3)) / 3
+        times, inputs = t[_STAGES], u[_STAGES]
+        A = system.f_jacobian(
+            times if by_row else times[:, None], at, inputs[:, None] if u.ndim == 2 else inputs
+        )
+        A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
+        K2 = _slope(A[1], h / 2, A[0])
+        K3 = _slope(A[2], h / 2, K2)
+        K4 = _slope(A[3], h, K3)
+        flow = _increment(h, A[0], K2, K3, K4)
+        flow += identity(nx, batch)
         F = flow if F is None else product(flow, F)
     assert F is not None  # there is at least one substep
-    return x, F.transpose(2, 0, 1)
+    return x.T, F.transpose(2, 0, 1)
+
+
+# The two below work in place where they can: small arrays cost by the call, not by the number.
+
+
+def _increment(
+    h: float | np.ndarray, k1: np.ndarray, k2: np.ndarray, k3: np.ndarray, k4: np.ndarray
+) -> np.ndarray:
+    """h(k1 + 2k2 + 2k3 + k4)/6, of arrays with the batch last."""
+    total = k2 + k3
+    total *= 2
+    total += k1
+    total += k4
+    total *= h / 6
+    return total
+
+
+def _slope(A: np.ndarray, h: float | np.ndarray, K: np.ndarray) -> np.ndarray:
+    """A(I + hK), the rate at which a flow changes after the time h at the rate K; matrices
+    (nx, nx, batch)."""
+    rate = product(A, K)
+    rate *= h
+    rate += A
+    return rate
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -393,10 +421,10 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("ijb,jkb->ikb", a, b)
 
 
-@lru_cache(maxsize=64)
-def identity(size: int) -> np.ndarray:
-    """The identity matrix, shape (size, size, 1), not to be written to."""
-    matrix = np.eye(size)[..., None]
+@lru_cache(maxsize=16)
+def identity(size: int, batch: int) -> np.ndarray:
+    """Identity matrices, shape (size, size, batch), not to be written to."""
+    matrix = np.repeat(np.eye(size)[..., None], batch, axis=-1)
     matrix.flags.writeable = False
     return matrix
 
@@ -418,9 +446,9 @@ def substeps(
     """
     xp = np if isinstance(x, np.ndarray) else array_namespace(x)
     longest = min(longest, system.model_step or system.setups["benchmark"].dt)
-    by_row = np.ndim(t0) > 0
+    by_row = getattr(t0, "ndim", 0) > 0
     whole = t1 - t0
-    count = max(1, int(np.ceil(float(whole.max() if by_row else whole) / longest - 1e-6)))
+    count = max(1, math.ceil(float(whole.max() if by_row else whole) / longest - 1e-6))
     step = whole[:, None] / count if by_row else float(whole) / count
     for k in range(count):
         part = xp.asarray([k, k + 0.5, k + 1], dtype=x.dtype)

@@ -129,7 +129,7 @@ def _gains_back(filtered: Filtered, start: int, stop: int) -> tuple[np.ndarray, 
     P, F, ahead = (a.transpose(1, 2, 0, 3).reshape(*a.shape[1:3], -1) for a in parts)
     L, _ = factor(ahead, np.zeros(ahead.shape[-1]))
     C = divide_factored(product(P, F.transpose(1, 0, 2)), L)
-    own = sandwich(identity(len(C)) - product(C, F), P) + sandwich(C, filtered.Q)
+    own = sandwich(identity(len(C), C.shape[-1]) - product(C, F), P) + sandwich(C, filtered.Q)
     C, own = (a.reshape(*a.shape[:2], stop - start, -1).transpose(2, 0, 1, 3) for a in (C, own))
     return C, own
 

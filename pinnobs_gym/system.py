@@ -251,9 +251,10 @@ def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:
 
 def stack(like: Array, *components: Array | float) -> Array:
     """The array (..., n) of n components, each a number or an array that broadcasts to the batch
-    (...) of ``like`` (..., nx)."""
+    (...) of ``like`` (..., nx). In NumPy its axes lie in memory in the order of those of ``like``,
+    so that arithmetic on the two is contiguous."""
     if isinstance(like, np.ndarray):  # several times faster than np.stack on small batches
-        out = np.empty((*like.shape[:-1], len(components)), dtype=like.dtype)
+        out = np.empty_like(like, shape=(*like.shape[:-1], len(components)))
         for i, component in enumerate(components):
             out[..., i] = component
         return out
@@ -272,18 +273,28 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
     """The (..., n, m) matrix of the given entries, each a number or an array (...) like the batch
     of ``like`` (..., nx).
 
-    The batch lies innermost in memory, so that arithmetic on one entry over a batch is contiguous.
+    The last axis of the batch lies innermost in memory, so that arithmetic on one entry over it is
+    contiguous.
     """
-    xp = np if isinstance(like, np.ndarray) else array_namespace(like)
-    batch = tuple(like.shape[:-1])
-    n, m = len(rows), len(rows[0])
-    out = xp.zeros((n, m, *batch), dtype=like.dtype, device=like.device)
+    *outer, inner = like.shape[:-1] if like.ndim > 1 else (1,)
+    shape = (*outer, len(rows), len(rows[0]), inner)
+    if isinstance(like, np.ndarray):
+        out = np.zeros(shape, dtype=like.dtype)
+    else:
+        out = array_namespace(like).zeros(shape, dtype=like.dtype, device=like.device)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
             if not (isinstance(entry, int | float) and entry == 0):
-                out[i, j] = entry
-    axes = (*range(2, 2 + len(batch)), 0, 1)
-    return out.transpose(axes) if isinstance(out, np.ndarray) else xp.permute_dims(out, axes)
+                out[..., i, j, :] = entry
+    if like.ndim == 1:
+        return out[..., 0]
+    k = len(outer)
+    axes = (*range(k), k + 2, k, k + 1)
+    return (
+        out.transpose(axes)
+        if isinstance(out, np.ndarray)
+        else array_namespace(out).permute_dims(out, axes)
+    )
 
 
 def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array:

@@ -70,7 +70,7 @@ def test_the_first_order_of_a_trajectory_is_that_of_finite_differences():
     record = record_of(source, 2)
     t, y, u = record.t, record.y.swapaxes(0, 1), record.u.swapaxes(0, 1)
     x0, R = np.array([[1.0, 2.0, 0.3, -0.2, 90.0]] * 2), np.array([0.25, 0.25])
-    X = np.broadcast_to(identity(5), (5, 5, 2))
+    X = identity(5, 2)
     fit = linearised(source.system, t, y, u, x0, X, R)
     for j in range(5):
         shift = 1e-5 * source.system.scale[j] * np.eye(5)[j]

@@ -427,3 +427,21 @@ def test_a_disturbance_that_leads_out_of_the_finite_numbers_is_told():
     noise = np.full((10, 1, 2), 1e200)
     with pytest.raises(FloatingPointError, match="leaves the finite numbers from x0="):
         disturbed_truth(ReverseDuffing(), np.ones((1, 2)), np.arange(11) * 0.1, noise)
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_rates_lie_in_memory_as_the_states_do(name: str) -> None:
+    """So that a filter whose batch comes last, and an env whose batch comes first, both add them
+    up contiguously; and the numbers do not depend on it."""
+    system, setup = SYSTEMS.resolve(name).configured()
+    x = np.stack([initial_states(system, setup, 5)] * 3)
+    t = np.asarray(0.1)
+    u = system.input(t)
+    last = np.ascontiguousarray(x.transpose(0, 2, 1)).transpose(0, 2, 1)
+    for states in (x, last, x[0], last[0]):
+        rates = system.f(t, states, u)
+        assert rates.strides == states.strides
+        np.testing.assert_array_equal(rates, system.f(t, states.copy(order="C"), u))
+    A = system.f_jacobian(t, last, u)
+    assert A.transpose(0, 2, 3, 1).flags.c_contiguous
+    np.testing.assert_array_equal(A[1, 2], system.f_jacobian(t, x[1, 2], u))

@@ -26,9 +26,9 @@ class Memory:
     """What the filter keeps besides the state's own fields; the batch comes last."""
 
     Q: np.ndarray
-    """Covariance of the process noise, shape (nx, nx, 1)."""
+    """Covariance of the process noise, shape (nx, nx, batch)."""
     R: np.ndarray
-    """Covariance of the output noise, shape (ny, ny, 1)."""
+    """Covariance of the output noise, shape (ny, ny, batch)."""
     P_restart: np.ndarray
     """Covariances that a filter that was wrong starts again with, shape (nx, nx, batch)."""
     bounds: np.ndarray
@@ -79,7 +79,7 @@ class EKF(GaussianEstimator):
         degrees = np.maximum(np.arange(self.system.ny + 1), 1)
         bounds = chi2.ppf(1.0 if self.gate is None else self.gate, degrees)
         beyond = np.zeros(len(P0), dtype=int)
-        memory = Memory(*self.tuning(), wide.transpose(1, 2, 0), bounds, beyond)
+        memory = Memory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
         return State(prior.mean, P=P0, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:

@@ -49,7 +49,7 @@ class HighGain(GaussianEstimator):
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         largest = self._size(prior.cov.transpose(1, 2, 0)) + self.system.nx
-        return State(prior.mean, P=prior.cov, memory=(*self.tuning(), largest))
+        return State(prior.mean, P=prior.cov, memory=(*self.tuning(len(prior.mean)), largest))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat, P, (Q, R, largest) = state.xhat, covariances(state), state.memory

@@ -104,7 +104,7 @@ class MHE(GaussianEstimator):
     def _fit(self, memory: Memory, start: np.ndarray) -> Fit:
         """The model's trajectory through the window from a state at its start."""
         nx, batch = self.system.nx, len(start)
-        X = np.broadcast_to(identity(nx), (nx, nx, batch))
+        X = identity(nx, batch)
         R = np.diagonal(memory.R[..., 0])
         return linearised(self.system, memory.t, memory.y, memory.u, start, X, R)
 
@@ -136,7 +136,7 @@ def _step(fit: Fit, P: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.nd
     window; without P̄⁻¹, because P̄ may be singular: what is known stays."""
     L = cholesky(P, semidefinite=True)
     L_transposed = L.transpose(1, 0, 2)
-    inner = identity(len(P)) + product(product(L_transposed, fit.information), L)
+    inner = identity(len(P), P.shape[-1]) + product(product(L_transposed, fit.information), L)
     P = product(divide(L, inner), L_transposed)
     right = fit.right - np.einsum("ijb,bj->ib", fit.information, ahead)
     return ahead + np.einsum("ijb,jb->bi", P, right), P

@@ -52,15 +52,15 @@ class StrongTrackingEKF(GaussianEstimator):
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
-        return State(prior.mean, P=prior.cov, memory=self.tuning())
+        growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
+        memory = (*self.tuning(len(prior.mean)), self.output_variance, growth)
+        return State(prior.mean, P=prior.cov, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        Q, R = state.memory
+        Q, R, variance, growth = state.memory
         if state.t is not None:
             assert state.innovation is not None
-            size = (state.innovation**2 / self.output_variance).mean(axis=-1)
-            scale = np.diag(np.square(self.system.scale))[..., None]
-            Q = Q + self.gamma * size * scale
+            Q = Q + growth * (state.innovation**2 / variance).mean(axis=-1)
         xhat, P = predicted(self.system, state, t, u, Q)
         innovation, H = observe(self.system, xhat, y)
         if self.output_factor:
