@@ -13,6 +13,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.evaluation import evaluate, make_vector_env
 from pinnobs_gym.log import Log
 from pinnobs_gym.options import parse, settings_of
+from pinnobs_gym.video import check_video, write_video
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Evaluate:
     """Seed of the first."""
     out: Path = Path("runs/evaluate")
     """Folder of rows and TensorBoard log."""
+    video: Path | None = None
+    """Video of the first episode to write, NAME.mp4; needs the extra "video"."""
 
     def run(self) -> int:
         """Evaluate and print."""
@@ -44,6 +47,8 @@ class Evaluate:
         cls = ESTIMATORS.resolve(self.estimator)
         estimator: Estimator | type[Estimator] = cls
         options = settings_of(cls, self.set)
+        if self.video is not None:
+            check_video(self.video)
         source = make_vector_env(name, 1, self.setup, self.condition).source
         if self.checkpoint is not None:
             estimator = suite.load(cls, self.checkpoint, source.system, source.setup)
@@ -69,6 +74,11 @@ class Evaluate:
         for table in leaderboard.tables(scored):
             print_table(table)
         console.print(f"rows: {self.out / 'rows.jsonl'}; TensorBoard: {self.out / 'tensorboard'}")
+        if self.video is not None:
+            if not isinstance(estimator, Estimator):
+                estimator = cls.for_setup(source.system, source.setup, **options)
+            write_video(self.video, estimator, name, self.setup, self.condition, self.seed)
+            console.print(f"video: {self.video}", soft_wrap=True)
         return 0
 
 
