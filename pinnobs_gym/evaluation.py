@@ -100,8 +100,8 @@ def run_episodes(
     results: Path | str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[list[Row], Estimator, dict[str, Any] | None]:
-    """What `evaluate` does but for logging; returns also the estimator that was scored, and what
-    `state_figure` draws of one episode, if any was run."""
+    """What `evaluate` does but for logging; returns also the estimator that was scored, and the
+    seed of the first episode that was run, if any was, with what `state_figure` draws of it."""
     if not len(seeds):
         raise ValueError(f"episodes={len(seeds)}; expected at least 1")
     if seeds[0] < 0:
@@ -117,7 +117,9 @@ def run_episodes(
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
         now = [row["episode_seed"] for row in batch]
-        scored, example = score_batch(made, env_id, setup, condition, now)
+        scored, first_played = score_batch(made, env_id, setup, condition, now)
+        if example is None:
+            example = {"seed": now[0], **first_played}
         done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
         if path is not None:
             rows_module.append(path, done)
@@ -342,16 +344,19 @@ def log_episodes(
     first = rows[0]
     if example is not None and log.active:
         title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
-        figure = state_figure(estimator.system, title=title, **example)
-        log.figure("states", figure, first["episode_seed"])
+        drawn = {name: value for name, value in example.items() if name != "seed"}
+        log.figure("states", state_figure(estimator.system, title=title, **drawn), example["seed"])
 
 
 def log_summary(log: Log, rows: list[Row]) -> None:
-    """Log an estimator's settings and what came of them for the HPARAMS table."""
+    """Log an estimator's settings and what came of them for the HPARAMS table: medians, in which
+    diverged episodes count as infinite, where they are finite."""
     first = rows[0]
     parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
-    parameters |= {name: str(value) for name, value in first["options"].items()}
-    medians = {f"median/{name}": float(np.median([row[name] for row in rows])) for name in LOGGED}
+    parameters |= first["options"]
+    diverged = np.array([row["diverged"] for row in rows])
+    scores = {name: np.where(diverged, np.inf, [row[name] for row in rows]) for name in LOGGED}
+    medians = {f"median/{name}": float(np.median(values)) for name, values in scores.items()}
     summary = {name: value for name, value in medians.items() if np.isfinite(value)}
-    summary["diverged"] = float(np.mean([row["diverged"] for row in rows]))
+    summary["diverged"] = float(diverged.mean())
     log.hparams(parameters, summary)

@@ -195,17 +195,18 @@ def run_job(job: Job) -> None:
 
 
 def log_folder(folder: Path, row: Row) -> Path:
-    """Where TensorBoard's log of a row's estimator lies."""
+    """Where TensorBoard's log of a row's estimator lies: other settings of it have their own."""
     system = row["env_id"].removeprefix("pinnobs/")
-    return folder / "tensorboard" / system / row["setup"] / row["condition"] / row["estimator"]
+    played = folder / "tensorboard" / system / row["setup"] / row["condition"]
+    return played / row["estimator"] / row["config_hash"]
 
 
 def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
     """Log what came of every estimator in these rows for TensorBoard's HPARAMS table."""
-    groups: dict[tuple[Path, str], list[Row]] = {}
+    groups: dict[Path, list[Row]] = {}
     for row in rows:
-        groups.setdefault((log_folder(folder, row), row["config_hash"]), []).append(row)
-    for (place, _), group in groups.items():
+        groups.setdefault(log_folder(folder, row), []).append(row)
+    for place, group in groups.items():
         with Log(place) as log:
             log_summary(log, group)
 
