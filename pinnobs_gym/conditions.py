@@ -429,8 +429,9 @@ CONDITIONS: dict[str, Condition] = {
 """The conditions by name, in the order in which they act; ``a+b`` is both."""
 
 
-def parse_condition(name: str) -> Condition:
-    """The condition of that name, or several joined by ``+``, in whichever order they are named.
+def canonical_name(name: str) -> str:
+    """The one name of a condition: its parts in the order in which they act, whichever order they
+    are named in, and ``nominal`` only alone.
 
     Raises:
         ValueError: listing the known ones, if one is unknown; naming two of one kind.
@@ -445,9 +446,17 @@ def parse_condition(name: str) -> Condition:
             raise ValueError(
                 f"condition {name!r}: {first!r} and {second!r} change the same; name one"
             )
-    if len(named) == 1:
-        return CONDITIONS[name]
-    return Combined(tuple(CONDITIONS[part] for part in named))
+    return "+".join(part for part in named if part != "nominal") or "nominal"
+
+
+def parse_condition(name: str) -> Condition:
+    """The condition of that name, or several joined by ``+``, in whichever order they are named.
+
+    Raises:
+        ValueError: as `canonical_name` does.
+    """
+    parts = tuple(CONDITIONS[part] for part in canonical_name(name).split("+"))
+    return parts[0] if len(parts) == 1 else Combined(parts)
 
 
 def fitting(system: System, setup: Setup) -> list[str]:

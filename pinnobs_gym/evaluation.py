@@ -19,6 +19,7 @@ import numpy as np
 
 from pinnobs_gym import rows as rows_module
 from pinnobs_gym.bound import cramer_rao, expected_scores
+from pinnobs_gym.conditions import canonical_name
 from pinnobs_gym.consistency import consistency
 from pinnobs_gym.env import EstimationVectorEnv
 from pinnobs_gym.episodes import EpisodeSource, Stream
@@ -106,6 +107,7 @@ def run_episodes(
         raise ValueError(f"episodes={len(seeds)}; expected at least 1")
     if seeds[0] < 0:
         raise ValueError(f"seed={seeds[0]}; expected at least 0")
+    condition = canonical_name(condition)
     env = make_vector_env(env_id, 1, setup, condition)
     made = _make(estimator, env, options or {})
     common = _common(made, env, env_id, setup, condition)
@@ -286,7 +288,7 @@ def _common(
         "env_id": env_id,
         "setup": setup,
         "condition": condition,
-        "ranked": condition == env.source.system.ranked_condition,
+        "ranked": condition == canonical_name(env.source.system.ranked_condition),
         "nx": env.source.system.nx,
         "estimator": estimator.label,
         "track": estimator.track,
