@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 from pinnobs_gym import rows as rows_module
-from pinnobs_gym.bound import cramer_rao, expected_scores
+from pinnobs_gym.bound import cramer_rao, expected_scores, step_error
 from pinnobs_gym.conditions import canonical_name
 from pinnobs_gym.consistency import consistency
 from pinnobs_gym.env import EstimationVectorEnv
@@ -242,7 +242,8 @@ def _reference(
 ) -> dict[str, np.ndarray] | None:
     """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each;
     None where there is none: without noise, from a fixed initial state, or under a condition that
-    is not in the model (`Condition.reference`)."""
+    is not in the model (`Condition.reference`). NaN where it is below what a single step of the
+    model errs by."""
     source = EpisodeSource(system, setup, condition)
     std = vector(source.setup.noise_std, source.system.ny, "noise_std")
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
@@ -253,7 +254,13 @@ def _reference(
     Q = None if source.process_noise is None else np.diag(source.process_noise**2)
     P0, R = record.prior.cov[0], np.diag(std**2)
     P = cramer_rao(source.system, record.t, x, P0, R, Q, np.isnan(record.y))
-    return expected_scores(P, source.system.scale, source.system.observable(x))
+    counted = (source.system.scale, source.system.observable(x))
+    expected = expected_scores(P, *counted)
+    if Q is None:
+        error = step_error(source.system, record.t, x)
+        floor = expected_scores(error[..., None] * error[..., None, :], *counted)
+        expected = {n: np.where(v > floor[n], v, np.nan) for n, v in expected.items()}
+    return expected
 
 
 def _number_of(values: np.ndarray | None, row: int) -> float | None:
