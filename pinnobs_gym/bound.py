@@ -81,6 +81,25 @@ def expected_scores(
     return {name: window(total, number, part) for name, part in parts.items()}
 
 
+def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """What one step of the model from the true state errs by, shape (batch, num_samples, nx), zero
+    at the first sample.
+
+    `cramer_rao` supposes that steps are exact. Without process noise the reference of a plant that
+    forgets its past falls without end; below this error it says nothing of any estimate.
+
+    Args:
+        system: the plant.
+        t: sample times in s, shape (num_samples,).
+        x: true states without process noise, shape (batch, num_samples, nx).
+    """
+    error, u = np.zeros_like(x), system.input(t)
+    for k in range(1, len(t)):
+        times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
+        error[:, k] = model_step(system, *times, x[:, k - 1], *inputs) - x[:, k]
+    return error
+
+
 @dataclass(frozen=True)
 class Posterior:
     """What the outputs up to each sample say of the state then."""

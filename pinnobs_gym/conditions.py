@@ -21,6 +21,18 @@ def noise_scale(system: System, setup: Setup) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class Outputs:
+    """Noisy outputs of some episodes."""
+
+    t: np.ndarray
+    """Sample times in s, shape (num_samples,)."""
+    y: np.ndarray
+    """Shape (num_samples, batch, ny)."""
+    noise_std: np.ndarray
+    """What `noise_scale` gives, shape (ny,)."""
+
+
+@dataclass(frozen=True)
 class Condition:
     """What changes in an episode. The base class changes nothing.
 
@@ -57,25 +69,10 @@ class Condition:
         first, in state units; None for none."""
         return None
 
-    def outputs(
-        self,
-        t: np.ndarray,
-        y: np.ndarray,
-        noise_std: np.ndarray,
-        rngs: Sequence[np.random.Generator],
-    ) -> np.ndarray:
-        """What becomes of the noisy outputs on the way.
-
-        Args:
-            t: sample times in s, shape (num_samples,).
-            y: outputs, shape (num_samples, batch, ny).
-            noise_std: the noise that `noise_scale` gives, shape (ny,).
-            rngs: a generator per episode.
-
-        Returns:
-            A new array of y's shape; NaN is a missing output.
-        """
-        return y
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        """What becomes of noisy outputs on the way: a new array of y's shape, in which NaN is a
+        missing output."""
+        return sent.y
 
 
 @dataclass(frozen=True)
@@ -264,19 +261,12 @@ class Outliers(Condition):
     def summary(self) -> str:
         return f"{100 * self.probability:g} % of the outputs off by {self.strength:g} σ"
 
-    def outputs(
-        self,
-        t: np.ndarray,
-        y: np.ndarray,
-        noise_std: np.ndarray,
-        rngs: Sequence[np.random.Generator],
-    ) -> np.ndarray:
-        shape = (len(y), y.shape[-1])
-        std = self.strength * noise_std
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        shape = (len(sent.y), sent.y.shape[-1])
         errors = [
             (rng.random(shape) < self.probability) * rng.standard_normal(shape) for rng in rngs
         ]
-        return y + np.stack(errors, axis=1) * std
+        return sent.y + np.stack(errors, axis=1) * (self.strength * sent.noise_std)
 
 
 @dataclass(frozen=True)
@@ -298,15 +288,9 @@ class Delay(Condition):
             )
         return setup
 
-    def outputs(
-        self,
-        t: np.ndarray,
-        y: np.ndarray,
-        noise_std: np.ndarray,
-        rngs: Sequence[np.random.Generator],
-    ) -> np.ndarray:
-        late = np.full_like(y, np.nan)
-        late[self.samples :] = y[: -self.samples]
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        late = np.full_like(sent.y, np.nan)
+        late[self.samples :] = sent.y[: -self.samples]
         return late
 
 
@@ -321,15 +305,10 @@ class Dropouts(Condition):
     def summary(self) -> str:
         return f"{100 * self.probability:g} % of the outputs missing"
 
-    def outputs(
-        self,
-        t: np.ndarray,
-        y: np.ndarray,
-        noise_std: np.ndarray,
-        rngs: Sequence[np.random.Generator],
-    ) -> np.ndarray:
-        lost = [rng.random((len(y), y.shape[-1])) < self.probability for rng in rngs]
-        return np.where(np.stack(lost, axis=1), np.nan, y)
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        shape = (len(sent.y), sent.y.shape[-1])
+        lost = [rng.random(shape) < self.probability for rng in rngs]
+        return np.where(np.stack(lost, axis=1), np.nan, sent.y)
 
 
 @dataclass(frozen=True)
@@ -347,17 +326,12 @@ class Gap(Condition):
             f"no output for {self.seconds:g} s, at most {100 * self.largest_part:g} % of the time"
         )
 
-    def outputs(
-        self,
-        t: np.ndarray,
-        y: np.ndarray,
-        noise_std: np.ndarray,
-        rngs: Sequence[np.random.Generator],
-    ) -> np.ndarray:
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        t = sent.t
         length = min(self.seconds, self.largest_part * float(t[-1] - t[0]))
         first = np.array([rng.uniform(t[0], t[-1] - length) for rng in rngs])
         lost = (t[:, None] >= first) & (t[:, None] < first + length)
-        return np.where(lost[..., None], np.nan, y)
+        return np.where(lost[..., None], np.nan, sent.y)
 
 
 @dataclass(frozen=True)
@@ -399,16 +373,10 @@ class Combined(Condition):
         stds = [part.process_noise(system) for part in self.parts]
         return next((std for std in stds if std is not None), None)
 
-    def outputs(
-        self,
-        t: np.ndarray,
-        y: np.ndarray,
-        noise_std: np.ndarray,
-        rngs: Sequence[np.random.Generator],
-    ) -> np.ndarray:
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
         for part in self.parts:
-            y = part.outputs(t, y, noise_std, rngs)
-        return y
+            sent = replace(sent, y=part.outputs(sent, rngs))
+        return sent.y
 
 
 CONDITIONS: dict[str, Condition] = {
@@ -429,8 +397,9 @@ CONDITIONS: dict[str, Condition] = {
 """The conditions by name, in the order in which they act; ``a+b`` is both."""
 
 
-def parse_condition(name: str) -> Condition:
-    """The condition of that name, or several joined by ``+``, in whichever order they are named.
+def canonical_name(name: str) -> str:
+    """The one name of a condition: its parts in the order in which they act, whichever order they
+    are named in, and ``nominal`` only alone.
 
     Raises:
         ValueError: listing the known ones, if one is unknown; naming two of one kind.
@@ -445,9 +414,17 @@ def parse_condition(name: str) -> Condition:
             raise ValueError(
                 f"condition {name!r}: {first!r} and {second!r} change the same; name one"
             )
-    if len(named) == 1:
-        return CONDITIONS[name]
-    return Combined(tuple(CONDITIONS[part] for part in named))
+    return "+".join(part for part in named if part != "nominal") or "nominal"
+
+
+def parse_condition(name: str) -> Condition:
+    """The condition of that name, or several joined by ``+``, in whichever order they are named.
+
+    Raises:
+        ValueError: as `canonical_name` does.
+    """
+    parts = tuple(CONDITIONS[part] for part in canonical_name(name).split("+"))
+    return parts[0] if len(parts) == 1 else Combined(parts)
 
 
 def fitting(system: System, setup: Setup) -> list[str]:

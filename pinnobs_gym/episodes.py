@@ -8,7 +8,7 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
-from pinnobs_gym.conditions import Condition, noise_scale, parse_condition
+from pinnobs_gym.conditions import Condition, Outputs, noise_scale, parse_condition
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.simulate import disturbed_truth, truth
 from pinnobs_gym.system import System, vector
@@ -144,8 +144,8 @@ class EpisodeSource:
         np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
         y += plant.h(x)
         if not self.trivial:
-            scale = noise_scale(self.system, self.setup)
-            y[:] = self.condition.outputs(self.times, y, scale, rngs)
+            sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
+            y[:] = self.condition.outputs(sent, rngs)
         ny = self.system.ny
         observations[..., :ny] = y
         observations[..., ny:-1] = self.inputs[:, None]

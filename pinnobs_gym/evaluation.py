@@ -18,7 +18,8 @@ import gymnasium as gym
 import numpy as np
 
 from pinnobs_gym import rows as rows_module
-from pinnobs_gym.bound import cramer_rao, expected_scores
+from pinnobs_gym.bound import cramer_rao, expected_scores, step_error
+from pinnobs_gym.conditions import canonical_name
 from pinnobs_gym.consistency import consistency
 from pinnobs_gym.env import EstimationVectorEnv
 from pinnobs_gym.episodes import EpisodeSource, Stream
@@ -100,12 +101,13 @@ def run_episodes(
     results: Path | str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[list[Row], Estimator, dict[str, Any] | None]:
-    """What `evaluate` does but for logging; returns also the estimator that was scored, and what
-    `state_figure` draws of one episode, if any was run."""
+    """What `evaluate` does but for logging; returns also the estimator that was scored, and the
+    seed of the first episode that was run, if any was, with what `state_figure` draws of it."""
     if not len(seeds):
         raise ValueError(f"episodes={len(seeds)}; expected at least 1")
     if seeds[0] < 0:
         raise ValueError(f"seed={seeds[0]}; expected at least 0")
+    condition = canonical_name(condition)
     env = make_vector_env(env_id, 1, setup, condition)
     made = _make(estimator, env, options or {})
     common = _common(made, env, env_id, setup, condition)
@@ -117,7 +119,9 @@ def run_episodes(
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
         now = [row["episode_seed"] for row in batch]
-        scored, example = score_batch(made, env_id, setup, condition, now)
+        scored, first_played = score_batch(made, env_id, setup, condition, now)
+        if example is None:
+            example = {"seed": now[0], **first_played}
         done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
         if path is not None:
             rows_module.append(path, done)
@@ -238,7 +242,8 @@ def _reference(
 ) -> dict[str, np.ndarray] | None:
     """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each;
     None where there is none: without noise, from a fixed initial state, or under a condition that
-    is not in the model (`Condition.reference`)."""
+    is not in the model (`Condition.reference`). NaN where it is below what a single step of the
+    model errs by."""
     source = EpisodeSource(system, setup, condition)
     std = vector(source.setup.noise_std, source.system.ny, "noise_std")
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
@@ -249,7 +254,13 @@ def _reference(
     Q = None if source.process_noise is None else np.diag(source.process_noise**2)
     P0, R = record.prior.cov[0], np.diag(std**2)
     P = cramer_rao(source.system, record.t, x, P0, R, Q, np.isnan(record.y))
-    return expected_scores(P, source.system.scale, source.system.observable(x))
+    counted = (source.system.scale, source.system.observable(x))
+    expected = expected_scores(P, *counted)
+    if Q is None:
+        error = step_error(source.system, record.t, x)
+        floor = expected_scores(error[..., None] * error[..., None, :], *counted)
+        expected = {n: np.where(v > floor[n], v, np.nan) for n, v in expected.items()}
+    return expected
 
 
 def _number_of(values: np.ndarray | None, row: int) -> float | None:
@@ -284,7 +295,7 @@ def _common(
         "env_id": env_id,
         "setup": setup,
         "condition": condition,
-        "ranked": condition == env.source.system.ranked_condition,
+        "ranked": condition == canonical_name(env.source.system.ranked_condition),
         "nx": env.source.system.nx,
         "estimator": estimator.label,
         "track": estimator.track,
@@ -342,16 +353,19 @@ def log_episodes(
     first = rows[0]
     if example is not None and log.active:
         title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
-        figure = state_figure(estimator.system, title=title, **example)
-        log.figure("states", figure, first["episode_seed"])
+        drawn = {name: value for name, value in example.items() if name != "seed"}
+        log.figure("states", state_figure(estimator.system, title=title, **drawn), example["seed"])
 
 
 def log_summary(log: Log, rows: list[Row]) -> None:
-    """Log an estimator's settings and what came of them for the HPARAMS table."""
+    """Log an estimator's settings and what came of them for the HPARAMS table: medians, in which
+    diverged episodes count as infinite, where they are finite."""
     first = rows[0]
     parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
-    parameters |= {name: str(value) for name, value in first["options"].items()}
-    medians = {f"median/{name}": float(np.median([row[name] for row in rows])) for name in LOGGED}
+    parameters |= first["options"]
+    diverged = np.array([row["diverged"] for row in rows])
+    scores = {name: np.where(diverged, np.inf, [row[name] for row in rows]) for name in LOGGED}
+    medians = {f"median/{name}": float(np.median(values)) for name, values in scores.items()}
     summary = {name: value for name, value in medians.items() if np.isfinite(value)}
-    summary["diverged"] = float(np.mean([row["diverged"] for row in rows]))
+    summary["diverged"] = float(diverged.mean())
     log.hparams(parameters, summary)

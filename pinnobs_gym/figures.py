@@ -171,4 +171,5 @@ class EpisodePicture:
         window, shown = self._window
         shown.set_data(image)
         window.canvas.draw_idle()
-        pyplot.pause(1e-3)
+        # What pyplot.pause does but for raising the window: it would take the focus at each frame.
+        window.canvas.start_event_loop(1e-3)

@@ -61,11 +61,20 @@ class Log:
     def hparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """Add the run's settings and what came of them to the HPARAMS table."""
         if writer := self._writer():
-            # The table takes no None and no sequences; the run name keeps it in this very run.
+            from torch.utils.tensorboard.summary import hparams
+
+            # The table takes no None and no sequences.
             shown = {
                 k: v if isinstance(v, bool | int | float) else str(v) for k, v in params.items()
             }
-            writer.add_hparams(shown, dict(metrics), run_name=".")
+            # The writer's own add_hparams would also say which columns the table has, and
+            # TensorBoard would give the table of all runs the columns of the first.
+            _, start, end = hparams(shown, dict(metrics))
+            assert writer.file_writer is not None  # it is there until the writer is closed
+            for summary in (start, end):
+                writer.file_writer.add_summary(summary)
+            for tag, value in metrics.items():
+                writer.add_scalar(tag, value, 0)
 
     def close(self) -> None:
         """Write everything out and close the files; a closed log that is used again reopens."""

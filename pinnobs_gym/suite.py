@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import joblib
 
 from pinnobs_gym import env_id
-from pinnobs_gym.conditions import fitting
+from pinnobs_gym.conditions import canonical_name, fitting
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.evaluation import (
@@ -131,9 +131,9 @@ def jobs_of(
             raise ValueError(f"estimator {estimator!r} knows one record; it cannot be ranked")
         for system in systems:
             name, ranked = env_id(system), SYSTEMS.resolve(system).ranked_condition
-            played = list(dict.fromkeys(["nominal", ranked]))
+            played = list(dict.fromkeys(["nominal", canonical_name(ranked)]))
             if list(conditions) != ["all"]:
-                played = list(dict.fromkeys(conditions)) or played
+                played = list(dict.fromkeys(map(canonical_name, conditions))) or played
             elif cls.needs_training is None and cls.trains_on_record is None:
                 model, chosen = SYSTEMS.resolve(system).configured(setup)
                 played += [name for name in fitting(model, chosen) if name not in played]
@@ -195,17 +195,18 @@ def run_job(job: Job) -> None:
 
 
 def log_folder(folder: Path, row: Row) -> Path:
-    """Where TensorBoard's log of a row's estimator lies."""
+    """Where TensorBoard's log of a row's estimator lies: other settings of it have their own."""
     system = row["env_id"].removeprefix("pinnobs/")
-    return folder / "tensorboard" / system / row["setup"] / row["condition"] / row["estimator"]
+    played = folder / "tensorboard" / system / row["setup"] / row["condition"]
+    return played / row["estimator"] / row["config_hash"]
 
 
 def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
     """Log what came of every estimator in these rows for TensorBoard's HPARAMS table."""
-    groups: dict[tuple[Path, str], list[Row]] = {}
+    groups: dict[Path, list[Row]] = {}
     for row in rows:
-        groups.setdefault((log_folder(folder, row), row["config_hash"]), []).append(row)
-    for (place, _), group in groups.items():
+        groups.setdefault(log_folder(folder, row), []).append(row)
+    for place, group in groups.items():
         with Log(place) as log:
             log_summary(log, group)
 

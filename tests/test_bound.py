@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from linear import H, Linear, linear_record, record_of, runge_kutta_matrix
+from linear import A, H, Linear, linear_record, record_of, runge_kutta_matrix
+from scipy.linalg import expm
 
-from pinnobs_gym.bound import cramer_rao, exact_bayes, expected_scores
+from pinnobs_gym.bound import cramer_rao, exact_bayes, expected_scores, step_error
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.metrics import score
@@ -89,6 +90,18 @@ def test_expected_scores_are_those_of_errors_of_these_covariances():
 @dataclass(frozen=True)
 class WideLinear(Linear):
     setups = {"benchmark": replace(Linear.setups["benchmark"], x0_low=(-5, -5), x0_high=(5, 5))}
+
+
+def test_the_error_of_a_step_is_the_runge_kutta_methods():
+    x = np.random.default_rng(0).standard_normal((3, 5, 2))
+    dt = 0.1
+    for k in range(1, 5):
+        x[:, k] = x[:, k - 1] @ expm(dt * A).T
+    found = step_error(Linear(), dt * np.arange(5), x)
+    expected = x[:, :-1] @ (runge_kutta_matrix(dt) - expm(dt * A)).T
+    np.testing.assert_allclose(found[:, 1:], expected, atol=1e-14)
+    assert abs(found[:, 1:]).max() > 1e-8
+    assert not found[:, 0].any()
 
 
 def test_on_a_linear_system_exact_bayes_is_least_squares():

@@ -5,10 +5,13 @@ import pytest
 from linear import A, Linear
 from scipy.linalg import expm
 
-from pinnobs_gym.conditions import CONDITIONS, fitting, parse_condition
+from pinnobs_gym import evaluate, rows
+from pinnobs_gym.cli import main
+from pinnobs_gym.conditions import CONDITIONS, canonical_name, fitting, parse_condition
 from pinnobs_gym.env import EstimationEnv
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.report import page
+from pinnobs_gym.suite import jobs_of
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.satellite import Satellite
@@ -150,6 +153,52 @@ def test_the_order_of_names_does_not_matter():
     _, other = played("Satellite", "mismatch10+outliers", batch=2)
     np.testing.assert_array_equal(one.x, other.x)
     np.testing.assert_array_equal(one.y, other.y)
+
+
+@pytest.mark.parametrize(
+    ("name", "canonical"),
+    [
+        ("nominal", "nominal"),
+        ("load_step", "load_step"),
+        ("outliers+mismatch10", "mismatch10+outliers"),
+        ("mismatch10+outliers", "mismatch10+outliers"),
+        ("gap+dt2+noise5", "noise5+dt2+gap"),
+        ("noise5+nominal", "noise5"),
+    ],
+)
+def test_a_condition_has_one_name(name, canonical):
+    assert canonical_name(name) == canonical
+    assert parse_condition(name) == parse_condition(canonical)
+
+
+def test_both_spellings_are_one_condition_to_rows_jobs_and_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spellings = ("outliers+dt5", "dt5+outliers")
+    found = [
+        evaluate("ekf", "pinnobs/Academic-v0", episodes=1, condition=name, results="rows.jsonl")
+        for name in spellings
+    ]
+    assert found[0] == found[1]  # its date too: the second is the stored row
+    (row,) = rows.read(tmp_path / "rows.jsonl")
+    assert row["condition"] == "dt5+outliers"
+    jobs = jobs_of(
+        ["Academic"],
+        ["ekf"],
+        setup="benchmark",
+        conditions=spellings,
+        episodes=1,
+        trained_episodes=1,
+        seed=0,
+        folder=tmp_path,
+        training={},
+    )
+    assert [job.condition for job in jobs] == ["dt5+outliers"]
+    pytest.importorskip("optuna")
+    for name in spellings:
+        chosen = ["--system", "Academic", "--condition", name, "--episodes", "2"]
+        assert main(["tune", "ekf", *chosen, "--trials", "2"]) == 0
+    trials = {path.name for path in (tmp_path / "runs" / "tune").glob("*.journal")}
+    assert trials == {"Academic-v0-benchmark-dt5+outliers-ekf.journal"}
 
 
 @pytest.mark.parametrize(

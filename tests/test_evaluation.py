@@ -166,3 +166,13 @@ def test_the_reference_knows_of_noise_gaps_and_process_noise():
     assert row["reference_ratio"] is None
     (row,) = evaluate("ekf", "pinnobs/Academic-v0", episodes=1, setup="paper")
     assert row["reference_ratio"] is None
+
+
+def test_a_reference_below_the_error_of_a_step_is_none():
+    """The motor forgets its past: without process noise the reference of its tail is 1e-8."""
+    (row,) = evaluate("ekf", "pinnobs/InductionMotor-v0", episodes=1)
+    assert row["reference_ratio_tail"] is None
+    assert 1 < row["reference_ratio"] < 1000
+    known = {"condition": "process_noise1e-3", "options": {"process_noise": 1e-3}}
+    (row,) = evaluate("ekf", "pinnobs/InductionMotor-v0", episodes=1, **known)
+    assert row["reference_ratio_tail"] == pytest.approx(1, abs=0.4)

@@ -41,9 +41,12 @@ def linear_T(dynamics, plant=PLANT):
     return solve_sylvester(dynamics.A, -plant, -dynamics.B @ H)
 
 
-def trained_on(name, system="ReverseDuffing", noise_std=None, **settings):
+def trained_on(name, system="ReverseDuffing", noise_std=None, part=1.0, **settings):
+    """Trained on the sample times of the first part of an episode."""
     module = trainer(name)
-    plant, setup, record = record_of(f"pinnobs/{system}-v0", "benchmark", "nominal", 10**6)
+    plant, setup, whole = record_of(f"pinnobs/{system}-v0", "benchmark", "nominal", 10**6)
+    n = round(part * whole.num_samples)
+    record = Record(whole.t[:n], whole.y[:, :n], whole.u[:, :n], whole.prior)
     told = setup.noise_std if noise_std is None else noise_std
     config = module.Config(**{**SMALL, **settings})
     return module.train(plant, config, record=record, noise_std=told), plant, setup, record
@@ -445,7 +448,8 @@ def test_learned_poles_are_stable_and_new():
 
 
 def test_the_sweep_chooses_a_cutoff_and_draws_its_curve():
-    trained, plant, _, record = trained_on("kkl_supervised", sweep="cutoff", iterations=15, width=8)
+    short = {"iterations": 15, "width": 8, "part": 0.2}
+    trained, plant, _, record = trained_on("kkl_supervised", sweep="cutoff", **short)
     points = trained.facts["sweep"]
     chosen = min(points, key=lambda point: point["loss"])
     assert trained.config["cutoff"] == chosen["cutoff"]
@@ -453,7 +457,7 @@ def test_the_sweep_chooses_a_cutoff_and_draws_its_curve():
     assert points[-1]["noise_gain"] > 2 * points[3]["noise_gain"]  # faster filters pass more
     drawn = trainer("kkl_supervised").figures(plant, trained, record)
     assert set(drawn) == {"radius", "error", "maps", "sweep"}
-    driven, plant, _, record = trained_on("kkl_supervised", "InductionMotor", iterations=15)
+    driven, plant, _, record = trained_on("kkl_supervised", "InductionMotor", **short)
     assert set(trainer("kkl_supervised").figures(plant, driven, record)) == {"radius"}
 
 

@@ -22,6 +22,7 @@ import reproduce_paper
 from reproduction import comparison, report, running
 from reproduction.tables import TABLES, Case, Printed, Table
 
+from pinnobs_gym.episodes import EpisodeSource
 from trainers.pinn_obs import Config
 
 SMALL = {"depth": 1, "width": 4, "iterations": 60, "points": 40, "checkpoint_every": 10}
@@ -263,8 +264,18 @@ def test_a_damaged_results_file_is_one_line(line, capsys, tmp_path):
     assert error.count("\n") == 1
 
 
-def test_the_comparison_keeps_what_is_there_and_shows_both(tmp_path, capsys):
-    options = ["comparison", "--records", "2", "--budget", "0.5", "--out", str(tmp_path)]
+def test_the_comparison_keeps_what_is_there_and_shows_both(tmp_path, capsys, monkeypatch):
+    configured = comparison.Comparison.config
+
+    def fewer(self, method):
+        config = configured(self, method)
+        few = {"trajectories": 40, "samples": 40}
+        return config if method.startswith("pinn_obs") else replace(config, **few)
+
+    monkeypatch.setattr(comparison.Comparison, "config", fewer)
+    source = EpisodeSource("ReverseDuffing", noise_std=0.0, dt=0.2)
+    monkeypatch.setattr(comparison, "_source", lambda: source)
+    options = ["comparison", "--records", "2", "--budget", "0.2", "--out", str(tmp_path)]
     assert reproduce_paper.main(options) == 0
     shown = capsys.readouterr().out
     assert "kkl_autoencoder: trained in" in shown

@@ -1,3 +1,7 @@
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -158,3 +162,39 @@ def test_the_command_prints_settings_that_evaluate_takes(tmp_path, monkeypatch, 
     assert main(["evaluate", *where, "--episodes", "1", "--out", "ev", *line.split()]) == 0
     (row,) = rows.read(tmp_path / "ev" / "rows.jsonl")
     assert f"process_noise={row['options']['process_noise']:.4g}" in line
+
+
+def test_ctrl_c_keeps_what_was_tried_and_the_next_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["tune", "ekf", "--system", "Academic", "--condition", "dt5", "--episodes", "4"]
+    command += ["--out", "tune"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pinnobs_gym.cli", *command, "--trials", "100000"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    path = tmp_path / "tune" / "Academic-v0-benchmark-dt5-ekf.journal"
+    one = Search(EKF, "pinnobs/Academic-v0", "benchmark", "dt5", 4, path)
+    deadline = time.monotonic() + 120
+    while not (path.exists() and path.stat().st_size and one.done() >= 5):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    printed, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in printed + told
+    done, best = one.done(), one.best()
+    assert done >= 5
+    if best.error < one.error({}):
+        assert f"best:    geometric mean NRMSE {best.error:.4g}" in printed
+        (line,) = (line for line in printed.splitlines() if line.startswith("--set "))
+        for name, value in best.settings.items():
+            assert f"{name}={value:.4g}" in line
+    else:
+        assert "nothing better than the default was found" in printed
+    assert "trials: tune/Academic-v0-benchmark-dt5-ekf.journal" in printed
+    assert main([*command, "--trials", f"{done + 2}"]) == 0
+    assert one.done() == done + 2  # two more, and what was there is still there
+    assert one.best().error <= best.error

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -19,10 +19,8 @@ import torch
 from pinnobs_gym.kkl import course
 from pinnobs_gym.kkl.config import DEFAULT, KKLConfig
 from pinnobs_gym.kkl.fitting import Equations, Objective, Term
-from pinnobs_gym.kkl.observer import TrainedKKL
 from pinnobs_gym.kkl.pictures import figures
-from pinnobs_gym.kkl.run import Run
-from pinnobs_gym.log import SILENT, Log
+from pinnobs_gym.kkl.run import Method, Run
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System
 from pinnobs_gym.training import expect
@@ -75,10 +73,10 @@ def gap(config: Config, system: System, record: Record) -> int:
     return min(max(1, samples), record.num_samples // 2)
 
 
-def residual(run: Run, gap: int) -> Objective:
+def residual(run: Run) -> Objective:
     """T(x_{k+m}) − Φᵐ T(x_k) − what the outputs between the two add to z."""
     data, scaling = run.data, run.z_scaling
-    pairs = run.pairs(gap)
+    pairs = run.pairs()
     root = np.linalg.inv(scaling.root)
     flows, driven = [], []
     for a, b in pairs:
@@ -104,30 +102,5 @@ def residual(run: Run, gap: int) -> Objective:
     return draw
 
 
-def train(
-    system: System,
-    config: Config,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None = None,
-    log: Log = SILENT,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    progress: bool = False,
-) -> TrainedKKL:
-    """Train T and T* on simulated episodes of the model; see `pinnobs_gym.kkl.course.train`."""
-    samples = gap(config, system, record)
-    return course.train(
-        "kkl_autoencoder",
-        lambda run: residual(run, samples),
-        False,
-        system,
-        config,
-        record=record,
-        noise_std=noise_std,
-        log=log,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=progress,
-        gap=samples,
-    )
+train = partial(course.train, Method("kkl_autoencoder", residual, labelled=False, gap=gap))
+"""See `pinnobs_gym.kkl.course.train`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -19,12 +19,8 @@ import torch
 from pinnobs_gym.kkl import course
 from pinnobs_gym.kkl.config import DEFAULT, KKLConfig
 from pinnobs_gym.kkl.fitting import Equations, Objective, Term
-from pinnobs_gym.kkl.observer import TrainedKKL
 from pinnobs_gym.kkl.pictures import figures
-from pinnobs_gym.kkl.run import Run
-from pinnobs_gym.log import SILENT, Log
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System
+from pinnobs_gym.kkl.run import Method, Run
 from pinnobs_gym.training import expect
 
 __all__ = ["Config", "figures", "train"]
@@ -92,28 +88,5 @@ def physics(run: Run) -> Objective:
     return draw
 
 
-def train(
-    system: System,
-    config: Config,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None = None,
-    log: Log = SILENT,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    progress: bool = False,
-) -> TrainedKKL:
-    """Train T and T* on simulated episodes of the model; see `pinnobs_gym.kkl.course.train`."""
-    return course.train(
-        "kkl_pinn",
-        physics,
-        True,
-        system,
-        config,
-        record=record,
-        noise_std=noise_std,
-        log=log,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=progress,
-    )
+train = partial(course.train, Method("kkl_pinn", physics))
+"""See `pinnobs_gym.kkl.course.train`."""

@@ -5,14 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pinnobs_gym import env_id, leaderboard, suite
 from pinnobs_gym.console import console, print_table, progress
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.evaluation import evaluate, make_vector_env
+from pinnobs_gym.evaluation import (
+    log_episodes,
+    log_summary,
+    make_vector_env,
+    run_episodes,
+)
 from pinnobs_gym.log import Log
 from pinnobs_gym.options import parse, settings_of
+from pinnobs_gym.report import check_writable
+from pinnobs_gym.rows import Row
+from pinnobs_gym.video import check_video, write_video
 
 
 @dataclass(frozen=True)
@@ -37,6 +46,8 @@ class Evaluate:
     """Seed of the first."""
     out: Path = Path("runs/evaluate")
     """Folder of rows and TensorBoard log."""
+    video: Path | None = None
+    """Video of the first episode to write, NAME.mp4; needs the extra "video"."""
 
     def run(self) -> int:
         """Evaluate and print."""
@@ -44,32 +55,52 @@ class Evaluate:
         cls = ESTIMATORS.resolve(self.estimator)
         estimator: Estimator | type[Estimator] = cls
         options = settings_of(cls, self.set)
+        if self.video is not None:
+            check_video(self.video)
         source = make_vector_env(name, 1, self.setup, self.condition).source
         if self.checkpoint is not None:
             estimator = suite.load(cls, self.checkpoint, source.system, source.setup)
         episodes = 1 if source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
-        folder = self.out / "tensorboard" / name.removeprefix("pinnobs/") / self.setup
-        with Log(folder / self.condition / ESTIMATORS.name_of(cls)) as log, progress() as bar:
-            task = bar.add_task("episodes", total=episodes)
-            scored = evaluate(
-                estimator,
-                name,
-                episodes=episodes,
-                seed=self.seed,
-                setup=self.setup,
-                condition=self.condition,
-                options=options,
-                results=self.out / "rows.jsonl",
-                log=log,
-                progress=lambda done: bar.advance(task, done),
-            )
-            bar.update(task, completed=episodes)
+        check_writable(self.out)
+        scored, made = self._score(estimator, name, episodes, options)
         for table in leaderboard.tables(scored):
             print_table(table)
-        console.print(f"rows: {self.out / 'rows.jsonl'}; TensorBoard: {self.out / 'tensorboard'}")
+        console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
+        if self.video is not None:
+            write_video(self.video, made, name, self.setup, self.condition, self.seed)
+            console.print(f"video: {self.video}", soft_wrap=True)
         return 0
+
+    @property
+    def _rows(self) -> Path:
+        return self.out / "rows.jsonl"
+
+    def _score(
+        self,
+        estimator: Estimator | type[Estimator],
+        name: str,
+        episodes: int,
+        options: dict[str, Any],
+    ) -> tuple[list[Row], Estimator]:
+        """The rows of that many episodes, logged, and the estimator that was scored."""
+        seeds = range(self.seed, self.seed + episodes)
+        game = (self.setup, self.condition)
+        with progress() as bar:
+            task = bar.add_task("episodes", total=episodes)
+
+            def told(done: int) -> None:
+                bar.advance(task, done)
+
+            scored, made, example = run_episodes(
+                estimator, name, seeds, *game, options, self._rows, told
+            )
+            bar.update(task, completed=episodes)
+        with Log(suite.log_folder(self.out, scored[0])) as log:
+            log_episodes(log, scored, made, example)
+            log_summary(log, scored)
+        return scored, made
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -12,6 +12,7 @@ from typing import Any, Generic, TypeVar
 import tyro
 
 from pinnobs_gym import acceptance, env_id, suite
+from pinnobs_gym.conditions import canonical_name
 from pinnobs_gym.console import console
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
@@ -53,10 +54,11 @@ def run(arguments: Sequence[str]) -> int:
     chosen = _chosen_training(name, module.Config, arguments[1:])
     check_writable(chosen.out)
     env = env_id(chosen.system)
-    played = suite.Played(env, chosen.setup, chosen.condition, chosen.episode)
-    source = make_vector_env(env, 1, chosen.setup, chosen.condition).source
+    condition = canonical_name(chosen.condition)
+    played = suite.Played(env, chosen.setup, condition, chosen.episode)
+    source = make_vector_env(env, 1, chosen.setup, condition).source
     system, setup = source.system, source.setup
-    title = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{chosen.condition}"
+    title = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{condition}"
     stem = chosen.out / f"{title}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
     path = stem.with_name(stem.name + ".pt")

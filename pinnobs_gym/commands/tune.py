@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from pinnobs_gym import env_id
+from pinnobs_gym.conditions import canonical_name
 from pinnobs_gym.console import console, progress
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.options import parse
@@ -45,9 +46,10 @@ class Tune:
             raise ValueError(f"trials={self.trials}; expected at least 1")
         cls, env = ESTIMATORS.resolve(self.name), env_id(self.system)
         check_writable(self.out)
-        game = f"{env.removeprefix('pinnobs/')}-{self.setup}-{self.condition}"
+        condition = canonical_name(self.condition)
+        game = f"{env.removeprefix('pinnobs/')}-{self.setup}-{condition}"
         path = self.out / f"{game}-{ESTIMATORS.name_of(cls)}.journal"
-        played = (env, self.setup, self.condition, self.episodes)
+        played = (env, self.setup, condition, self.episodes)
         search = Search(cls, *played, path, self.seed)
         done = search.done()
         default = Tried({}, search.error({}))

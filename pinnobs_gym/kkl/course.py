@@ -8,11 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.kkl.config import KKLConfig
-from pinnobs_gym.kkl.fitting import Objective
 from pinnobs_gym.kkl.observer import TrainedKKL
-from pinnobs_gym.kkl.run import Run
-from pinnobs_gym.log import Log
+from pinnobs_gym.kkl.run import Method, Run
+from pinnobs_gym.log import SILENT, Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.system import System, vector
 from pinnobs_gym.trained_file import read
@@ -31,29 +29,44 @@ _SWEEP_STEPS = 120
 
 
 def train(
-    trainer: str,
-    encoding: Callable[[Run], Objective],
-    labelled: bool,
+    method: Method,
     system: System,
     config: Any,
     *,
     record: Record,
-    noise_std: Sequence[float] | float | None,
-    log: Log,
-    checkpoint: Path | None,
-    resume: bool,
-    progress: bool,
-    gap: int = 0,
+    noise_std: Sequence[float] | float | None = None,
+    log: Log = SILENT,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: bool = False,
 ) -> TrainedKKL:
-    """The course of a training; see the trainers."""
-    _check(system, record, config)
+    """Train T and T* on simulated episodes of the model.
+
+    Args:
+        method: the trainer's; each trainer module has this function with its own filled in.
+        system: the model.
+        config: the recipe.
+        record: whose sample times are trained on, and the prior.
+        noise_std: standard deviation of the output noise; the benchmark setup's if None.
+        log: where curves go.
+        checkpoint: file that progress is kept in.
+        resume: go on from that file.
+        progress: show a bar.
+
+    Raises:
+        ValueError: in one line, if the recipe gives no observer of the system, or the checkpoint is
+            of another one.
+    """
+    _check(system, record)
     if resume and checkpoint is None:
         raise ValueError("resume=True without a checkpoint; name its file")
     told = system.setups["benchmark"].noise_std if noise_std is None else noise_std
     std = vector(told, system.ny, "noise_std")
 
+    gap = method.gap(config, system, record)
+
     def make(config: Any) -> Run:
-        return Run(trainer, system, config, record, std, encoding, labelled, gap)
+        return Run(method, system, config, record, std, gap)
 
     if resume and checkpoint is not None:
         run = make(_as_swept(config, checkpoint))
@@ -132,7 +145,7 @@ def _log(log: Log, run: Run) -> None:
     log.scalar(f"loss/{name}_held_out", run.latest, run.fit.iteration)
 
 
-def _check(system: System, record: Record, config: KKLConfig) -> None:
+def _check(system: System, record: Record) -> None:
     if system.measured_input:
         raise ValueError(
             f"{type(system).__name__} has a measured input; a KKL observer is trained on simulated "

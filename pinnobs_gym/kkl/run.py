@@ -42,34 +42,49 @@ _SHARE = 0.02
 """Part of the mean squared error that is added to each part's before it is divided by."""
 
 
+def _no_pairs(config: Any, system: System, record: Record) -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class Method:
+    """What the trainers differ in."""
+
+    name: str
+    """The trainer's."""
+    encoding: Callable[[Run], Objective]
+    """Makes the equations that T is fitted to."""
+    labelled: bool = True
+    """Whether T* is fitted to simulated z, and not to T's own."""
+    gap: Callable[[Any, System, Record], int] = _no_pairs
+    """Samples from the first to the second of each pair that is kept, if pairs are, for a recipe, a
+    system and a record."""
+
+
 class Run:
     """A training of T, then of T*.
 
     Args:
-        trainer: the trainer's name.
+        method: the trainer's.
         system: the model.
         config: the recipe.
         record: whose sample times are trained on, and the prior.
         noise_std: standard deviation of the output noise, shape (ny,).
-        encoding: makes the equations that T is fitted to.
-        labelled: whether T* is fitted to simulated z, and not to T's own.
         gap: samples from the first to the second of each pair that is kept, if pairs are.
     """
 
     def __init__(
         self,
-        trainer: str,
+        method: Method,
         system: System,
         config: KKLConfig,
         record: Record,
         noise_std: np.ndarray,
-        encoding: Callable[[Run], Objective],
-        labelled: bool,
         gap: int = 0,
     ) -> None:
         self._earlier, self._start = 0.0, time.process_time()
-        self.trainer, self.system, self.config = trainer, system, config
-        self.noise_std, self._encoding, self.labelled = noise_std, encoding, labelled
+        self.method, self.system, self.config = method, system, config
+        self.noise_std, self.gap = noise_std, gap
         self.driven = system.nu > 0
         self.t, self.prior = record.t, record.prior.mean[:1]
         if config.design == "learned":
@@ -81,7 +96,7 @@ class Run:
             self.dynamics = config.dynamics(system)
         self.dynamics.step(self.interval)  # a bad one is told before anything is simulated
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
-        self._simulate(gap)
+        self._simulate()
         self._prepare()
         self.latest = math.nan
         self.best: dict[str, Best] = {}
@@ -103,7 +118,7 @@ class Run:
         """Steps so far, for both networks."""
         return self.fit.iteration + (self.best["T"].made if self.stage != "T" else 0)
 
-    def _simulate(self, gap: int) -> None:
+    def _simulate(self) -> None:
         config, system = self.config, self.system
         held = max(20, config.trajectories // 10)
         total = config.trajectories + held
@@ -114,7 +129,7 @@ class Run:
         if not (config.transient or self.driven):
             settled = self.t[0] + _FORGOTTEN / self.dynamics.slowest
             first = min(int(np.searchsorted(self.t, settled)), (len(self.t) - 1) // 2)
-        self.kept = kept_samples(len(self.t), first, config.samples, gap, rng)
+        self.kept = kept_samples(len(self.t), first, config.samples, self.gap, rng)
         self.data = simulated(
             system, self.dynamics, self.t, x0, self.kept, config.start, self.prior
         )
@@ -148,7 +163,7 @@ class Run:
         self.times = self.tensor(self.clock_scaling.scaled(times))
         self.x = self.tensor(self.x_scaling.scaled(data.x))
         self.labels = None
-        if self.labelled:
+        if self.method.labelled:
             self.labels = self.tensor(self.z_scaling.scaled(data.z if data.T is None else data.T))
             self.z = self.tensor(self.whitening.scaled(data.z))
         shifted = self.noise + self.whitening.mean
@@ -176,10 +191,11 @@ class Run:
         x = self.x[k, i]
         return torch.cat([x, self.times[k]], dim=-1) if self.driven else x
 
-    def pairs(self, gap: int) -> np.ndarray:
+    def pairs(self) -> np.ndarray:
         """Kept samples that are ``gap`` samples apart, as indices (pairs, 2)."""
         where = {int(k): index for index, k in enumerate(self.kept)}
-        return np.array([[i, where[k + gap]] for k, i in where.items() if k + gap in where])
+        later = {k: where.get(k + self.gap) for k in where}
+        return np.array([[where[k], i] for k, i in later.items() if i is not None])
 
     def rates(self) -> np.ndarray:
         """Rates of change in 1/s of what T is given, at the kept samples: (kept, batch, size)."""
@@ -207,10 +223,10 @@ class Run:
         shape = (config.depth, config.width, config.activation)
         net = Mlp(inputs, outputs, *shape, generator, self.dtype, self.device)
         if stage == "T":
-            objective = self._encoding(self)
+            objective = self.method.encoding(self)
             self._checked = _held_equations(objective, config.seed)
         else:
-            if not self.labelled:  # T is what it is now
+            if not self.method.labelled:  # T is what it is now
                 self.z = self.tensor(self.whitening.scaled(self._own_z()))
             objective = self._decoding
             self._mse = torch.ones(int(self.parts[-1]) + 1, dtype=self.dtype, device=self.device)
@@ -394,7 +410,7 @@ class Run:
     def _expected(self) -> dict[str, Any]:
         """What a checkpoint must agree with."""
         config = {k: v for k, v in asdict(self.config).items() if k not in _FREE}
-        told = {"trainer": self.trainer, "noise_std": self.noise_std.tolist()}
+        told = {"trainer": self.method.name, "noise_std": self.noise_std.tolist()}
         return {**identity(self.system), **told, "config": config}
 
     def result(self) -> TrainedKKL:
@@ -404,7 +420,7 @@ class Run:
             self._begin("T*")
         about = identity(self.system)
         return TrainedKKL(
-            trainer=self.trainer,
+            trainer=self.method.name,
             A=self.dynamics.A,
             B=self.dynamics.B,
             mode=self.dynamics.mode,
