@@ -15,12 +15,27 @@ def blocks(path, *kinds):
 
 
 def run_python(text, folder, timeout=120):
-    """Run a block; one that begins with a comment ``# name.py`` is kept under that name, and later
-    ones may import it. Returns what it printed."""
-    named = re.match(r"# (\w+\.py)\n", text)
-    path = folder / (named.group(1) if named else "snippet.py")
-    path.write_text(text, encoding="utf-8")
-    return _run([sys.executable, "-W", "error::UserWarning", path.name], folder, timeout)
+    """Run a block by itself. Returns what it printed."""
+    (folder / "snippet.py").write_text(text, encoding="utf-8")
+    return _run([sys.executable, "-W", "error::UserWarning", "snippet.py"], folder, timeout)
+
+
+def run_page(path, folder, timeout=240):
+    """Run a file's blocks of Python and lines of ``pinnobs``, in order, in one process. A block
+    that begins with a comment ``# name.py`` is a module that later ones may import."""
+    parts = []
+    for kind, text in blocks(path, "python", "sh"):
+        if kind == "sh":
+            for line in text.splitlines():
+                assert line.startswith("pinnobs "), line
+                parts.append(f"assert main({line.split()[1:]!r}) == 0, {line!r}\n")
+            continue
+        named = re.match(r"# (\w+)\.py\n", text)
+        name = named.group(1) if named else f"part{len(parts)}"
+        (folder / f"{name}.py").write_text(text, encoding="utf-8")
+        parts.append(f"import {name}\n")
+    whole = "from pinnobs_gym.cli import main\n" + "".join(parts)
+    return run_python(whole, folder, timeout) if parts else ""
 
 
 def run_command(line, folder, timeout=120):

@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass
 
 import pytest
-from snippets import ROOT, blocks, run_command, run_python
+from snippets import ROOT, run_page
 
 from pinnobs_gym import Setup, System, suite
 from pinnobs_gym.conditions import CONDITIONS
@@ -151,12 +151,7 @@ def test_links_of_written_pages_lead_to_files(generated):
 
 @pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.stem)
 def test_the_code_of_a_guide_runs(path, tmp_path):
-    for kind, text in blocks(path, "python", "sh"):
-        if kind == "python":
-            run_python(text, tmp_path)
-        else:
-            for line in text.splitlines():
-                run_command(line, tmp_path)
+    run_page(path, tmp_path)
 
 
 @pytest.mark.slow
