@@ -71,14 +71,20 @@ def _equations(cls: type[System]) -> str:
     try:
         found = trace(cls())
     except ValueError as error:
-        return f"## Equations\n\nThey cannot be shown here as the text above has them: {error}.\n"
+        return f"## Equations\n\nThose of the text above: {error}.\n"
     outputs = [name_in_latex(name) for name in cls().output_names]
-    whole = [*zip(rates(found), found.f, strict=True), *zip(outputs, found.h, strict=True)]
+    whole = [
+        *zip(rates(found), found.f.flat(), strict=True),
+        *zip(outputs, found.h.flat(), strict=True),
+    ]
     parts = ["## Equations\n", "Run on symbols, the code that is simulated says:\n", _math(whole)]
     if found.definitions:
         parts += ["where\n", _math((latex(s), e) for s, e in found.definitions.items())]
     if found.u:
-        parts += ["with the input\n", _math(zip(map(latex, found.u), found.input, strict=True))]
+        parts += [
+            "with the input\n",
+            _math(zip(map(latex, found.u), found.input.flat(), strict=True)),
+        ]
     parts += ["and linearised\n", _math(_jacobians(found)), _symbols(cls, found)]
     return "\n".join(parts)
 
@@ -100,7 +106,7 @@ def _symbols(cls: type[System], found: Equations) -> str:
     )
 
 
-def _math(equations: Iterable[tuple[str, Any]] | str) -> str:
+def _math(equations: Iterable[tuple[Any, Any]] | str) -> str:
     text = equations if isinstance(equations, str) else aligned(list(equations))
     return f"```{{math}}\n\\begin{{aligned}}\n{text.strip()}\n\\end{{aligned}}\n```\n"
 

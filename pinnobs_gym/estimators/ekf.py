@@ -71,7 +71,7 @@ S &= H P_k^- H^\top + R, \qquad K = P_k^- H^\top S^{-1} \\
 \hat x_k &= \hat x_k^- + K e_k \\
 P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
 \text{gate: } & P_k^- := P_0 + \operatorname{diag}(\mathrm{scale}^2)
-\text{ after so many } e_k^\top S^{-1} e_k > \chi^2_{n_y} \\
+\text{ after patience samples in a row with } e_k^\top S^{-1} e_k > \chi^2_{n_y, \mathrm{gate}} \\
 \text{huber: } & R_{jj} := R_{jj} \max\bigl(1, |e_j| / (c \sqrt{S_{jj}})\bigr)
 """
 
