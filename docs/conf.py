@@ -16,6 +16,7 @@ version = release = importlib.metadata.version("pinnobs-gym")
 extensions = ["myst_nb"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 nitpicky = True
+suppress_warnings = ["toc.empty_glob"]  # the page of measured figures may not be written yet
 smartquotes = False  # the mark of x' is a prime
 
 myst_enable_extensions = ["dollarmath", "attrs_inline"]
@@ -23,6 +24,7 @@ myst_heading_anchors = 3
 nb_execution_mode = "force"  # what the tutorial shows is what this package does
 nb_execution_raise_on_error = True
 nb_execution_timeout = 120
+nb_merge_streams = True
 
 html_theme = "furo"
 html_title = f"pinnobs-gym {version}"

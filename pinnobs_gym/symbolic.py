@@ -193,16 +193,21 @@ def aligned(equations: Sequence[tuple[str, Any]]) -> str:
 
 def rates(equations: Equations) -> list[str]:
     """The left sides of ẋ = f in LaTeX."""
-    return [rf"\dot{{{name_in_latex(symbol.name)}}}" for symbol in equations.x]
+    return [rf"\dot{{{base}}}{marks}" for base, marks in (_parts(s.name) for s in equations.x)]
 
 
 def name_in_latex(name: str) -> str:
     """A state's, output's or parameter's name in LaTeX: ``phi1`` is a Greek letter with an index,
     ``velocity`` an upright word."""
+    return "".join(_parts(name))
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """A name in LaTeX, and its indices."""
     base, above, below = split_super_sub(name)
     parts = {"^": above, "_": below}
     marks = [f"{m}{{{','.join(map(_part, indices))}}}" for m, indices in parts.items() if indices]
-    return _part(base) + "".join(marks)
+    return _part(base), "".join(marks)
 
 
 def _part(text: Any) -> str:

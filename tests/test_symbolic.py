@@ -107,7 +107,7 @@ def test_what_is_computed_of_parameters_has_a_name():
 def test_latex():
     equations = trace(SYSTEMS.resolve("ReverseDuffing")())
     lines = aligned(list(zip(rates(equations), equations.f, strict=True)))
-    assert lines == "\\dot{x_{1}} &= x_{2}^{3} \\\\\n\\dot{x_{2}} &= - x_{1}"
+    assert lines == "\\dot{x}_{1} &= x_{2}^{3} \\\\\n\\dot{x}_{2} &= - x_{1}"
     assert latex(sympy.Symbol("velocity") ** 2) == r"\mathrm{velocity}^{2}"
     names = {
         "phi1": r"\phi_{1}",
