@@ -16,7 +16,6 @@ version = release = importlib.metadata.version("pinnobs-gym")
 extensions = ["myst_nb"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 nitpicky = True
-suppress_warnings = ["toc.empty_glob"]  # the page of measured figures may not be written yet
 smartquotes = False  # the mark of x' is a prime
 
 myst_enable_extensions = ["dollarmath", "attrs_inline"]
