@@ -93,6 +93,9 @@ class Estimator(ABC):
     """Which of its settings are searched by ``pinnobs tune``, and where."""
     recipe: ClassVar[Mapping[str, Any]] = {}
     """Choices in that trainer's Config that are made for it unless others are."""
+    equations: ClassVar[str] = ""
+    """Its equations in LaTeX for its page, one below the other as in an ``aligned`` environment;
+    φ is the model's flow from the sample before, and a raised minus marks what precedes y_k."""
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:

@@ -6,13 +6,13 @@ import csv
 import inspect
 import os
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pinnobs_gym.conditions import CONDITIONS, fitting
+from pinnobs_gym.docstrings import field_docs
 from pinnobs_gym.env import NOT_FINITE_REWARD
 from pinnobs_gym.estimator import Estimates
 from pinnobs_gym.record import Record
@@ -107,32 +107,12 @@ def _setups(cls: type[System]) -> str:
 
 def _parameters(cls: type[System]) -> str:
     system = cls()
-    described = _field_docs(cls)
+    described = field_docs(cls)
     rows = [
-        (name, f"{value}", described.get(name, "")) for name, value in system.parameters.items()
+        (name, f"{value}", " ".join(described.get(name, "").split()))
+        for name, value in system.parameters.items()
     ]
     return _table(("name", "default", "meaning"), rows) if rows else "none."
-
-
-def _field_docs(cls: type[System]) -> dict[str, str]:
-    """The docstring under each field."""
-    import ast
-    import textwrap
-
-    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    names = {f.name for f in fields(cls)}
-    found = {}
-    for statement, following in zip(body.body, body.body[1:], strict=False):
-        if (
-            isinstance(statement, ast.AnnAssign)
-            and isinstance(statement.target, ast.Name)
-            and statement.target.id in names
-            and isinstance(following, ast.Expr)
-            and isinstance(following.value, ast.Constant)
-        ):
-            found[statement.target.id] = str(following.value.value)
-    return found
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

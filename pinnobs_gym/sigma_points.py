@@ -46,6 +46,17 @@ class SigmaPointFilter(GaussianEstimator):
     `kalman.JITTER` of each of its variances is added, and reported in the state's memory.
     """
 
+    equations = r"""
+\chi_i^- &= \varphi(\hat x_{k-1} + \sqrt{P_{k-1}}\, \xi_i), \qquad
+\hat x_k^- = \sum_i w_i \chi_i^- \\
+P_k^- &= \sum_i v_i (\chi_i^- - \hat x_k^-)(\chi_i^- - \hat x_k^-)^\top + Q \\
+\chi_i &= \hat x_k^- + \sqrt{P_k^-}\, \xi_i, \qquad \hat y = \sum_i w_i h(\chi_i) \\
+X_i &= \sqrt{v_i} (\chi_i - \hat x_k^-), \qquad Y_i = \sqrt{v_i} (h(\chi_i) - \hat y) \\
+K &= X Y^\top (Y Y^\top + R)^{-1} \\
+\hat x_k &= \hat x_k^- + K\, (y_k - \hat y) \\
+P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
+"""
+
     @abstractmethod
     def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The points of the standard normal distribution, (num_points, nx), and their weights in

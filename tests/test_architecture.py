@@ -61,6 +61,8 @@ ALLOWED = {
     },
     "trained_file": {"system"},
     "training": set(),
+    "symbolic": {"system"},
+    "docstrings": set(),
 }
 """What a module or subpackage may import of ours; itself is a case of its own below."""
 FORBIDDEN = {

@@ -1,32 +1,20 @@
 """The README's snippets run, and what it names is there."""
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from snippets import ROOT, blocks, run_command, run_python
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PYTHON = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-SHELL = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+PYTHON = [text for _, text in blocks(ROOT / "README.md", "python")]
+SHELL = [text for _, text in blocks(ROOT / "README.md", "sh")]
 
 
 @pytest.mark.parametrize("number", range(len(PYTHON)))
 def test_python_snippet(number, tmp_path):
-    path = tmp_path / "snippet.py"
-    path.write_text(PYTHON[number])
-    done = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", path],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
+    printed = run_python(PYTHON[number], tmp_path)
     if "class Luenberger" in PYTHON[number]:
-        tail, diverged = done.stdout.split()
+        tail, diverged = printed.split()
         assert float(tail) < 0.2
         assert diverged == "False"
 
@@ -47,14 +35,7 @@ def test_the_estimate_command(tmp_path):
     (tmp_path / "my_module.py").write_text(snippet)
     (tmp_path / "log.csv").write_text("t,y1\n" + "".join(f"{k / 20},{1.5}\n" for k in range(20)))
     (command,) = (s for s in SHELL if "pinnobs estimate" in s)
-    done = subprocess.run(
-        [sys.executable, "-m", "pinnobs_gym.cli", *command.split()[1:]],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
+    run_command(command, tmp_path)
     assert (tmp_path / "estimates.csv").read_text().startswith("t,position,velocity,position_std")
     assert (tmp_path / "estimates.png").stat().st_size > 1000
 

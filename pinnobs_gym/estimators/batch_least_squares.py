@@ -34,6 +34,13 @@ class BatchLeastSquares(OfflineEstimator):
     """Samples of the first stretch."""
 
     name = "batch_least_squares"
+    equations = r"""
+\hat x_{0|n} &= \arg\min_x \; (x - \hat x_0)^\top P_0^{-1} (x - \hat x_0)
++ \sum_{k=0}^{n} \bigl\| y_k - h(\varphi_k(x)) \bigr\|^2_{R^{-1}} \\
+\hat x_k &= \varphi_k(\hat x_{0|n}), \qquad \Phi_k = \tfrac{\partial \varphi_k}{\partial x} \\
+P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \Bigr)^{-1}
+\Phi_k^\top
+"""
 
     def __post_init__(self) -> None:
         for name in ("max_iterations", "first_iterations", "shortest"):

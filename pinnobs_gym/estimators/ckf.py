@@ -19,6 +19,11 @@ class CKF(SigmaPointFilter):
     """
 
     name = "ckf"
+    equations = (
+        r"""
+\xi_i &= \pm \sqrt{n_x}\, \mathbf e_i, \qquad w_i = v_i = \frac{1}{2 n_x} \\"""
+        + SigmaPointFilter.equations
+    )
 
     def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         nx = self.system.nx

@@ -62,6 +62,18 @@ class EKF(GaussianEstimator):
     Huber 1964; Karlgaard & Schaub 2007). 1.345 is 95 % efficient on Gaussian noise. None: never."""
 
     name = "ekf"
+    equations = r"""
+\dot{\hat x} &= f(t, \hat x, u), \qquad
+\dot\Phi = \tfrac{\partial f}{\partial x}(t, \hat x, u)\, \Phi \\
+P_k^- &= \Phi P_{k-1} \Phi^\top + Q, \qquad Q = \operatorname{diag}(q \cdot \mathrm{scale})^2 \\
+e_k &= y_k - h(\hat x_k^-), \qquad H = \tfrac{\partial h}{\partial x}(\hat x_k^-) \\
+S &= H P_k^- H^\top + R, \qquad K = P_k^- H^\top S^{-1} \\
+\hat x_k &= \hat x_k^- + K e_k \\
+P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
+\text{gate: } & P_k^- := P_0 + \operatorname{diag}(\mathrm{scale}^2)
+\text{ after patience samples in a row with } e_k^\top S^{-1} e_k > \chi^2_{n_y, \mathrm{gate}} \\
+\text{huber: } & R_{jj} := R_{jj} \max\bigl(1, |e_j| / (c \sqrt{S_{jj}})\bigr)
+"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -48,6 +48,16 @@ class EnKF(GaussianEstimator):
     """Of the random numbers."""
 
     name = "enkf"
+    equations = r"""
+\chi_i &= \varphi(x_{k-1}^i), \qquad \bar\chi = \tfrac1N \sum_i \chi_i \\
+x_k^{i-} &= \bar\chi + \lambda\, (\chi_i - \bar\chi) + w_i, \qquad w_i \sim \mathcal N(0, Q) \\
+X &= \tfrac{1}{\sqrt{N-1}} \bigl[ x_k^{i-} - \bar x_k^- \bigr]_i, \qquad
+Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(x_k^{i-}) - \bar y \bigr]_i \\
+K &= X Y^\top (Y Y^\top + R)^{-1} \\
+x_k^i &= x_k^{i-} + K\, (y_k + v_i - h(x_k^{i-})), \qquad v_i \sim \mathcal N(0, R) \\
+\hat x_k &= \tfrac1N \sum_i x_k^i, \qquad
+P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
+"""
     tunable = {**GaussianEstimator.tunable, "inflation": Range(1.0, 1.1)}
 
     def __post_init__(self) -> None:

@@ -39,6 +39,15 @@ class HighGain(GaussianEstimator):
     """θ in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "high_gain"
+    equations = r"""
+\dot{\hat x} &= f(t, \hat x, u), \qquad
+P_k^- = e^{\theta (t_k - t_{k-1})}\, \Phi P_{k-1} \Phi^\top + Q \\
+& \text{without the factor where } \textstyle\sum_i P_{ii} / \mathrm{scale}_i^2
+\text{ would exceed that of } P_0 + \operatorname{diag}(\mathrm{scale}^2) \\
+K &= P_k^- H^\top (H P_k^- H^\top + R)^{-1} \\
+\hat x_k &= \hat x_k^- + K\, (y_k - h(\hat x_k^-)) \\
+P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
+"""
     tunable = {"theta": Range(0.1, 1e3, log=True)}
 
     def __post_init__(self) -> None:

@@ -13,4 +13,11 @@ class KKLSupervised(KKL):
     states and z (Ramos et al. 2020)."""
 
     name = "kkl_supervised"
+    equations = (
+        KKL.equations.rstrip()
+        + r""" \\
+T &: \; \min \textstyle\sum_i \| T(x_i) - z_i \|^2, \qquad
+T^* : \; \min \textstyle\sum_i \| T^*(z_i) - x_i \|^2
+"""
+    )
     needs_training = "kkl_supervised"

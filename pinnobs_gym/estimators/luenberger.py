@@ -37,6 +37,15 @@ class Luenberger(Estimator):
     """How fast errors should decay in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "luenberger"
+    equations = r"""
+\hat x_k &= \hat x_k^- + K\, (y_k - h(\hat x_k^-)) \\
+K &= \Delta t\, L\, (I + \Delta t\, H L)^{-1}, \qquad
+H = \tfrac{\partial h}{\partial x}(\hat x_k^-) \\
+\text{poles: } L &= P H^\top, \qquad (A + \rho I) P + P (A + \rho I)^\top - P H^\top H P
++ (0.1 \rho)^2 I = 0 \\
+\text{lmi: } L &= P^{-1} Y, \qquad P A + A^\top P - Y H - H^\top Y^\top + 2 \rho P \preceq 0
+\text{ for all } A, H
+"""
     tunable = {"rate": Range(0.1, 1e3, log=True)}
     knows = ("model", "prior")
 

@@ -67,6 +67,14 @@ class MHE(GaussianEstimator):
     """Gauss-Newton steps at every sample; one is the real-time iteration of Diehl et al. 2005."""
 
     name = "mhe"
+    equations = r"""
+x_{k-N+1} &= \arg\min_x \; (x - \bar x)^\top \bar P^{-1} (x - \bar x)
++ \sum_{j=k-N+1}^{k} \bigl\| y_j - h(\varphi_j(x)) \bigr\|^2_{R^{-1}} \\
+\hat x_k &= \varphi_k(x_{k-N+1}), \qquad
+G_j = \tfrac{\partial h(\varphi_j)}{\partial x}, \quad
+\Phi = \tfrac{\partial \varphi_k}{\partial x} \\
+P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\top
+"""
     tunable = {**GaussianEstimator.tunable, "window": Range(2, 40, log=True)}
 
     def __post_init__(self) -> None:

@@ -16,6 +16,9 @@ class OpenLoop(Estimator):
     """The model integrated from x̂₀ without looking at the output."""
 
     name = "open_loop"
+    equations = r"""
+\dot{\hat x} &= f(t, \hat x, u), \qquad \hat x(t_0) = \hat x_0
+"""
     knows = ("model", "prior")
 
     def reset(self, prior: Prior) -> State:

@@ -57,6 +57,16 @@ class ParticleFilter(Estimator):
     """Of the random numbers."""
 
     name = "particle"
+    equations = r"""
+x_i &:= \varphi(x_i) \\
+w_i &:\propto w_i \exp\bigl( -\tfrac12 (y_k - h(x_i))^\top R^{-1} (y_k - h(x_i)) \bigr) \\
+\hat x_k &= \sum_i w_i x_i, \qquad P_k = \sum_i w_i (x_i - \hat x_k)(x_i - \hat x_k)^\top \\
+\text{if } \Bigl( \sum_i w_i^2 \Bigr)^{-1} &< \frac N2: \quad
+x_i := a\, x_{j(i)} + (1 - a)\, \hat x_k + \sqrt{1 - a^2} \sqrt{P_k}\, \xi_i, \quad
+w_i := \frac1N \\
+a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
+\qquad j(i) \text{ drawn by the weights}
+"""
     tunable = {"discount": Range(0.8, 0.999)}
 
     def __post_init__(self) -> None:

@@ -125,6 +125,14 @@ class PinnGain(GaussianEstimator):
     """The trained network."""
 
     name = "pinn_gain"
+    equations = r"""
+K &= P_k^- H^\top S^{-1}, \qquad s_j = \bigl( (H P_k^- H^\top)_{jj} / S_{jj} \bigr)^{3/4} \\
+K'_{ij} &= K_{ij}\, 8^{\tanh(a_{ij} s_j)}
++ \tanh(b_{ij} s_j) \sqrt{P^-_{k,ii} / S_{jj}} \\
+(a, b) &= \text{network}(\hat x_k^-, P_k^-, e_k, \text{recent innovations}) \\
+\hat x_k &= \hat x_k^- + K' e_k, \qquad
+P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
+"""
     needs_training = "pinn_gain"
 
     def reset(self, prior: Prior) -> State:

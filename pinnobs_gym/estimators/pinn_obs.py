@@ -190,6 +190,9 @@ class PinnObsReplay(_Learned, Estimator):
     """The trained network."""
 
     name = "pinn_obs_replay"
+    equations = r"""
+\dot{\hat x} &= f(t, \hat x, u) + L(t)\, (y - h(\hat x)), \qquad \hat x(t_0) = \hat x_0
+"""
     knows = ("model", "prior")
     needs_training = "pinn_obs"
     recipe = MappingProxyType({"transfer": True})
@@ -247,6 +250,9 @@ class PinnObsDirect(_Learned, OfflineEstimator):
     """The trained network."""
 
     name = "pinn_obs_direct"
+    equations = r"""
+(\hat x(t), L(t)) &= \text{network}(t), \text{ of least loss on this record; see pinn\_obs}
+"""
     knows = ("model", "prior")
     needs_training = "pinn_obs"
 

@@ -26,6 +26,11 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
     """
 
     name = "rts_smoother"
+    equations = r"""
+C_k &= P_k F_k^\top (P_{k+1}^-)^{-1} \\
+\hat x_k^s &= \hat x_k + C_k (\hat x_{k+1}^s - \hat x_{k+1}^-) \\
+P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
+"""
 
     def run(self, record: Record) -> Estimates:
         record = replace(record, prior=checked(record.prior))

@@ -35,6 +35,12 @@ class SlidingMode(Estimator):
     """ε over the standard deviation of the output noise."""
 
     name = "sliding_mode"
+    equations = r"""
+e &= y_k - h(\hat x_k^-), \qquad
+s_j = 1 + \frac{\rho_j}{\varepsilon_j} \min\Bigl( 1, \frac{\varepsilon_j}{|e_j|} \Bigr) \\
+K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{diag}(s))^{-1} \\
+\hat x_k &= \hat x_k^- + K e
+"""
     tunable = {
         "rate": Range(0.1, 1e3, log=True),
         "switching": Range(0.1, 100.0, log=True),

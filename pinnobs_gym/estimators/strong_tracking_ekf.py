@@ -38,6 +38,15 @@ class StrongTrackingEKF(GaussianEstimator):
     """What part of HPHᵀ is added to R."""
 
     name = "strong_tracking_ekf"
+    equations = r"""
+Q_k &= \Bigl( \frac{\gamma}{n_y} e_{k-1}^\top R^{-1} e_{k-1} + q^2 \Bigr)
+\operatorname{diag}(\mathrm{scale}^2) \\
+P_k^- &= \Phi P_{k-1} \Phi^\top + Q_k \\
+R_k &= R + r\, H P_k^- H^\top \quad (r: \text{output\_factor}) \\
+K &= P_k^- H^\top (H P_k^- H^\top + R_k)^{-1} \\
+\hat x_k &= \hat x_k^- + K e_k, \qquad e_k = y_k - h(\hat x_k^-) \\
+P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
+"""
     tunable = {
         **GaussianEstimator.tunable,
         "gamma": Range(1e-10, 1e-2, log=True),

@@ -25,6 +25,13 @@ class UKF(SigmaPointFilter):
     """What is added to the weight of the centre in covariances."""
 
     name = "ukf"
+    equations = (
+        r"""
+\xi_0 &= 0, \quad \xi_i = \pm \sqrt{n_x + \kappa}\, \mathbf e_i, \qquad \kappa = \max(0, 3 - n_x) \\
+w_0 &= \frac{\kappa}{n_x + \kappa}, \quad v_0 = w_0 + \beta, \qquad
+w_i = v_i = \frac{1}{2 (n_x + \kappa)} \\"""
+        + SigmaPointFilter.equations
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

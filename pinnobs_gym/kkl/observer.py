@@ -164,6 +164,10 @@ class KKL(Estimator):
     """The trained observer."""
 
     knows = ("model", "noise", "simulated true states")
+    equations = r"""
+\dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
+\hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial x}(x)\, f(x) = A_z T(x) + B_z h(x)
+"""
 
     def reset(self, prior: Prior) -> State:
         return State(np.array(prior.mean, dtype=float))

@@ -189,6 +189,15 @@ class PinnObs(OfflineEstimator):
     keeps nothing."""
 
     name = "pinn_obs"
+    equations = r"""
+(\hat x(t), L(t)) &= \text{network}_\vartheta(t) \\
+\min_\vartheta \; & w_0 \| \hat x(t_0) - \hat x_0 \|^2
++ w_y \operatorname{mean} \| h(\hat x) - y \|^2 \\
+& + w_{\mathrm{ode}} \operatorname{mean}
+\bigl\| \dot{\hat x} - f(t, \hat x, u) - L\, (y - h(\hat x)) \bigr\|^2 \\
+& + w_{\mathrm{guide}} \operatorname{mean} \| \hat x - x^{\mathrm{smoother}} \|^2
++ w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2
+"""
     trains_on_record = "pinn_obs"
 
     @property

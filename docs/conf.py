@@ -1,0 +1,38 @@
+"""Settings of the documentation: ``make docs``, or ``python -m sphinx docs docs/_build/html``."""
+
+import importlib.metadata
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # in the tutorial's kernel, too
+
+import pages
+
+project = "pinnobs-gym"
+author = "the authors of pinnobs-gym"
+version = release = importlib.metadata.version("pinnobs-gym")
+extensions = ["myst_nb"]
+exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+nitpicky = True
+smartquotes = False  # the mark of x' is a prime
+
+myst_enable_extensions = ["dollarmath", "attrs_inline"]
+myst_heading_anchors = 3
+nb_execution_mode = "force"  # what the tutorial shows is what this package does
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+nb_merge_streams = True
+
+html_theme = "furo"
+html_title = f"pinnobs-gym {version}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_copyright = False
+
+
+def setup(app):
+    """Write the pages that are made from the code before Sphinx looks for pages."""
+    app.connect("builder-inited", lambda app: pages.write(Path(app.srcdir) / "reference"))

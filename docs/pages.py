@@ -1,0 +1,303 @@
+"""The pages that are made from the code: one per system, estimator and trainer, and the tables.
+
+Nothing here knows any of them by name: what discovery finds gets a page.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from pinnobs_gym import consistency, env_id, metrics, rows, suite
+from pinnobs_gym.conditions import CONDITIONS
+from pinnobs_gym.docstrings import field_docs, variable_docs
+from pinnobs_gym.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.evaluation import score_batch
+from pinnobs_gym.figures import state_figure
+from pinnobs_gym.leaderboard import markdown_table
+from pinnobs_gym.report import page, write_figure
+from pinnobs_gym.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
+from pinnobs_gym.system import System
+from pinnobs_gym.systems import SYSTEMS
+
+
+def write(folder: Path) -> None:
+    """Write all of them below a folder; those of what is no longer there go."""
+    made = pages()
+    for path in folder.rglob("*.md"):
+        if path.relative_to(folder).as_posix() not in made:
+            path.unlink()
+    for name, text in made.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+    for cls in SYSTEMS.classes().values():
+        write_figure(folder / "systems" / f"{cls.__name__}.png", _episode(cls))
+
+
+def pages() -> dict[str, str]:
+    """Their texts by file name."""
+    systems, estimators, trainers = SYSTEMS.classes(), ESTIMATORS.classes(), suite.trainers()
+    return {
+        **{f"systems/{name}.md": system_page(cls) for name, cls in systems.items()},
+        "systems/index.md": _systems(systems),
+        **{f"estimators/{name}.md": estimator_page(name, cls) for name, cls in estimators.items()},
+        "estimators/index.md": _estimators(estimators),
+        **{f"trainers/{name}.md": trainer_page(name, m) for name, m in trainers.items()},
+        "trainers/index.md": _trainers(trainers),
+        "conditions.md": _conditions(),
+        "metrics.md": _metrics(),
+        "row_schema.txt": variable_docs(rows)["Row"] + "\n",
+    }
+
+
+def system_page(cls: type[System]) -> str:
+    """What `pinnobs systems NAME` prints, with its equations as the code has them."""
+    head, _, rest = page(cls, env_id(cls)).partition("\n## ")
+    picture = f"![EKF on {cls.__name__}]({cls.__name__}.png)"
+    told = f"One episode of `{env_id(cls)}` with the [EKF](../estimators/ekf.md):\n\n{picture}\n"
+    return "\n".join([head, _equations(cls), told, f"## {rest}"])
+
+
+def _equations(cls: type[System]) -> str:
+    try:
+        found = trace(cls())
+    except ValueError as error:
+        return f"## Equations\n\nThose of the text above: {error}.\n"
+    outputs = [name_in_latex(name) for name in cls().output_names]
+    whole = [
+        *zip(rates(found), found.f.flat(), strict=True),
+        *zip(outputs, found.h.flat(), strict=True),
+    ]
+    parts = ["## Equations\n", "Run on symbols, the code that is simulated says:\n", _math(whole)]
+    if found.definitions:
+        parts += ["where\n", _math((latex(s), e) for s, e in found.definitions.items())]
+    if found.u:
+        parts += [
+            "with the input\n",
+            _math(zip(map(latex, found.u), found.input.flat(), strict=True)),
+        ]
+    parts += ["and linearised\n", _math(_jacobians(found)), _symbols(cls, found)]
+    return "\n".join(parts)
+
+
+def _jacobians(found: Equations) -> Sequence[tuple[str, Any]]:
+    f, h = found.f_jacobian().applyfunc(lambda e: e.simplify()), found.h_jacobian()
+    return [(r"\frac{\partial f}{\partial x}", f), (r"\frac{\partial h}{\partial x}", h)]
+
+
+def _symbols(cls: type[System], found: Equations) -> str:
+    """The parameters' symbols, values and meanings."""
+    docs = field_docs(cls)
+    lines = [
+        (f"${latex(symbol)}$", f"`{name}`", f"{getattr(cls(), name):.6g}", _line(docs.get(name)))
+        for name, symbol in found.parameters.items()
+    ]
+    return f"\n{markdown_table(('symbol', 'parameter', 'default', 'meaning'), lines)}\n" * bool(
+        lines
+    )
+
+
+def _math(equations: Iterable[tuple[Any, Any]] | str) -> str:
+    text = equations if isinstance(equations, str) else aligned(list(equations))
+    return f"```{{math}}\n\\begin{{aligned}}\n{text.strip()}\n\\end{{aligned}}\n```\n"
+
+
+def _episode(cls: type[System]) -> Any:
+    """A picture of the EKF in one episode."""
+    system, setup = cls.configured()
+    name, condition = env_id(cls), cls.ranked_condition
+    example = score_batch(EKF.for_setup(system, setup), name, "benchmark", condition, [0])[1]
+    return state_figure(system, title=f"{name}, {condition}: ekf", **example)
+
+
+def estimator_page(name: str, cls: type[Estimator]) -> str:
+    """What an estimator is, what it is told, its equations and settings."""
+    trainer = cls.needs_training or cls.trains_on_record
+    told = [
+        ("track", _line(f"{cls.track}: {_TRACKS[cls.track]}")),
+        ("is told", ", ".join(cls.knows)),
+        ("training", f"[`{trainer}`](../trainers/{trainer}.md)" if trainer else "needs none"),
+        ("class", f"`{cls.__module__}.{cls.__qualname__}`"),
+    ]
+    parts = [f"# {name}\n", docstring(cls), "\n", markdown_table(("", ""), told)]
+    if cls.equations:
+        parts += ["\n## Equations\n", _math(cls.equations), _NOTATION]
+    base = {f.name for f in fields(Estimator)}
+    lines = _settings(cls, {f.name for f in fields(cls) if f.name not in base and f.repr})
+    if lines:
+        parts += ["\n## Settings\n", "On the command line `--set name=value`.\n"]
+        parts.append(markdown_table(("name", "default", "meaning"), lines))
+    if cls.tunable:
+        ranges = [(f"`{n}`", f"{r.low:g} to {r.high:g}") for n, r in cls.tunable.items()]
+        parts += [f"\n`pinnobs tune {name}` searches\n", markdown_table(("name", "range"), ranges)]
+    return "\n".join(parts) + "\n"
+
+
+_TRACKS = {"online": "x̂(k|k) from y₀..y_k", "offline": "sees the whole record first"}
+_NOTATION = (
+    "\n$\\varphi$ is the flow of the model from the sample before ($\\varphi_k$: from the first "
+    "state of the record or window), a raised minus marks what comes before $y_k$, $R$ is the "
+    "covariance of the output noise, $\\|v\\|_M^2 = v^\\top M v$."
+)
+
+
+def _settings(cls: type, names: Iterable[str]) -> list[tuple[str, str, str]]:
+    """Name, default and meaning of some fields of a dataclass."""
+    docs, hints = field_docs(cls), get_type_hints(cls)
+    return [
+        (f"`{f.name}`", _default(f), _line(docs.get(f.name)) + _choices(hints[f.name]))
+        for f in fields(cls)
+        if f.name in names
+    ]
+
+
+def _default(field: Any) -> str:
+    if field.default is not MISSING:
+        return _shown(field.default)
+    return "" if field.default_factory is MISSING else f"`{field.default_factory.__name__}()`"
+
+
+def _shown(value: Any) -> str:
+    return f"`{value}`" if not isinstance(value, float) else f"`{value:g}`"
+
+
+def _choices(hint: Any) -> str:
+    """What a field may be, if that is one of a few."""
+    inner = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    found = [choice for kind in inner if get_origin(kind) is Literal for choice in get_args(kind)]
+    return f" One of {', '.join(f'`{choice}`' for choice in found)}." if found else ""
+
+
+def trainer_page(name: str, module: types.ModuleType) -> str:
+    """A trainer's recipe: its Config's fields, preset by preset."""
+    config = module.Config
+    used = [
+        f"[`{label}`](../estimators/{label}.md)"
+        for label, cls in ESTIMATORS.classes().items()
+        if name in (cls.needs_training, cls.trains_on_record)
+    ]
+    hints = get_type_hints(config)
+    presets = get_args(hints["preset"]) if "preset" in hints else ()
+    made = [config(preset=preset) for preset in presets] or [config()]
+    lines = [
+        (label, *(_shown(getattr(each, label.strip("`"))) for each in made), meaning)
+        for label, _, meaning in _settings(config, {f.name for f in fields(config)})
+    ]
+    call = f"```sh\npinnobs train {name} --system ReverseDuffing\n```\n"
+    return "\n".join(
+        [
+            f"# {name}\n",
+            docstring(module),
+            f"\nMakes {', '.join(used)}.\n" if used else "",
+            call,
+            "## Config\n",
+            docstring(config),
+            "",
+            markdown_table(("name", *(presets or ("default",)), "meaning"), lines),
+            "\n## train\n",
+            docstring(module.train) + "\n",
+        ]
+    )
+
+
+def _systems(systems: Mapping[str, type[System]]) -> str:
+    lines = [
+        (f"[{name}]({name}.md)", f"`{env_id(cls)}`", *_sizes(cls()), first_line(cls))
+        for name, cls in systems.items()
+    ]
+    header = ("system", "env id", "states", "measured", "inputs", "what it is")
+    return _index("Systems", header, lines, systems)
+
+
+def _sizes(system: System) -> tuple[str, str, str]:
+    names = system.state_names, system.output_names, system.input_names
+    states, outputs, inputs = (", ".join(part) for part in names)
+    return states, outputs, inputs
+
+
+def _estimators(estimators: Mapping[str, type[Estimator]]) -> str:
+    lines = [
+        (f"[{name}]({name}.md)", cls.track, ", ".join(cls.knows), first_line(cls))
+        for name, cls in estimators.items()
+    ]
+    return _index("Estimators", ("name", "track", "is told", "what it is"), lines, estimators)
+
+
+def _trainers(trainers: Mapping[str, types.ModuleType]) -> str:
+    lines = [(f"[{name}]({name}.md)", first_line(module)) for name, module in trainers.items()]
+    return _index("Trainers", ("name", "what it is"), lines, trainers)
+
+
+def _index(
+    title: str, header: Sequence[str], lines: list[tuple[str, ...]], names: Iterable[str]
+) -> str:
+    tree = "\n".join(["```{toctree}", ":hidden:", "", *(f"{n} <{n}>" for n in names), "```"])
+    return f"# {title}\n\n{markdown_table(header, lines)}\n\n{tree}\n"
+
+
+def _conditions() -> str:
+    lines = [
+        (f"`{name}`", c.summary, c.told, "yes" if c.reference else "no")
+        for name, c in CONDITIONS.items()
+    ]
+    header = ("name", "what changes", "estimators are told", "Cramér–Rao reference")
+    kinds = dict.fromkeys(type(c) for c in CONDITIONS.values())
+    return "\n".join(
+        [
+            "# Conditions\n",
+            "How episodes depart from their setup: `gym.make(id, condition=...)` and `--condition`;"
+            " `a+b` is both.\n",
+            markdown_table(header, lines),
+            *(f"\n## {kind.__name__}\n\n{docstring(kind)}" for kind in kinds),
+            "",
+        ]
+    )
+
+
+def _metrics() -> str:
+    docs = variable_docs(metrics)
+    limits = [
+        (f"`{n}`", f"{getattr(metrics, n):g}", _line(docs[n])) for n in ("DIVERGED", "SETTLED")
+    ]
+    optional = ", ".join(f"`{name}`" for name in metrics.OPTIONAL_SCORES)
+    return "\n".join(
+        [
+            "# Metrics\n",
+            f"{docstring(metrics.score)}\n",
+            markdown_table(("limit", "value", "meaning"), limits),
+            f"\n## Where they apply\n\n{optional}\n\n{docs['OPTIONAL_SCORES']}\n",
+            docstring(consistency.consistency),
+            "",
+        ]
+    )
+
+
+def first_line(subject: Any) -> str:
+    """The first paragraph of a docstring, in one line."""
+    return _line((inspect.getdoc(subject) or "").partition("\n\n")[0])
+
+
+def _line(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("|", "\\|")
+
+
+def docstring(subject: Any) -> str:
+    """A docstring in Markdown: its sections (Args and the like) as bold words and lists."""
+    text = inspect.getdoc(subject) or ""
+    parts = re.split(r"^(Args|Returns|Raises):\n", text, flags=re.MULTILINE)
+    found = [parts[0]]
+    for title, body in zip(parts[1::2], parts[2::2], strict=True):
+        body = inspect.cleandoc(body)
+        if title != "Returns":
+            body = re.sub(r"^(\w+):", r"- `\1`:", body, flags=re.MULTILINE)
+        found.append(f"**{title}**\n\n{body}\n")
+    return "\n".join(found)
