@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import os
-import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.shared_file import locked, write_whole
 
 SCHEMA = 3
 """Version of the row format."""
@@ -59,8 +58,6 @@ TOLERANCE = 1e-6
 
 _BEGINNING = b'{"schema": '
 """What every line begins with."""
-_APPENDING = threading.Lock()
-"""A file's lock keeps other processes out; this one, the other threads of this process."""
 
 
 class Stored(NamedTuple):
@@ -83,25 +80,35 @@ def key(row: Row) -> tuple[Any, ...]:
     return tuple([row[name] for name in KEY])
 
 
-def append(path: Path, rows: Iterable[Row]) -> None:
+def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
     """Append rows to a file, all or none of them, under a lock: processes and machines may share
     it. A half line at its end, of a process that was killed, is cut off first.
+
+    Args:
+        path: the file; it is made if it is not there.
+        rows: what is appended.
+        new: leave out scored episodes that are in the file by now, which is read for that: of two
+            runs whose scores need not be the same, the first counts.
 
     Raises:
         CannotWrite: in one line, if the file cannot be written; what it held is untouched.
     """
-    data = "".join(json.dumps(_encoded(row)) + "\n" for row in rows).encode()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            with _APPENDING:
-                fcntl.lockf(descriptor, fcntl.LOCK_EX)  # until the file is closed
-                _write(descriptor, data)
-        finally:
-            os.close(descriptor)
+        with locked(path) as descriptor:
+            there = _keys(descriptor) if new else set()
+            rows = [row for row in rows if row["kind"] != "score" or key(row) not in there]
+            _write(descriptor, b"".join(_line(row) for row in rows))
     except OSError as error:
         raise CannotWrite(f"cannot write rows to {path}: {error}") from None
+
+
+def _keys(descriptor: int) -> set[tuple[Any, ...]]:
+    """What names the scored episodes of an open file."""
+    with open(descriptor, "rb", closefd=False) as file:  # closing a file gives up its lock
+        file.seek(0)
+        rows = [_parsed(line) for line in file]
+    return {key(row) for row in rows if row is not None and row.get("kind") == "score"}
 
 
 def _write(descriptor: int, data: bytes) -> None:
@@ -113,17 +120,11 @@ def _write(descriptor: int, data: bytes) -> None:
         size = begin
     elif tail:  # only the line's end is missing, or the line is not ours to delete
         data = b"\n" + data
-    try:
-        written = os.write(descriptor, data)
-        if written < len(data):
-            raise OSError(f"only {written} of {len(data)} bytes fitted")
-    except BaseException:
-        os.ftruncate(descriptor, size)
-        raise
+    write_whole(descriptor, data, size)
 
 
 def _last_line(descriptor: int, size: int) -> tuple[int, bytes]:
-    """Where the last line begins and what it holds, if it does not end; else the end, and nothing."""
+    """Where the last line begins and what it holds, if it does not end; else the file's end."""
     begin, tail = size, b""
     while begin > 0:
         step = min(begin, 1 << 16 if tail else 1)  # most files end as they should
@@ -197,13 +198,14 @@ def _same(row: Row, other: Row) -> bool:
     )
 
 
-def _encoded(row: Row) -> Row:
+def _line(row: Row) -> bytes:
     first = {"schema": row["schema"]}  # the key by which a half line is known
-    return {
+    encoded = {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in (first | row).items()
         if not (value is None and name in OPTIONAL_SCORES)
     }
+    return json.dumps(encoded).encode() + b"\n"
 
 
 def _is_cut(tail: bytes) -> bool:
