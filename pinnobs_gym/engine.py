@@ -109,7 +109,7 @@ class Engine:
         """
         if not jobs:
             return
-        with _interruptible(), _backend(self._where) as backend, _mark(jobs[0].folder) as mark:
+        with _backend(self._where) as backend, _mark(jobs[0].folder) as mark:
             self.processes = backend.processes
             children = self._where.scheduler is None
             home = Home(os.getpid(), socket.gethostname(), os.getcwd(), mark, children)
@@ -241,7 +241,10 @@ def _attempt(number: int, job: Job, home: Home) -> Outcome:
 def _run(job: Job) -> str | None:
     """Run a job; what went wrong, in one line, is written down."""
     try:
-        job.run()
+        with _handling(_stop, lambda before: before is signal.default_int_handler):
+            job.run()
+    except _Stopped:
+        raise KeyboardInterrupt from None
     except CannotWrite:
         raise
     except Exception as error:
@@ -267,8 +270,10 @@ def _note(number: int, error: str | None, mark: Path) -> None:
     """Write down that a job has ended."""
     data = f"{number} {error or ''}\n".encode()
     try:
-        with locked(mark) as descriptor:
+        with locked(mark, make=False) as descriptor:
             write_whole(descriptor, data, os.fstat(descriptor).st_size)
+    except FileNotFoundError:  # nobody waits for the outcome any more
+        return
     except OSError as cause:
         raise CannotWrite(f"cannot write {mark}: {cause}") from None
 
@@ -341,14 +346,13 @@ def _handling(handler: Any, of: Callable[[Any], bool]) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+class _Stopped(BaseException):
+    """Ctrl-C while a job is run in this very process. Trainers answer to a KeyboardInterrupt with
+    what they have so far, which must not be scored."""
 
 
-def _interruptible() -> Any:
-    """Ctrl-C ends a training in this process as well, rather than have its result scored; see
-    `pinnobs_gym.training.interruption`."""
-    return _handling(_interrupt, lambda before: before is signal.default_int_handler)
+def _stop(number: int, frame: object) -> None:
+    raise _Stopped
 
 
 def _signals_ignored() -> Any:

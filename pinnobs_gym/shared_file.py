@@ -14,15 +14,16 @@ _THREADS = threading.Lock()
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[int]:
-    """The descriptor of a file, made if it is not there, that nobody else has locked meanwhile;
-    what is written goes to its end.
+def locked(path: Path, *, make: bool = True) -> Iterator[int]:
+    """The descriptor of a file that nobody else has locked meanwhile; what is written goes to its
+    end. It is made if it is not there, or else that is an error.
 
     Raises:
         OSError: if the file cannot be opened or locked.
     """
     with _THREADS:  # closing any descriptor of a file gives up a process's lock on it
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        flags = os.O_RDWR | os.O_APPEND | (os.O_CREAT if make else 0)
+        descriptor = os.open(path, flags, 0o644)
         try:
             fcntl.lockf(descriptor, fcntl.LOCK_EX)  # until the file is closed
             yield descriptor

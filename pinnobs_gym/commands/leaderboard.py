@@ -108,20 +108,20 @@ class Leaderboard:
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
         """Print and write what came of it."""
         scored = stored.rows
+        lines, placed = overview.lines(scored), overview.ranks(scored)
         tables = leaderboard.tables(scored, stored.failures)
         shown = [table for table in tables if table.condition in conditions]
         for table in shown if len(conditions) <= 2 else ():
             print_table(table)
         console.print(leaderboard.NOTE if len(conditions) <= 2 else "")
-        print_grid("Across systems", *overview.cells(overview.lines(scored)))
+        print_grid("Across systems", *overview.cells(lines))
         console.print(overview.NOTE)
-        placed = overview.ranks(scored)
         if len(placed) > 1:
             print_grid("Ranks", *overview.rank_cells(placed))
             console.print(overview.RANK_NOTE)
         path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
-            text = overview.markdown(scored) + "\n" + leaderboard.markdown(tables)
+            text = overview.markdown(lines, placed) + "\n" + leaderboard.markdown(tables)
             temporary.write_text(text, encoding="utf-8")
         for what, where in (
             ("tables", path),
