@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from joblib.parallel import ParallelBackendBase
 
-from pinnobs_gym.engine import Lost, Outcome
+from pinnobs_gym.engine import Lost
+from pinnobs_gym.worker import Outcome
 
 if TYPE_CHECKING:
     from distributed import Client, Future
