@@ -100,6 +100,8 @@ class Engine:
                     told = f"exit codes {codes[0]}" if codes else str(death)
                     yield self._ended(Outcome(alone, told, died=True), waiting)
                 suspects |= self._under_way.keys()
+                for number in suspects & waiting.keys():  # they may have written something
+                    waiting[number] = waiting[number].anew()
             finally:
                 self._under_way.clear()
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from pinnobs_gym import env_id
 from pinnobs_gym import rows as rows_module
@@ -83,6 +83,10 @@ class Job:
         run_job(self)
         if self.failed:
             rows_module.append(self.rows, [self._event("recovery")])
+
+    def anew(self) -> Self:
+        """The same job, when it is not known any more what is stored."""
+        return replace(self, known=None)
 
     def fail(self, error: str) -> None:
         """Append a row that says what went wrong.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 from threadpoolctl import threadpool_limits
 
@@ -38,6 +38,10 @@ class Job(Protocol):
 
     def run(self) -> None:
         """Do the work and write what comes of it."""
+
+    def anew(self) -> Self:
+        """The same job, to be run although it was under way before."""
+        ...
 
     def fail(self, error: str) -> None:
         """Write down what went wrong.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pinnobs_gym import planning, rows, suites
+from pinnobs_gym import planning, rows, suite, suites
 from pinnobs_gym.conditions import CONDITIONS
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
@@ -171,3 +171,27 @@ def test_failures_are_left_out_or_told_that_they_are_tried_again(tmp_path):
     assert left_out == []
     here = jobs_of(Suite(("Academic",), (Entry("ekf"),)), tmp_path)[0]
     assert here.digest == first.digest  # wherever it is kept
+
+
+def test_of_two_trainings_at_the_same_time_the_first_counts(tmp_path, monkeypatch):
+    """The other one's file is there by the time that the second is trained."""
+    small = {"depth": 1, "width": 4, "iterations": 5}
+    entry = (Entry("pinn_obs_replay", None, small),)
+    (job,) = jobs_of(Suite(("Academic",), entry, ("nominal",)), tmp_path)
+    cls = ESTIMATORS.resolve("pinn_obs_replay")
+    train, found = suite.train, []
+
+    def slow(*arguments, **options):
+        result = train(*arguments, **options)
+        if not found:
+            found.append(None)
+            suite.trained(cls, job)  # as another process does meanwhile
+            (path,) = (tmp_path / "trained").iterdir()
+            found.append((path, path.stat()))
+        return result
+
+    monkeypatch.setattr(suite, "train", slow)
+    suite.trained(cls, job)
+    path, before = found[1]
+    assert list((tmp_path / "trained").iterdir()) == [path]
+    assert path.stat() == before
