@@ -52,6 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"pinnobs: error: {error}", file=sys.stderr)
         return 2
+    except ConnectionError as error:  # to other machines, while they worked
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        print(f"pinnobs: error: {error}", file=sys.stderr)
+        return 1
     except Exception as error:  # of a plug-in, or a fault of ours
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from types import TracebackType
+from typing import Self
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -15,6 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from pinnobs_gym import leaderboard
 
@@ -42,7 +47,7 @@ def print_table(table: leaderboard.Table) -> None:
         trained = f"; trained: {standing.training}" if standing.training else ""
         console.print(f"  {standing.estimator} is told: {standing.knows}{trained}")
     if table.note:
-        console.print(f"  {table.note}", style="yellow")
+        console.print(f"  {table.note}", style="yellow", markup=False)
 
 
 def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
@@ -65,3 +70,79 @@ def progress() -> Progress:
         TimeRemainingColumn(),
         console=console,
     )
+
+
+class RunView:
+    """What becomes of many jobs, live in a terminal: how many are done, run and have failed, what
+    runs now, and the time left. Elsewhere it is a line now and then. Failures are told at once.
+
+    Args:
+        total: how many jobs there are.
+        running: names what runs now.
+    """
+
+    EVERY = 10.0
+    """Least seconds from one line to the next."""
+    SHOWN = 8
+    """Of the jobs that run, how many are named."""
+
+    def __init__(self, total: int, running: Callable[[], Sequence[str]]) -> None:
+        self.done = 0
+        self.failed = 0
+        self._total = total
+        self._running = running
+        self._bar = progress()
+        self._task = self._bar.add_task("jobs", total=total)
+        self._live = Live(self, console=console, refresh_per_second=4)
+        self._told = self._begun = time.monotonic()
+
+    def __enter__(self) -> Self:
+        if console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._live.stop()
+
+    def ended(self, name: str, error: str | None) -> None:
+        """Take in that a job has ended."""
+        self.done += error is None
+        self.failed += error is not None
+        self._bar.advance(self._task)
+        if error is not None:
+            console.print(f"failed: {name}: {error}", style="red", markup=False, soft_wrap=True)
+        now = time.monotonic()
+        last = self.done + self.failed == self._total
+        if not console.is_terminal and (last or now - self._told >= self.EVERY):
+            self._told = now
+            console.print(self._line(now - self._begun), soft_wrap=True, highlight=False)
+
+    def _line(self, seconds: float) -> str:
+        ended = self.done + self.failed
+        parts = [f"jobs: {self.done} of {self._total} done", f"{self.failed} failed"]
+        if ended < self._total:
+            left = seconds / ended * (self._total - ended)
+            parts += [f"{len(self._running())} running", f"about {_duration(left)} left"]
+        return ", ".join([*parts, f"{_duration(seconds)} so far"])
+
+    def __rich__(self) -> Group:
+        names = self._running()
+        shown = [Text(f"  {name}", style="dim") for name in names[: self.SHOWN]]
+        if len(names) > self.SHOWN:
+            shown.append(Text(f"  and {len(names) - self.SHOWN} more", style="dim"))
+        counts = Text(f"{self.done} done, {len(names)} running, ")
+        counts.append(f"{self.failed} failed", style="red" if self.failed else "")
+        return Group(self._bar, counts, *shown)
+
+
+def _duration(seconds: float) -> str:
+    """Such as 3 min."""
+    for size, unit in ((3600, "h"), (60, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

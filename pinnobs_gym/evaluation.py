@@ -7,8 +7,8 @@ import importlib.metadata
 import json
 import platform
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -33,6 +33,24 @@ from pinnobs_gym.system import System, vector
 
 BATCH = 256
 """Episodes that are run at a time."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """A rows file that scores are appended to."""
+
+    path: Path
+    known: frozenset[tuple[str, int | None, int]] | None = None
+    """(config_hash, training_seed, episode_seed) of what is there already of the same estimator and
+    game; None if the file is to be read for that."""
+
+    def stored(self, wanted: Sequence[Row]) -> dict[tuple[Any, ...], Row]:
+        """Those of the wanted rows that are there already, by what names them; as they are in the
+        file, if it is read."""
+        if self.known is None:
+            return {rows_module.key(row): row for row in rows_module.read(self.path)}
+        there = (row for row in wanted if rows_module.key(row)[4:] in self.known)
+        return {rows_module.key(row): row for row in there}
 
 
 def evaluate(
@@ -83,7 +101,7 @@ def evaluate(
         setup,
         condition,
         options,
-        results,
+        None if results is None else Results(Path(results)),
         progress,
     )
     log_episodes(log, result, made, example)
@@ -98,11 +116,14 @@ def run_episodes(
     setup: str,
     condition: str,
     options: Mapping[str, Any] | None = None,
-    results: Path | str | None = None,
+    results: Results | None = None,
     progress: Callable[[int], None] | None = None,
+    label: str | None = None,
 ) -> tuple[list[Row], Estimator, dict[str, Any] | None]:
     """What `evaluate` does but for logging; returns also the estimator that was scored, and the
-    seed of the first episode that was run, if any was, with what `state_figure` draws of it."""
+    seed of the first episode that was run, if any was, with what `state_figure` draws of it. Rows
+    that are only known to be stored have no scores. The label is the estimator's name in rows, if
+    not its own."""
     if not len(seeds):
         raise ValueError(f"episodes={len(seeds)}; expected at least 1")
     if seeds[0] < 0:
@@ -111,9 +132,9 @@ def run_episodes(
     env = make_vector_env(env_id, 1, setup, condition)
     made = _make(estimator, env, options or {})
     common = _common(made, env, env_id, setup, condition)
-    path = None if results is None else Path(results)
-    stored = {} if path is None else {rows_module.key(row): row for row in rows_module.read(path)}
+    common["estimator"] = label or made.label
     wanted = [{**common, "episode_seed": seed} for seed in seeds]
+    stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
     example = None
     for first in range(0, len(missing), BATCH):
@@ -123,8 +144,8 @@ def run_episodes(
         if example is None:
             example = {"seed": now[0], **first_played}
         done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
-        if path is not None:
-            rows_module.append(path, done)
+        if results is not None:
+            rows_module.append(results.path, done, new=made.trains_on_record is not None)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))
@@ -224,7 +245,7 @@ def score_batch(
         for name, whole in (("reference_ratio", "nrmse"), ("reference_ratio_tail", "nrmse_tail")):
             ratio = None if reference is None else scores[f"{whole}_modulo"] / reference[whole]
             optional[name] = ratio
-    cost_now = {"us_per_step": cost, "batch": record.batch, "date": _now()}
+    cost_now = {"us_per_step": cost, "batch": record.batch, "date": now()}
     rows = [
         {name: values[i].item() for name, values in scores.items()}
         | {name: _number_of(optional.get(name), i) for name in OPTIONAL_SCORES}
@@ -292,6 +313,7 @@ def _common(
     text = json.dumps(identity, sort_keys=True)
     return {
         "schema": SCHEMA,
+        "kind": "score",
         "env_id": env_id,
         "setup": setup,
         "condition": condition,
@@ -327,6 +349,7 @@ def canonical(value: Any) -> Any:
     return getattr(value, "__qualname__", type(value).__qualname__)
 
 
+@lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
     """Versions of what a score depends on."""
     packages = ("pinnobs-gym", "numpy", "scipy", "torch", "gymnasium")
@@ -334,8 +357,9 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **found}
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+def now() -> str:
+    """The date and time (UTC), as rows have them."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 LOGGED = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")

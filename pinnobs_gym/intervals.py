@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.stats import binom, binomtest, trim_mean
@@ -38,10 +39,16 @@ def median(values: np.ndarray) -> Interval:
     values as well (Conover, "Practical Nonparametric Statistics", section 3.2); the whole range
     where there are too few values for it."""
     ordered = np.sort(values)
-    low = max(int(binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5)) - 1, 0)
+    low = _lowest_rank(len(ordered))
     return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[-1 - low]))
 
 
+@lru_cache(maxsize=1024)
+def _lowest_rank(count: int) -> int:
+    return max(int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5)) - 1, 0)
+
+
+@lru_cache(maxsize=65536)
 def rate(hits: int, count: int) -> Interval:
     """A proportion with Wilson's interval."""
     interval = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")

@@ -71,19 +71,28 @@ class Table:
         return f"{self.env_id}, {self.setup}, {self.condition}"
 
 
-def tables(rows: Iterable[Row]) -> list[Table]:
+def tables(rows: Iterable[Row], failures: Iterable[Row] = ()) -> list[Table]:
     """A table per env, setup and condition. Within a track estimators stand in the order of their
-    median NRMSE over the whole episode, diverged episodes counting as infinite."""
+    median NRMSE over the whole episode, diverged episodes counting as infinite. What failed is told
+    in the notes."""
     played: dict[tuple[str, str, str], dict[tuple[str, str], list[Row]]]
     played = defaultdict(lambda: defaultdict(list))
     for row in rows:
         game = (row["env_id"], row["setup"], row["condition"])
         played[game][row["estimator"], row["config_hash"]].append(row)
+    failed: dict[tuple[str, str, str], list[str]] = defaultdict(list)
+    for row in failures:
+        game = (row["env_id"], row["setup"], row["condition"])
+        many = row["episodes"] > 1
+        which = f"{row['episodes']} episodes" if many else f"episode {row['episode_seed']}"
+        failed[game].append(f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}.")
     result = []
-    for game, groups in sorted(played.items()):
+    for game in sorted(played.keys() | failed.keys()):
+        groups = played[game]
         standings = [standing(group) for group in groups.values()]
         standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
-        result.append(Table(*game, tuple(standings), _note(list(groups.values()))))
+        note = " ".join(filter(None, [_note(list(groups.values())), *failed[game]]))
+        result.append(Table(*game, tuple(standings), note))
     return result
 
 

@@ -197,11 +197,10 @@ RANK_NOTE = (
 """How to read the table of ranks."""
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """The overview and, if several conditions were played by estimators that can be ranked, the
-    table of ranks, in Markdown."""
-    parts = ["# Leaderboard\n", NOTE, "", markdown_table(*cells(lines(rows))), ""]
-    placed = ranks(rows)
+def markdown(found: Sequence[Line], placed: Mapping[str, Mapping[str, int]]) -> str:
+    """The overview of `lines` and, if several conditions were played by estimators that can be
+    ranked, the table of `ranks`, in Markdown."""
+    parts = ["# Leaderboard\n", NOTE, "", markdown_table(*cells(found)), ""]
     if len(placed) > 1:
         parts += ["# Conditions\n", RANK_NOTE, "", markdown_table(*rank_cells(placed)), ""]
     return "\n".join(parts) + "\n"

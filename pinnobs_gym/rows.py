@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.shared_file import locked, write_whole
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the row format."""
 
 Row: TypeAlias = dict[str, Any]
-"""One scored episode. Its keys:
+"""One scored episode (``kind`` is ``score``). Its keys:
 
 - ``schema``: version of this format.
 - ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
@@ -30,6 +34,14 @@ Row: TypeAlias = dict[str, Any]
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
 - ``batch``: the size of that batch.
 - ``versions``, ``date``: of the packages, and when it was run (UTC).
+
+Or a job of a leaderboard that failed (``kind`` is ``failure``), or one that failed before and then
+went well (``recovery``), of which these are kept:
+
+- ``schema``, ``env_id``, ``setup``, ``condition``, ``estimator``, ``versions``, ``date`` as above.
+- ``episode_seed``, ``episodes``: the first episode of the job, and how many it has.
+- ``job``: a hash of all that was asked for.
+- ``error``: what went wrong, in one line; of failures alone.
 """
 
 KEY = (
@@ -42,91 +54,244 @@ KEY = (
     "episode_seed",
 )
 """The fields that name a row; no two rows of a file share them."""
+JOB = ("env_id", "setup", "condition", "estimator", "episode_seed", "episodes", "job")
+"""The fields that a failure has."""
+TOLERANCE = 1e-6
+"""By how much, relatively, scores of the same episode may differ from machine to machine."""
+
+_BEGINNING = b'{"schema": '
+"""What every line begins with."""
 
 
-def key(row: Row) -> tuple[Any, ...]:
-    """What names a row."""
-    return tuple(row[name] for name in KEY)
+class Stored(NamedTuple):
+    """What a rows file holds."""
+
+    rows: list[Row]
+    """The scored episodes, in the order of the file."""
+    failures: list[Row]
+    """The jobs that failed and have not gone well since."""
+    warning: str = ""
+    """What to know about the file, if anything."""
 
 
-def append(path: Path, rows: Iterable[Row]) -> None:
-    """Append rows to a file in one write, so that processes may share it and a kill leaves no half
-    line. If the file ends in one all the same, the rows begin on a line of their own.
+class CannotWrite(ValueError):
+    """Rows could not be written; what the file held is untouched."""
+
+
+key: Callable[[Row], tuple[Any, ...]] = itemgetter(*KEY)
+"""What names a row."""
+
+
+def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
+    """Append rows to a file, all or none of them, under a lock: processes and machines may share
+    it. A half line at its end, of a process that was killed, is cut off first.
+
+    Args:
+        path: the file; it is made if it is not there.
+        rows: what is appended.
+        new: leave out scored episodes that are in the file by now, which is read for that: of two
+            runs whose scores need not be the same, the first counts.
 
     Raises:
-        ValueError: in one line, if the file cannot be written; what it held is untouched.
+        CannotWrite: in one line, if the file cannot be written; what it held is untouched.
     """
-    data = "".join(json.dumps(_encoded(row)) + "\n" for row in rows).encode()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            size = os.fstat(descriptor).st_size
-            if size and os.pread(descriptor, 1, size - 1) != b"\n":
-                data = b"\n" + data
-            written = os.write(descriptor, data)
-            if written < len(data):
-                raise OSError(f"only {written} of {len(data)} bytes fitted")
-        finally:
-            os.close(descriptor)
+        with locked(path) as descriptor:
+            there = _keys(descriptor) if new else set()
+            rows = [row for row in rows if row["kind"] != "score" or key(row) not in there]
+            _write(descriptor, b"".join(_line(row) for row in rows))
     except OSError as error:
-        raise ValueError(f"cannot write rows to {path}: {error}") from None
+        raise CannotWrite(f"cannot write rows to {path}: {error}") from None
+
+
+def _keys(descriptor: int) -> set[tuple[Any, ...]]:
+    """What names the scored episodes of an open file."""
+    with open(descriptor, "rb", closefd=False) as file:  # closing a file gives up its lock
+        file.seek(0)
+        rows = [_parsed(line) for line in file]
+    return {key(row) for row in rows if row is not None and row.get("kind") == "score"}
+
+
+def _write(descriptor: int, data: bytes) -> None:
+    """Write at the end of a locked file, all or nothing."""
+    size = os.fstat(descriptor).st_size
+    begin, tail = _last_line(descriptor, size)
+    if _is_cut(tail):
+        os.ftruncate(descriptor, begin)
+        size = begin
+    elif tail:  # only the line's end is missing, or the line is not ours to delete
+        data = b"\n" + data
+    write_whole(descriptor, data, size)
+
+
+def _last_line(descriptor: int, size: int) -> tuple[int, bytes]:
+    """Where the last line begins and what it holds, if it does not end; else the file's end."""
+    begin, tail = size, b""
+    while begin > 0:
+        step = min(begin, 1 << 16 if tail else 1)  # most files end as they should
+        block = os.pread(descriptor, step, begin - step)
+        _, newline, rest = block.rpartition(b"\n")
+        tail = rest + tail
+        if newline:
+            return begin - len(rest), tail
+        begin -= step
+    return 0, tail
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a file, in its order; none if there is no such file.
+    """The scored episodes of a file; see `load`."""
+    return load(path).rows
+
+
+def load(path: Path) -> Stored:
+    """What a file holds; nothing if there is no such file.
+
+    Files may be joined by concatenation: an episode that is there twice counts once. A half line at
+    the end is what a killed process leaves; it is left out, with a warning.
 
     Raises:
         ValueError: in one line that names the file and the line, if one is not a whole row of this
             schema, or contradicts an earlier one.
     """
     if not path.exists():
-        return []
+        return Stored([], [])
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        *lines, tail = path.read_bytes().split(b"\n")
+    except OSError as error:
         raise ValueError(f"cannot read rows from {path}: {error}") from None
-    rows: dict[tuple[Any, ...], tuple[int, Row]] = {}
+    warning = ""
+    if not _is_cut(tail):
+        lines += [tail] if tail else []
+    else:
+        warning = (
+            f"{path}, line {len(lines) + 1}, is cut off, as a killed process leaves it; it is left "
+            f"out, and what it held is run anew"
+        )
+    with _uncollected():
+        rows, failed = _merged(path, lines)
+    return Stored(rows, failed, warning)
+
+
+def _merged(path: Path, lines: list[bytes]) -> tuple[list[Row], list[Row]]:
+    """The scored episodes of lines, each once, and the jobs that failed."""
+    rows: dict[tuple[Any, ...], Row] = {}
+    numbers: dict[tuple[Any, ...], int] = {}
+    failures: dict[str, Row] = {}
+    parsed = _parsed_together(lines)
     for number, line in enumerate(lines, 1):
-        row = _decoded(path, number, line)
+        row = _checked(path, number, line, _parsed(line) if parsed is None else parsed[number - 1])
+        if row["kind"] != "score":
+            known = failures.get(row["job"])
+            if known is None or known["date"] <= row["date"]:  # joined files are in any order
+                failures[row["job"]] = row
+            continue
         name = key(row)
-        if name in rows and any(rows[name][1][s] != row[s] for s in (*SCORES, "diverged")):
+        if name not in rows:
+            rows[name], numbers[name] = row, number
+        elif not _same(rows[name], row):
             raise ValueError(
-                f"{path}, lines {rows[name][0]} and {number}, give different scores of the same "
-                f"episode: {dict(zip(KEY, name, strict=True))}"
+                f"{path}, lines {numbers[name]} and {number}, give different scores of the same "
+                f"episode: {dict(zip(KEY, name, strict=True))}; delete one of them"
             )
-        rows.setdefault(name, (number, row))
-    return [row for _, row in rows.values()]
+    failed = [row for row in failures.values() if row["kind"] == "failure"]
+    return list(rows.values()), failed
 
 
-def _encoded(row: Row) -> Row:
-    return {
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the search for garbage, which takes as long as reading: nothing is garbage here."""
+    on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if on:
+            gc.enable()
+
+
+def _parsed_together(lines: list[bytes]) -> list[Any] | None:
+    """What the lines hold, faster than one by one; None if one of them is damaged."""
+    try:
+        parsed = json.loads(b"[" + b",".join(lines) + b"]")
+    except ValueError:
+        return None
+    whole = len(parsed) == len(lines) and all(type(row) is dict for row in parsed)
+    return parsed if whole else None
+
+
+def _same(row: Row, other: Row) -> bool:
+    """Whether two rows of an episode agree, but for rounding; an episode that diverged magnifies
+    that without bound."""
+    if row["diverged"] or other["diverged"]:
+        return row["diverged"] == other["diverged"]
+    return all(
+        math.isclose(row[name], other[name], rel_tol=TOLERANCE, abs_tol=1e-12) for name in SCORES
+    )
+
+
+def _line(row: Row) -> bytes:
+    first = {"schema": row["schema"]}  # the key by which a half line is known
+    encoded = {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in row.items()
+        for name, value in (first | row).items()
         if not (value is None and name in OPTIONAL_SCORES)
     }
+    return json.dumps(encoded).encode() + b"\n"
 
 
-def _decoded(path: Path, number: int, line: str) -> Row:
+def _is_cut(tail: bytes) -> bool:
+    """Whether what follows the last line is the beginning of a row, but not all of it."""
+    begins = tail.startswith(_BEGINNING) or (tail and _BEGINNING.startswith(tail))
+    return bool(begins) and _parsed(tail) is None
+
+
+def _parsed(line: bytes) -> Row | None:
+    """The object that a line holds, if it holds one."""
     try:
         row = json.loads(line)
-    except json.JSONDecodeError:
-        row = None
-    if not isinstance(row, dict):
+    except ValueError:  # not JSON, or not text
+        return None
+    return row if isinstance(row, dict) else None
+
+
+_ABSENT = object()
+_NEEDED = {
+    "score": frozenset((*KEY, *SCORES, "diverged", "ranked", "nx")),
+    "failure": frozenset((*JOB, "error", "date")),
+    "recovery": frozenset((*JOB, "date")),
+}
+"""What a row of each kind must have."""
+
+
+def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
+    """A row of this schema, with infinity where it is meant."""
+    if row is None:
+        shown = line[:40].decode(errors="replace")
         raise ValueError(
-            f"{path}, line {number}, is cut off or is not a row: {line[:40]!r}...; delete that "
-            f"line and run again, and only what it held is run anew"
+            f"{path}, line {number}, is cut off or is not a row: {shown!r}...; delete that line "
+            f"and run again, and only what it held is run anew"
         )
     if row.get("schema") != SCHEMA:
         raise ValueError(
             f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}: move "
             f"the file away and run again"
         )
-    missing = [name for name in (*KEY, *SCORES, "diverged", "ranked", "nx") if name not in row]
-    if missing:
-        raise ValueError(f"{path}, line {number}: a row without {', '.join(missing)}")
-    for name in SCORES:
-        row[name] = math.inf if row[name] is None else row[name]
-    for name in OPTIONAL_SCORES:
-        row[name] = math.inf if name in row and row[name] is None else row.get(name)
+    kind = row.get("kind")
+    if kind not in _NEEDED:
+        raise ValueError(
+            f"{path}, line {number}: a row of kind {kind!r}; expected {', '.join(_NEEDED)}"
+        )
+    if not _NEEDED[kind] <= row.keys():
+        missing = ", ".join(sorted(_NEEDED[kind] - row.keys()))
+        raise ValueError(f"{path}, line {number}: a row without {missing}")
+    if kind == "score":
+        for name in SCORES:
+            if row[name] is None:
+                row[name] = math.inf
+        for name in OPTIONAL_SCORES:
+            if row.setdefault(name, _ABSENT) is None:
+                row[name] = math.inf
+            elif row[name] is _ABSENT:
+                row[name] = None
     return row

@@ -1,37 +1,35 @@
-"""Running many evaluations: jobs, each a pure function that appends its own rows."""
+"""The jobs of a leaderboard, each a pure function of what it says that appends its own rows."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
 import json
-import os
 import pkgutil
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
-
-import joblib
+from typing import Any, NamedTuple, Self
 
 from pinnobs_gym import env_id
-from pinnobs_gym.conditions import canonical_name, fitting
+from pinnobs_gym import rows as rows_module
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.evaluation import (
+    Results,
     canonical,
     log_episodes,
     log_summary,
     make_vector_env,
+    now,
     run_episodes,
+    versions,
 )
 from pinnobs_gym.log import Log
 from pinnobs_gym.record import Record
 from pinnobs_gym.rows import Row
 from pinnobs_gym.system import Setup, System
-from pinnobs_gym.systems import SYSTEMS
 
 TRAINING_SEED = 10**6
 """Seed of the first episode that an estimator trained beforehand learns from; further ones have the
@@ -54,6 +52,14 @@ class Job:
     """Where rows, TensorBoard's log and trained files go."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """Choices in the trainer's Config, for estimators that learn."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The estimator's own settings."""
+    label: str | None = None
+    """The estimator's name in rows, if not its own."""
+    known: frozenset[tuple[str, int | None, int]] | None = None
+    """What is stored already; see `Results`."""
+    failed: bool = False
+    """Whether it failed before, and is tried again."""
 
     @property
     def rows(self) -> Path:
@@ -63,7 +69,47 @@ class Job:
     @property
     def name(self) -> str:
         """What the job does, in a few words."""
-        return f"{self.estimator} on {self.system}, {self.condition}"
+        many = f"{self.episodes} episodes" if self.episodes > 1 else f"episode {self.seed}"
+        return f"{self.label or self.estimator} on {self.system}, {self.condition}, {many}"
+
+    @property
+    def digest(self) -> str:
+        """A hash of all that is asked for."""
+        aside = {f.name: None for f in fields(self) if f.name in ("folder", "known", "failed")}
+        return _digest({f.name: getattr(self, f.name) for f in fields(self)} | aside)
+
+    def run(self) -> None:
+        """Append the rows that are missing; see `run_job`."""
+        run_job(self)
+        if self.failed:
+            rows_module.append(self.rows, [self._event("recovery")])
+
+    def anew(self) -> Self:
+        """The same job, when it is not known any more what is stored."""
+        return replace(self, known=None)
+
+    def fail(self, error: str) -> None:
+        """Append a row that says what went wrong.
+
+        Raises:
+            CannotWrite: if it cannot.
+        """
+        rows_module.append(self.rows, [self._event("failure") | {"error": error}])
+
+    def _event(self, kind: str) -> Row:
+        return {
+            "schema": rows_module.SCHEMA,
+            "kind": kind,
+            "env_id": env_id(self.system),
+            "setup": self.setup,
+            "condition": self.condition,
+            "estimator": self.label or ESTIMATORS.name_of(ESTIMATORS.resolve(self.estimator)),
+            "episode_seed": self.seed,
+            "episodes": self.episodes,
+            "job": self.digest,
+            "versions": versions(),
+            "date": now(),
+        }
 
 
 class Played(NamedTuple):
@@ -94,90 +140,14 @@ def trainer(name: str) -> ModuleType:
     return known[name]
 
 
-def default_estimators() -> tuple[str, ...]:
-    """All that can be scored on episodes they have not seen."""
-    return tuple(
-        name
-        for name, cls in ESTIMATORS.classes().items()
-        if cls.needs_training is None or cls.track == "online"
-    )
-
-
-def jobs_of(
-    systems: Sequence[str],
-    estimators: Sequence[str],
-    *,
-    setup: str,
-    conditions: Sequence[str],
-    episodes: int,
-    trained_episodes: int,
-    seed: int,
-    folder: Path,
-    training: Mapping[str, Any],
-) -> list[Job]:
-    """The jobs of a cross of systems and estimators, the longest first.
-
-    Without conditions every system is played under the nominal one, and under that it is ranked
-    under if this is another. ``all`` stands for these and, for estimators that need no training,
-    for all others that fit the system. Estimators that train on each record get their own, smaller
-    number of episodes, a job each.
-    """
-    if "all" in conditions and len(conditions) > 1:
-        raise ValueError(f"conditions {' '.join(conditions)}: 'all' stands alone")
-    quick, long = [], []
-    for estimator in estimators:
-        cls = ESTIMATORS.resolve(estimator)
-        if cls.needs_training is not None and cls.track == "offline":
-            raise ValueError(f"estimator {estimator!r} knows one record; it cannot be ranked")
-        for system in systems:
-            name, ranked = env_id(system), SYSTEMS.resolve(system).ranked_condition
-            played = list(dict.fromkeys(["nominal", canonical_name(ranked)]))
-            if list(conditions) != ["all"]:
-                played = list(dict.fromkeys(map(canonical_name, conditions))) or played
-            elif cls.needs_training is None and cls.trains_on_record is None:
-                model, chosen = SYSTEMS.resolve(system).configured(setup)
-                played += [name for name in fitting(model, chosen) if name not in played]
-            for each in played:
-                # A bad combination is refused before any run.
-                source = make_vector_env(name, 1, setup, each).source
-                count = 1 if source.deterministic else episodes
-                job = Job(system, estimator, setup, each, count, seed, folder, dict(training))
-                if cls.trains_on_record is None:
-                    (quick if cls.needs_training is None else long).append(job)
-                else:
-                    for i in range(min(count, trained_episodes)):
-                        long.append(replace(job, episodes=1, seed=seed + i))
-    return long + quick
-
-
-def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, str | None]]:
-    """Run jobs, one thread each, and yield each as it ends, with what went wrong if it failed."""
-    if processes == 1:
-        yield from map(_attempt, jobs)
-        return
-    with joblib.parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
-        parallel: Any = joblib.Parallel(return_as="generator_unordered")
-        yield from parallel(joblib.delayed(_attempt)(job) for job in jobs)
-
-
-def _attempt(job: Job) -> tuple[Job, str | None]:
-    try:
-        run_job(job)
-    except Exception as error:
-        return job, f"{type(error).__name__}: {error}"
-    return job, None
-
-
 def run_job(job: Job) -> None:
     """Train if the estimator needs it, evaluate, and append the rows that are missing."""
     import torch
 
     torch.set_num_threads(1)
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # for module:Class of the user's folder, in workers too
     name = env_id(job.system)
     cls = ESTIMATORS.resolve(job.estimator)
-    options: dict[str, Any] = {}
+    options = dict(job.settings)
     estimator: Estimator | type[Estimator] = cls
     if cls.trains_on_record is not None:
         recipe = trainer(cls.trains_on_record).Config(**job.training)
@@ -186,9 +156,11 @@ def run_job(job: Job) -> None:
     elif cls.needs_training is not None:
         estimator = trained(cls, job)
     seeds = range(job.seed, job.seed + job.episodes)
-    scored, made, example = run_episodes(
-        estimator, name, seeds, job.setup, job.condition, options, job.rows
+    results = Results(job.rows, job.known)
+    found, made, example = run_episodes(
+        estimator, name, seeds, job.setup, job.condition, options, results, label=job.label
     )
+    scored = [row for row in found if "nrmse" in row]
     if example is not None:  # something was run, and not all of it was there already
         with Log(log_folder(job.folder, scored[0])) as log:
             log_episodes(log, scored, made, example)
@@ -220,7 +192,9 @@ def trained(cls: type[Estimator], job: Job) -> Estimator:
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            train(name, recipe, played, log=log).save(path)
+            result = train(name, recipe, played, log=log)
+        if not path.exists():  # of two that trained at the same time, the first counts
+            result.save(path)
     source = make_vector_env(played.env_id, 1, played.setup, played.condition).source
     return load(cls, path, source.system, source.setup)
 

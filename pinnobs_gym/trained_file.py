@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import torch
 
@@ -49,7 +50,7 @@ def write(path: str | Path, content: Mapping[str, Any]) -> None:
         ValueError: in one line, if the file cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f"{path.name}.{uuid4().hex}.part")
     buffer = io.BytesIO()
     torch.save(dict(content), buffer)
     try:

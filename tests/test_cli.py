@@ -17,7 +17,8 @@ from pinnobs_gym.cli import main
 from pinnobs_gym.conditions import CONDITIONS
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.suite import jobs_of
+from pinnobs_gym.planning import jobs_of
+from pinnobs_gym.suites import Entry, Suite
 
 QUICK = ["--systems", "ReverseDuffing", "--episodes", "4", "--jobs", "1"]
 
@@ -93,6 +94,14 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         ),
         (["leaderboard", "--out", "file/x"], "cannot write to folder file/x"),
         (["leaderboard", "--jobs", "0"], "jobs=0"),
+        (["leaderboard", "--backend", "dask"], "backend 'dask' without a scheduler; expected"),
+        (["leaderboard", "--scheduler", "tcp://a:1"], "goes with --backend dask"),
+        (
+            ["leaderboard", "--backend", "dask", "--scheduler", "tcp://a:1", "--jobs", "2"],
+            "jobs=2 with backend 'dask'",
+        ),
+        (["leaderboard", "--suite", "quik"], "unknown suite 'quik'; known are full, leaderboard,"),
+        (["leaderboard", "--suite", "none.toml"], "cannot read suite none.toml: No such file"),
         (["leaderboard", "--condition", "load_step"], "needs a plant with a load torque"),
         (["estimate", "--system", "Academic", "--log", "none.csv"], "cannot read log none.csv"),
         (["estimate", "--system", "Academic", "--log", "bad.csv"], "has no column y1; Academic"),
@@ -166,17 +175,13 @@ def test_leaderboard_prints_ranks_writes_and_resumes(folder, capsys):
 
 
 def test_all_conditions_are_played_by_those_that_need_no_training(folder, capsys):
-    jobs = jobs_of(
-        ["ReverseDuffing", "InductionMotor"],
-        ["ekf", "pinn_gain", "pinn_obs"],
-        setup="benchmark",
-        conditions=["all"],
-        episodes=4,
+    played = Suite(
+        ("ReverseDuffing", "InductionMotor"),
+        tuple(map(Entry, ("ekf", "pinn_gain", "pinn_obs"))),
+        ("all",),
         trained_episodes=1,
-        seed=0,
-        folder=folder,
-        training={},
     )
+    jobs = jobs_of(played, folder)
     played = {
         (system, estimator): [
             job.condition for job in jobs if (job.system, job.estimator) == (system, estimator)
@@ -201,28 +206,69 @@ def test_conditions_are_ranked(folder, capsys):
     assert run("leaderboard", *where, "--condition", "all", "noise5") == 2
 
 
-def test_a_truncated_rows_file_is_refused_before_anything_runs(folder, capsys):
+def test_a_damaged_rows_file_is_refused_before_anything_runs(folder, capsys):
     path = folder / "lb" / "rows.jsonl"
     path.parent.mkdir()
-    path.write_text('{"schema": 1, "env')
+    path.write_text('{"schema": 3, "env\n{"schema": 2}\n')
     assert run("leaderboard", *QUICK, "--out", "lb") == 2
     assert "lb/rows.jsonl, line 1, is cut off" in capsys.readouterr().err
-    assert path.read_text() == '{"schema": 1, "env'
+    path.write_text('{"schema": 2}\n')
+    assert run("leaderboard", *QUICK, "--out", "lb") == 2
+    assert "lb/rows.jsonl, line 1: rows of schema 2; expected 3" in capsys.readouterr().err
+    assert path.read_text() == '{"schema": 2}\n'
 
 
-def test_a_failed_job_is_told_and_the_rest_goes_on(folder, capsys):
+def test_half_a_line_at_the_end_is_told_and_its_episode_is_run_again(folder, capsys):
+    arguments = ["leaderboard", *QUICK, "--estimators", "ekf", "--out", "lb"]
+    assert run(*arguments) == 0
+    path = folder / "lb" / "rows.jsonl"
+    whole = path.read_bytes()
+    before = rows.read(path)
+    path.write_bytes(whole[:-100])
+    capsys.readouterr()
+    assert run(*arguments) == 0
+    assert "lb/rows.jsonl, line 4, is cut off" in capsys.readouterr().out
+    assert path.read_bytes().startswith(whole[: whole.rindex(b"\n", 0, -1)])
+    after = [r["nrmse"] for r in rows.read(path)]
+    assert after == pytest.approx([r["nrmse"] for r in before], rel=1e-9)
+
+
+def test_a_failed_job_is_told_left_out_and_tried_again_if_asked(folder, capsys):
     (folder / "failing_module.py").write_text(
+        "from pathlib import Path\n"
         "from pinnobs_gym.estimators.ekf import EKF\n"
         "class Broken(EKF):\n"
         "    name = 'broken'\n"
         "    def update(self, state, t, y, u):\n"
+        "        if Path('mended').exists():\n"
+        "            return super().update(state, t, y, u)\n"
         "        raise RuntimeError('out of luck')\n"
     )
     estimators = ["--estimators", "failing_module:Broken", "ekf"]
-    assert run("leaderboard", *QUICK, *estimators, "--out", "lb") == 1
+    arguments = ["leaderboard", *QUICK, *estimators, "--out", "lb"]
+    path = folder / "lb" / "rows.jsonl"
+
+    def scored():
+        return {row["estimator"] for row in rows.read(path)}
+
+    assert run(*arguments) == 1
     printed = capsys.readouterr().out
-    assert "RuntimeError: out of luck" in printed
-    assert {row["estimator"] for row in rows.read(folder / "lb" / "rows.jsonl")} == {"ekf"}
+    name = "failing_module:Broken on ReverseDuffing, nominal, 4 episodes"
+    assert f"failed: {name}: RuntimeError: out of luck" in printed
+    assert "Failed: broken, 4 episodes: RuntimeError: out of luck." in printed
+    assert scored() == {"ekf"}
+    (failure,) = rows.load(path).failures
+    assert (failure["estimator"], failure["error"]) == ("broken", "RuntimeError: out of luck")
+    (folder / "mended").touch()
+    before = path.read_bytes()
+    assert run(*arguments) == 1
+    assert "1 job(s) failed before and were left out; --retry-failed" in capsys.readouterr().out
+    assert path.read_bytes() == before
+    assert run(*arguments, "--retry-failed") == 0
+    assert "Failed" not in capsys.readouterr().out
+    assert scored() == {"ekf", "broken"}
+    assert rows.load(path).failures == []
+    assert run(*arguments) == 0
 
 
 def test_train_evaluate_and_refuse_another_system(folder, capsys):

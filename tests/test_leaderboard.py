@@ -96,3 +96,22 @@ def test_optional_scores_are_shown_where_they_are(tmp_path):
     for anees, shown in ((1.29, "1.29"), (0.7, "0.7 ▼"), (np.inf, "∞ ▲")):
         (table,) = leaderboard.tables(rows_of("ekf", [0.1] * 50, anees=anees))
         assert shown in leaderboard.cells(table)[0]
+
+
+def test_what_failed_is_told_in_the_note_of_its_game():
+    failure = {
+        "env_id": "pinnobs/X-v0",
+        "setup": "benchmark",
+        "condition": "nominal",
+        "estimator": "mine",
+        "episode_seed": 3,
+        "episodes": 1,
+        "error": "RuntimeError: out of luck.",
+    }
+    other = failure | {"condition": "noise5", "episodes": 20}
+    second, first = leaderboard.tables(rows_of("ekf", [0.1, 0.2]), [failure, other])
+    assert first.note == "Failed: mine, episode 3: RuntimeError: out of luck."
+    assert [s.estimator for s in first.standings] == ["ekf"]
+    assert (second.condition, second.standings) == ("noise5", ())  # nothing else was played
+    assert second.note == "Failed: mine, 20 episodes: RuntimeError: out of luck."
+    assert second.note in leaderboard.markdown([first, second])

@@ -46,7 +46,7 @@ def test_cells_by_hand():
     assert lines[2][4:6] == ["0.1", "div 100 %"]
     assert lines[3][4:6] == ["", "0.25"]
     assert lines[0][3] == "88 %"
-    text = overview.markdown(played())
+    text = overview.markdown(overview.lines(played()), overview.ranks(played()))
     assert "| half | online | 0.5 (0.5-∞) | 88 % | 0.05, div 25 % | 0.5 | 1 |" in text
 
 

@@ -5,85 +5,123 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from pinnobs_gym import leaderboard, overview, rows, suite
-from pinnobs_gym.console import console, print_grid, print_table, progress
+from pinnobs_gym import leaderboard, overview, planning, rows, suite, suites
+from pinnobs_gym.console import RunView, console, print_grid, print_table
+from pinnobs_gym.engine import Engine, Where
 from pinnobs_gym.options import parse
 from pinnobs_gym.report import check_writable, replacing
-from pinnobs_gym.systems import SYSTEMS
+
+PROCESSES = 2
+"""At a time, if none are asked for."""
 
 
 @dataclass(frozen=True)
 class Leaderboard:
     """Run every estimator on every system and print the tables; what is already there is kept."""
 
+    suite: str = "leaderboard"
+    """What is played: full, leaderboard, paper, quick, or the path of a TOML file of your own. The
+    options from systems to seed change it."""
     systems: tuple[str, ...] = ()
-    """Names or module:Class of systems; all that are known if empty."""
+    """Names or module:Class of systems."""
     estimators: tuple[str, ...] = ()
-    """Names or module:Class of estimators; all that are known if empty."""
-    setup: str = "benchmark"
+    """Names or module:Class of estimators."""
+    setup: str | None = None
     """Setup that is played."""
     condition: tuple[str, ...] = ()
-    """Conditions; nominal, and the one that a system is ranked under, if none is given. With "all",
-    those that need no training play every condition that fits the system as well."""
-    episodes: int = 100
+    """Conditions; nominal, and the one that a system is ranked under, if neither this nor the suite
+    names any. With "all", those that need no training play every condition that fits the system."""
+    episodes: int | None = None
     """Episodes of each estimator and system."""
-    trained_episodes: int = 5
+    trained_episodes: int | None = None
     """Episodes of those that train on every record."""
-    budget: float = 45.0
-    """CPU seconds of each training."""
-    seed: int = 0
+    budget: tuple[float, ...] = ()
+    """CPU seconds of each training; of several, one after the other."""
+    training_seeds: tuple[int, ...] = ()
+    """Seeds of each training."""
+    seed: int | None = None
     """Seed of the first episode."""
-    jobs: int = 2
-    """Processes at a time, one thread each."""
+    jobs: int | None = None
+    """Processes at a time on this machine, one thread each; 2 if not given."""
+    backend: Literal["loky", "dask"] = "loky"
+    """Where jobs are run: processes of this machine, or the workers of a Dask scheduler."""
+    scheduler: str | None = None
+    """Address of the Dask scheduler, such as tcp://host:8786."""
+    retry_failed: bool = False
+    """Run the jobs again that failed before; they are left out otherwise."""
     out: Path = Path("runs/leaderboard")
     """Folder of rows, tables, TensorBoard log and trained files."""
 
     def run(self) -> int:
         """Run what is missing, then print and write the tables."""
-        for name, least in (("jobs", 1), ("episodes", 1), ("trained_episodes", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}={getattr(self, name)}; expected at least {least}")
-        if not self.budget > 0:
-            raise ValueError(f"budget={self.budget}; expected a positive number of seconds")
-        check_writable(self.out)
-        rows.read(self.out / "rows.jsonl")  # a damaged file is refused before anything is run
-        jobs = suite.jobs_of(
-            self.systems or tuple(SYSTEMS.classes()),
-            self.estimators or suite.default_estimators(),
+        where = self._where()
+        played = suites.load(self.suite).changed(
+            systems=self.systems,
+            estimators=self.estimators,
             setup=self.setup,
             conditions=self.condition,
             episodes=self.episodes,
             trained_episodes=self.trained_episodes,
+            budgets=self.budget,
+            training_seeds=self.training_seeds,
             seed=self.seed,
-            folder=self.out,
-            training={"budget": self.budget},
         )
-        failures = []
-        with progress() as bar:
-            task = bar.add_task("jobs", total=len(jobs))
-            for job, failure in suite.run_jobs(jobs, self.jobs):
-                bar.advance(task)
-                if failure is not None:
-                    failures.append(f"failed: {job.name}: {failure}")
-                    bar.console.print(failures[-1], markup=False)
-        scored = rows.read(self.out / "rows.jsonl")
-        suite.log_summaries(self.out, scored)
-        tables = leaderboard.tables(scored)
-        played = {job.condition for job in jobs}
-        shown = [table for table in tables if table.condition in played]
-        for table in shown if len(played) <= 2 else ():
+        check_writable(self.out)
+        path = self.out / "rows.jsonl"
+        stored = rows.load(path)  # a damaged file is refused before anything is run
+        if stored.warning:
+            console.print(stored.warning, style="yellow", soft_wrap=True)
+        jobs = planning.jobs_of(played, self.out.absolute())
+        to_run, left_out = planning.left(jobs, stored, self.retry_failed)
+        engine = Engine(where)
+        with RunView(len(to_run), lambda: [job.name for job in engine.running]) as view:
+            for job, error in engine.run(to_run):
+                view.ended(job.name, error)
+        stored = rows.load(path)
+        suite.log_summaries(self.out, stored.rows)
+        self._report(stored, {job.condition for job in jobs})
+        if left_out:
+            console.print(
+                f"{len(left_out)} job(s) failed before and were left out; --retry-failed runs "
+                "them again",
+                style="yellow",
+                soft_wrap=True,
+            )
+        return 1 if view.failed or left_out else 0
+
+    def _where(self) -> Where:
+        if self.backend == "dask":
+            if self.scheduler is None:
+                raise ValueError("backend 'dask' without a scheduler; expected --scheduler ADDRESS")
+            if self.jobs is not None:
+                told = "the scheduler's workers say how many run at a time"
+                raise ValueError(f"jobs={self.jobs} with backend 'dask': {told}")
+            return Where(scheduler=self.scheduler)
+        if self.scheduler is not None:
+            raise ValueError(f"scheduler={self.scheduler!r} goes with --backend dask")
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"jobs={self.jobs}; expected at least 1")
+        return Where(self.jobs or PROCESSES)
+
+    def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
+        """Print and write what came of it."""
+        scored = stored.rows
+        lines, placed = overview.lines(scored), overview.ranks(scored)
+        tables = leaderboard.tables(scored, stored.failures)
+        shown = [table for table in tables if table.condition in conditions]
+        for table in shown if len(conditions) <= 2 else ():
             print_table(table)
-        console.print(leaderboard.NOTE if len(played) <= 2 else "")
-        print_grid("Across systems", *overview.cells(overview.lines(scored)))
+        console.print(leaderboard.NOTE if len(conditions) <= 2 else "")
+        print_grid("Across systems", *overview.cells(lines))
         console.print(overview.NOTE)
-        placed = overview.ranks(scored)
         if len(placed) > 1:
             print_grid("Ranks", *overview.rank_cells(placed))
             console.print(overview.RANK_NOTE)
         path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
-            text = overview.markdown(scored) + "\n" + leaderboard.markdown(tables)
+            text = overview.markdown(lines, placed) + "\n" + leaderboard.markdown(tables)
             temporary.write_text(text, encoding="utf-8")
         for what, where in (
             ("tables", path),
@@ -93,7 +131,6 @@ class Leaderboard:
         ):
             if where.exists():
                 console.print(f"{what + ':':14} {where}", soft_wrap=True)
-        return 1 if failures else 0
 
 
 def run(arguments: Sequence[str]) -> int:

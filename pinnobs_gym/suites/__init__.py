@@ -1,0 +1,180 @@
+"""Suites: what a leaderboard plays, each a TOML file.
+
+Those of this folder are known by their names, and a file put here is found; a user's own is given
+by its path. Each key is a field of `Suite`, and every key may be left out. An estimator is a name,
+``module:Class``, or a table of ``name``, ``label`` (its name in tables) and ``settings``::
+
+    systems = ["ReverseDuffing", "my_module:VanDerPol"]
+    estimators = ["ekf", { name = "ekf", label = "robust ekf", settings = { huber = 1.345 } }]
+    conditions = ["nominal", "noise5+dropout10"]
+    episodes = 20
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An estimator that is played."""
+
+    name: str
+    """Name or ``module:Class``."""
+    label: str | None = None
+    """Its name in tables, if not its own."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Its settings or, if it learns, its trainer's."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What is played: the cross of systems, estimators and conditions."""
+
+    systems: tuple[str, ...] = ()
+    """Names or ``module:Class``; all that are known if empty."""
+    estimators: tuple[Entry, ...] = ()
+    """All that can be ranked if empty."""
+    conditions: tuple[str, ...] = ()
+    """Nominal, and the one that a system is ranked under, if empty. With "all", those that need no
+    training play every condition that fits the system as well."""
+    setup: str = "benchmark"
+    """Setup that is played."""
+    episodes: int = 100
+    """Episodes of each estimator and system."""
+    trained_episodes: int = 5
+    """Episodes of those that train on every record."""
+    seed: int = 0
+    """Seed of the first episode."""
+    training_seeds: tuple[int, ...] = ()
+    """Seeds of each training; the trainer's own if empty."""
+    budgets: tuple[float, ...] = (45.0,)
+    """CPU seconds of each training, one after the other."""
+    file: str = field(default="", kw_only=True)
+    """Where it was read from."""
+    given: frozenset[str] = field(default=frozenset(), kw_only=True)
+    """The keys that the file gives."""
+
+    def wrong(self, key: str, what: object) -> ValueError:
+        """An error in what a key says, naming the file and the key, if it stands in one."""
+        return ValueError(f"{self.file}: {key}: {what}" if key in self.given else str(what))
+
+    def changed(self, **changes: Any) -> Suite:
+        """The suite with other values, checked; those that are None or empty change nothing.
+
+        Raises:
+            ValueError: in one line, naming the value and what was expected.
+        """
+        values = {name: value for name, value in changes.items() if value not in (None, ())}
+        for name, value in values.items():
+            values[name] = _checked(name, list(value) if isinstance(value, tuple) else value)
+        return replace(self, **values, given=self.given - values.keys())
+
+
+def names() -> list[str]:
+    """The suites that are known by name."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load(spec: str) -> Suite:
+    """A suite by its name or its file's path.
+
+    Raises:
+        ValueError: in one line, naming the file, the key, its value and what was expected.
+    """
+    path = FOLDER / f"{spec}.toml" if spec in names() else Path(spec)
+    if path.suffix != ".toml":
+        raise ValueError(
+            f"unknown suite {spec!r}; known are {', '.join(names())}, and files that end in .toml"
+        )
+    file = f"suite {spec}"
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {file}: {error.strerror or error}") from None
+    except ValueError as error:  # not TOML, or not text
+        raise ValueError(f"{file} is no TOML: {error}") from None
+    known = [f.name for f in fields(Suite) if not f.kw_only]
+    values = {}
+    for key, value in content.items():
+        if key not in known:
+            raise ValueError(f"{file}: unknown key {key!r}; expected one of {', '.join(known)}")
+        try:
+            values[key] = _checked(key, value)
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
+    return Suite(**values, file=file, given=frozenset(values))
+
+
+def _checked(key: str, value: Any) -> Any:
+    """A value as the suite keeps it."""
+    expected, fits = _EXPECTED[key]
+    several = key in _SEVERAL
+    if several and not isinstance(value, list):
+        raise ValueError(f"{key}={value!r}; expected a list of {expected}")
+    for part in value if several else [value]:
+        if not fits(part):
+            raise ValueError(f"{key}={value!r}; expected {'a list of ' * several}{expected}")
+    if key == "estimators":
+        return tuple(_entry(part) for part in value)
+    if several and len({repr(part) for part in value}) < len(value):
+        raise ValueError(f"{key}={value!r}; expected each but once")
+    return tuple(value) if several else value
+
+
+def _entry(value: Any) -> Entry:
+    if not isinstance(value, Mapping):
+        return value if isinstance(value, Entry) else Entry(value)
+    known = [f.name for f in fields(Entry)]
+    for key in value:
+        if key not in known:
+            raise ValueError(
+                f"estimators: unknown key {key!r} in {dict(value)!r}; expected one of "
+                f"{', '.join(known)}"
+            )
+    entry = Entry(**{"name": "", **value})
+    if not (isinstance(entry.name, str) and entry.name):
+        raise ValueError(f"estimators: {dict(value)!r} has no name")
+    if entry.label is not None and not re.fullmatch(r"\w[\w .,=+%-]*", str(entry.label)):
+        raise ValueError(
+            f"estimators: label={entry.label!r}; expected letters, digits, spaces and _ . , = + % -"
+        )
+    if not isinstance(entry.settings, Mapping):
+        raise ValueError(f"estimators: settings={entry.settings!r}; expected a table")
+    return entry
+
+
+def _whole(least: int) -> Callable[[Any], bool]:
+    return lambda value: type(value) is int and value >= least
+
+
+def _name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
+_SEVERAL = ("systems", "estimators", "conditions", "training_seeds", "budgets")
+_EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "systems": ("names", _name),
+    "estimators": (
+        "names and tables",
+        lambda v: _name(v) or isinstance(v, Mapping | Entry),
+    ),
+    "conditions": ("names", _name),
+    "setup": ("a name", _name),
+    "episodes": ("at least 1", _whole(1)),
+    "trained_episodes": ("at least 1", _whole(1)),
+    "seed": ("at least 0", _whole(0)),
+    "training_seeds": ("whole numbers of at least 0", _whole(0)),
+    "budgets": (
+        "positive numbers of seconds",
+        lambda v: type(v) in (int, float) and 0 < v < float("inf"),
+    ),
+}
+"""What each key takes."""

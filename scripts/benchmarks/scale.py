@@ -1,0 +1,186 @@
+"""The engine and the tables at scale: overhead of a job, two processes over one, 100,000 rows."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import Figure, at_least, at_most
+from pinnobs_gym import leaderboard, overview, planning, rows
+from pinnobs_gym.engine import Engine, Where
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.suites import Entry, Suite
+from pinnobs_gym.systems import SYSTEMS
+
+JOBS = 2000
+ROWS = 100_000
+CONDITIONS = ("nominal", "load_step", "noise5", "mismatch10", "outliers", "dropout30", "dt2")
+EPISODES = 120
+
+
+def figures(repeats: int) -> Iterator[Figure]:
+    """The engine and the tables."""
+    yield from overhead("loky", Where(2), 5.0)
+    with cluster() as address:
+        yield from overhead("Dask", Where(scheduler=address), 20.0)
+    yield two_over_one(min(repeats, 3))
+    yield from many_rows()
+
+
+def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
+    """So many rows as a leaderboard would store them, with made-up scores: estimators on systems
+    under conditions, game by game, `EPISODES` of each."""
+    rng = np.random.default_rng(seed)
+    names = sorted(set(ESTIMATORS.classes()) - {"ekf"})
+    systems = [cls for name, cls in SYSTEMS.classes().items() if cls.__module__.startswith("pinn")]
+    games = product(CONDITIONS, systems, ["ekf", *names])
+    found: list[rows.Row] = []
+    for condition, cls, name in games:
+        model, _ = cls.configured()
+        estimator = ESTIMATORS.classes()[name]
+        learns = estimator.needs_training or estimator.trains_on_record
+        base = {
+            "schema": rows.SCHEMA,
+            "kind": "score",
+            "env_id": f"pinnobs/{cls.__name__}-v0",
+            "setup": "benchmark",
+            "condition": condition,
+            "ranked": condition == cls.ranked_condition,
+            "nx": model.nx,
+            "estimator": name,
+            "track": estimator.track,
+            "knows": list(estimator.knows),
+            "options": {},
+            "config_hash": f"{abs(hash((name, cls.__name__))):012x}"[:12],
+            "training": {"seed": 0, "seconds": 45.0, "config": {"budget": 45.0}} if learns else {},
+            "training_seed": 0 if learns else None,
+            "versions": {"python": "3.13.0", "pinnobs-gym": "0.1.0", "numpy": "2.4.0"},
+            "date": "2026-01-01T00:00:00.000+00:00",
+            "batch": EPISODES,
+        }
+        level = rng.lognormal(-3, 1)
+        for episode in range(min(EPISODES, count - len(found))):
+            score = float(level * rng.lognormal(0, 0.4))
+            row = base | dict.fromkeys(SCORES, score) | dict.fromkeys(OPTIONAL_SCORES)
+            row |= {"nrmse_tail": score / 10, "nrmse_tail_modulo": score / 10, "settling": 1.0}
+            row |= {"anees": 1.0, "coverage": 0.9, "reference_ratio": score / 0.03}
+            found.append(
+                row | {"diverged": score > 2, "episode_seed": episode, "us_per_step": float(level)}
+            )
+        if len(found) == count:
+            return found
+    seeds = range(1, 1 + count // len(found))  # of training, once all games are full
+    return (found + [row | {"training_seed": s} for s in seeds for row in found])[:count]
+
+
+@dataclass(frozen=True)
+class Trivial:
+    """A job that does nothing but append a row."""
+
+    folder: Path
+    row: rows.Row
+
+    @property
+    def name(self) -> str:
+        """What it does."""
+        return "trivial"
+
+    def run(self) -> None:
+        """Append the row."""
+        rows.append(self.folder / "rows.jsonl", [self.row])
+
+    def anew(self) -> Trivial:
+        """The same."""
+        return self
+
+    def fail(self, error: str) -> None:
+        """Never."""
+        raise AssertionError(error)
+
+
+def overhead(name: str, where: Where, bound: float) -> Iterator[Figure]:
+    """Wall time a job of `JOBS` that each append a row, once all workers have done one, and with
+    the start of the workers."""
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = [Trivial(Path(folder), row) for row in synthetic_rows(JOBS)]
+        begun = time.perf_counter()
+        times = [time.perf_counter() for _ in Engine(where).run(jobs)]
+        assert len(rows.read(Path(folder) / "rows.jsonl")) == JOBS
+    first = 50  # by then both workers have loaded what they need
+    steady = 1000 * (times[-1] - times[first]) / (JOBS - 1 - first)
+    yield at_most(f"overhead of a job, two workers of {name}", steady, "ms", bound)
+    whole = 1000 * (times[-1] - begun) / JOBS
+    yield Figure(f"the same, {name}'s start included", whole, "ms", "", None)
+
+
+@contextmanager
+def cluster() -> Iterator[str]:
+    """A Dask scheduler of this machine with two workers; its address."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scheduler.json"
+        local = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+        def start(program: str, *arguments: object) -> subprocess.Popen[bytes]:
+            command = [sys.executable, "-m", f"distributed.cli.{program}", *map(str, arguments)]
+            return subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+
+        processes = [start("dask_scheduler", *local, "--scheduler-file", file)]
+        try:
+            while not (file.exists() and file.read_text()):
+                time.sleep(0.1)
+            address = json.loads(file.read_text())["address"]
+            one = (address, "--nthreads", 1, "--no-dashboard", "--no-nanny")
+            processes += [start("dask_worker", *one) for _ in range(2)]
+            yield address
+        finally:
+            for process in reversed(processes):
+                process.terminate()
+                process.wait()
+
+
+def two_over_one(repeats: int) -> Figure:
+    """Wall time of the EKF on every system under some conditions, in one process over two, which
+    have been started and have done the suite once."""
+    played = ("nominal", "noise5", "outliers", "dropout30", "gap")
+    suite = Suite(estimators=(Entry("ekf"),), conditions=played)
+
+    def seconds(processes: int) -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            jobs = planning.jobs_of(suite, Path(folder))
+            begun = time.perf_counter()
+            for job, error in Engine(Where(processes)).run(jobs):
+                assert error is None, (job, error)
+            return time.perf_counter() - begun
+
+    seconds(2)
+    ratios = [seconds(1) / seconds(2) for _ in range(repeats)]
+    told = "EKF suite: throughput of two processes over one"
+    return at_least(told, float(np.median(ratios)), "", 1.8)
+
+
+def many_rows() -> Iterator[Figure]:
+    """Seconds from a rows file to all tables."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rows.jsonl"
+        rows.append(path, synthetic_rows(ROWS))
+        begun = time.perf_counter()
+        stored = rows.load(path)
+        read = time.perf_counter()
+        leaderboard.markdown(leaderboard.tables(stored.rows, stored.failures))
+        overview.markdown(overview.lines(stored.rows), overview.ranks(stored.rows))
+        end = time.perf_counter()
+    yield at_most(f"{ROWS:,} rows read", read - begun, "s", 4)
+    yield at_most(f"{ROWS:,} rows read, and all tables", end - begun, "s", 4)
