@@ -262,8 +262,9 @@ def _reference(
     system: type[System], setup: str, condition: str, seeds: tuple[int, ...]
 ) -> dict[str, np.ndarray] | None:
     """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each, and
-    ``by_sample`` what is expected of each sample, (batch, num_samples); None where there is none: without noise, from a fixed initial state, or under a condition that
-    is not in the model (`Condition.reference`)."""
+    as ``by_sample`` what is expected of each sample, (batch, num_samples); None where there is
+    none: without noise, from a fixed initial state, or under a condition that is not in the model
+    (`Condition.reference`)."""
     source = EpisodeSource(system, setup, condition)
     std = vector(source.setup.noise_std, source.system.ny, "noise_std")
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():

@@ -99,6 +99,28 @@ def read(path: Path) -> list[Row]:
     return [row for _, row in rows.values()]
 
 
+def read_all(paths: Iterable[Path]) -> list[Row]:
+    """The rows of several files, each once.
+
+    Raises:
+        ValueError: in one line, if there is no such file, and as `read` and where two files give
+            different scores of an episode.
+    """
+    found: dict[tuple[Any, ...], tuple[Path, Row]] = {}
+    for path in paths:
+        if not path.exists():
+            raise ValueError(f"there is no rows file {path}")
+        for row in read(path):
+            name = key(row)
+            first, earlier = found.setdefault(name, (path, row))
+            if any(earlier[score] != row[score] for score in (*SCORES, "diverged")):
+                raise ValueError(
+                    f"{first} and {path} give different scores of the same episode: "
+                    f"{dict(zip(KEY, name, strict=True))}"
+                )
+    return [row for _, row in found.values()]
+
+
 def _encoded(row: Row) -> Row:
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
