@@ -17,14 +17,18 @@ from pinnobs_gym.rows import Row
 from pinnobs_gym.system import System
 
 POINTS = 200
-"""Most sample times that are kept of an episode."""
+"""Most sample times at which errors are kept."""
+EARLY, EVEN = 50, 250
+"""Of the example episode: its first samples are kept, and so many spread evenly."""
 
 
 @dataclass(frozen=True)
 class Example:
-    """One episode at the kept times."""
+    """One episode at times of its own, close enough for oscillations."""
 
     seed: int
+    t: np.ndarray
+    """Times in s, shape (points,)."""
     x: np.ndarray
     """True states, shape (points, nx)."""
     xhat: np.ndarray
@@ -72,6 +76,11 @@ def kept(num_samples: int, points: int = POINTS) -> np.ndarray:
     return np.unique(np.round(np.concatenate([early, even])).astype(int))
 
 
+def _kept_of_example(num_samples: int) -> np.ndarray:
+    even = np.linspace(0, num_samples - 1, min(EVEN, num_samples)).round().astype(int)
+    return np.union1d(np.arange(min(EARLY, num_samples)), even)
+
+
 def labels(system: System) -> tuple[str, ...]:
     """Names of the states, with their units in brackets."""
     units = (system.units.get(name, "") for name in system.state_names)
@@ -97,15 +106,20 @@ def curves_of(
         reference: that of the Cramér-Rao reference, if there is one.
         example: one of them, at all samples.
     """
-    k = kept(len(t))
-    std = None if example.std is None else _short(example.std[k])
+    k, m = kept(len(t)), _kept_of_example(len(t))
+    std = None if example.std is None else _short(example.std[m])
     return Curves(
         t=t[k],
         seeds=np.asarray(seeds),
         error=_short(error[:, k]),
         reference=None if reference is None else _short(reference[:, k]),
         example=Example(
-            example.seed, _short(example.x[k]), _short(example.xhat[k]), _short(example.y[k]), std
+            example.seed,
+            t[m],
+            _short(example.x[m]),
+            _short(example.xhat[m]),
+            _short(example.y[m]),
+            std,
         ),
         states=labels(system),
         measured=measured_states(system),
@@ -141,6 +155,7 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
     arrays = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
     optional = {"reference": curves.reference, "std": curves.example.std}
     arrays |= {name: getattr(curves.example, name) for name in ("x", "xhat", "y")}
+    arrays["example_t"] = curves.example.t
     arrays |= {name: array for name, array in optional.items() if array is not None}
     name = f"{_plain(row['estimator'])}-{row['config_hash']}-{curves.seeds[0]}.npz"
     path = _place(folder, row["env_id"], row["setup"], row["condition"]) / name
@@ -194,7 +209,7 @@ def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
 
 
 def _of(about: dict[str, object], arrays: dict[str, np.ndarray]) -> Curves:
-    names = ("x", "xhat", "y")
+    names = ("example_t", "x", "xhat", "y")
     seed: object = about["example_seed"]
     example = Example(int(str(seed)), *(arrays[name] for name in names), arrays.get("std"))
     states: object = about["states"]

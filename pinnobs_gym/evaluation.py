@@ -252,7 +252,7 @@ def play_batch(
         record.t,
         by_sample(xhat - x, system.scale, system.observable(x)),
         None if reference is None else reference["by_sample"],
-        Example(seeds[0], x[0], xhat[0], record.y[0], std),
+        Example(seeds[0], record.t, x[0], xhat[0], record.y[0], std),
     )
     return rows, example, curves
 

@@ -41,7 +41,8 @@ def named(data: str) -> alt.Chart:
 
 def finished(*layers: Any, height: Any, **params: Any) -> Spec:
     """Layers as one chart as wide as its place; ``params`` can be set by the page."""
-    chart = alt.layer(*layers).properties(width="container", height=height)
+    fit = alt.AutoSizeParams(type="fit-x", contains="padding")
+    chart = alt.layer(*layers).properties(width="container", height=height, autosize=fit)
     chart = chart.add_params(*(alt.param(name=name, value=v) for name, v in params.items()))
     spec = chart.to_dict()
     spec.pop("config", None)
@@ -65,11 +66,12 @@ def log_axis(low: float, high: float, **more: Any) -> alt.Axis:
 
 def time_of(end: float) -> alt.X:
     """The time axis up to ``end`` (s): linear at first, then logarithmic, so that the transient is
-    seen."""
-    scale = alt.Scale(type="symlog", constant=end / 200, domain=[0, end], nice=False)
+    seen. It ends at a tick if one is near."""
     powers = range(int(np.floor(np.log10(end / 200))), int(np.ceil(np.log10(end))) + 1)
     ticks = [float(f"{part}e{power}") for power in powers for part in (1, 2, 5)]
-    values = [0.0, *(tick for tick in ticks if end / 200 <= tick <= end)]
+    values = [0.0, *(tick for tick in ticks if end / 200 <= tick <= 1.02 * end)]
+    end = max(end, values[-1])
+    scale = alt.Scale(type="symlog", constant=end / 200, domain=[0, end], nice=False)
     axis = alt.Axis(values=values, format="~g", labelOverlap="greedy", labelFlush=True)
     return alt.X("t:Q", scale=scale, axis=axis, title="t (s)")
 

@@ -27,8 +27,9 @@ PLAIN_NAMES = alt.Axis(
 def level(scale: alt.Scale, vertical: bool) -> alt.Chart:
     """A line where the ratio is 1."""
     rule = named("one").mark_rule(style="level")
-    at = alt.XDatum(1, scale=scale) if vertical else alt.YDatum(1, scale=scale)
-    return rule.encode(**{"x" if vertical else "y": at})
+    if vertical:
+        return rule.encode(x=alt.XDatum(1, scale=scale))
+    return rule.encode(y=alt.YDatum(1, scale=scale))
 
 
 def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Spec:
@@ -91,8 +92,8 @@ def cost(
     across: tuple[float, float],
     up: tuple[float, float],
 ) -> Spec:
-    """The factor to the peer against a cost, both axes with their ranges; those whose ``named`` is
-    true have their name beside them."""
+    """The factor to the peer against a cost, both axes with their ranges; those for which
+    ``named_<field>`` is true have their name beside them."""
     scale = log_scale(*up)
     x = alt.X(f"{field}:Q", scale=log_scale(*across), title=title, axis=log_axis(*across))
     y = alt.Y("ratio:Q", scale=scale, title="NRMSE / EKF's", axis=log_axis(*up))

@@ -64,8 +64,8 @@ class States:
     truth: Columns
     """``t``, true states ``x0``, ...; outputs ``y0``, ... under the state that they measure."""
     estimates: Columns
-    """``estimator``, ``t``, ``m0``, ... and the bounds ``lo0``, ``hi0``, ... of two standard
-    deviations, gaps where it gives none."""
+    """``estimator``, ``t``, estimates ``m0``, ... and two of their standard deviations ``s0``, ...,
+    gaps where it gives none."""
 
 
 def ordered(
@@ -219,20 +219,17 @@ def states(found: Mapping[str, Curves]) -> States | None:
     seed = max(sorted(set(seeds)), key=seeds.count)
     shown = {name: own for name, own in found.items() if own.example.seed == seed}
     first = next(iter(shown.values()))
-    k = curves.kept(len(first.t), POINTS)
-    x, y = first.example.x[k], first.example.y[k]
-    truth: Columns = {"t": _numbers(first.t[k])}
+    x, y = first.example.x, first.example.y
+    truth: Columns = {"t": _numbers(first.example.t)}
     truth |= {f"x{i}": _numbers(x[:, i]) for i in range(x.shape[1])}
     truth |= {f"y{i}": _numbers(y[:, output]) for i, output in first.measured.items()}
     table: Columns = {"estimator": [], "t": []}
-    table |= {f"{part}{i}": [] for i in range(x.shape[1]) for part in ("m", "lo", "hi")}
+    table |= {f"{part}{i}": [] for i in range(x.shape[1]) for part in ("m", "s")}
     for name, own in shown.items():
-        k = curves.kept(len(own.t), POINTS)
-        mean = own.example.xhat[k].astype(float)
-        band = np.full(mean.shape, np.nan) if own.example.std is None else 2 * own.example.std[k]
-        parts = {"m": mean, "lo": mean - band, "hi": mean + band}
+        t, mean, std = own.example.t, own.example.xhat, own.example.std
+        parts = {"m": mean, "s": np.full(mean.shape, np.nan) if std is None else 2 * std}
         new = {f"{p}{i}": _numbers(v[:, i]) for p, v in parts.items() for i in range(x.shape[1])}
-        _extend(table, estimator=[name] * len(k), t=_numbers(own.t[k]), **new)
+        _extend(table, estimator=[name] * len(t), t=_numbers(t), **new)
     return States(
         seed, first.states, tuple(_limits(x[:, i]) for i in range(x.shape[1])), truth, table
     )
@@ -240,11 +237,11 @@ def states(found: Mapping[str, Curves]) -> States | None:
 
 def standings(lines: Sequence[overview.Line], players: Mapping[str, Any]) -> Columns:
     """Each line of the overview: its factor to the peer with the interval, its µs per step, and the
-    CPU seconds that training took, a gap for those that are not trained. ``named_us`` is true of
-    those that no other of their track beats in both accuracy and speed, ``named_seconds`` of all.
-    Lines whose factor is not finite are left out."""
+    CPU seconds that training took, a gap for those that are not trained. ``front`` is true of
+    those that no other of their track beats in both accuracy and speed. Lines whose factor is not
+    finite are left out."""
     table: Columns = {name: [] for name in ("estimator", "track", "ratio", "low", "high", "us")}
-    table |= {"seconds": [], "named_us": [], "named_seconds": []}
+    table |= {"seconds": [], "front": []}
     for line in lines:
         if line.ratio is None or not np.isfinite(line.ratio.value):
             continue
@@ -260,8 +257,7 @@ def standings(lines: Sequence[overview.Line], players: Mapping[str, Any]) -> Col
             high=[_number(line.ratio.high)],
             us=[_number(line.us_per_step)],
             seconds=[_number(float(np.median(known))) if known else None],
-            named_us=[not any(_beats(other, line) for other in lines)],
-            named_seconds=[True],
+            front=[not any(_beats(other, line) for other in lines)],
         )
     return table
 

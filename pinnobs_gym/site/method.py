@@ -39,7 +39,9 @@ def methods(players: Players) -> list[Method]:
                 estimator=name,
                 track=first["track"],
                 told=", ".join(first["knows"]),
-                settings="; ".join(dict.fromkeys(_settings(row["options"]) for row in _some(games))),
+                settings="; ".join(
+                    dict.fromkeys(_settings(row["options"]) for row in _some(games))
+                ),
                 training=training_of(rows),
                 episodes=len(rows),
                 dates=dates(rows),
@@ -79,35 +81,37 @@ def versions(rows: Iterable[Row]) -> dict[str, str]:
 
 
 def commands(rows: Sequence[Row]) -> list[str]:
-    """A command line per setup that makes these rows anew; it may make more, since all its
-    estimators play all its systems."""
-    setups = dict.fromkeys(row["setup"] for row in rows)
-    return [_command([row for row in rows if row["setup"] == setup], setup) for setup in setups]
+    """Command lines that make these rows anew: one per setup for the conditions that are played by
+    default, and one for each set of others that some systems were played under. They may make
+    more rows, since every estimator named plays every system named."""
+    usual: dict[str, list[Row]] = {}
+    others: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row["ranked"] or row["condition"] == "nominal":
+            usual.setdefault(row["setup"], []).append(row)
+        else:
+            others.setdefault((row["setup"], row["env_id"]), []).append(row)
+    alike: dict[tuple[str, ...], list[Row]] = {}
+    for (setup, _), some in others.items():
+        played = dict.fromkeys(row["condition"] for row in some)
+        alike.setdefault((setup, *sorted(played)), []).extend(some)
+    lines = [_command(some) for some in usual.values()]
+    return lines + [_command(some, conditions) for (_, *conditions), some in alike.items()]
 
 
-def _command(rows: Sequence[Row], setup: str) -> str:
+def _command(rows: Sequence[Row], conditions: Sequence[str] = ()) -> str:
     words = ["pinnobs leaderboard"]
     systems = {row["env_id"].removeprefix("pinnobs/").rpartition("-v")[0] for row in rows}
     words += ["--systems", *sorted(systems)]
     words += ["--estimators", *sorted({row["estimator"] for row in rows})]
+    setup = rows[0]["setup"]
     words += ["--setup", setup] if setup != "benchmark" else []
-    words += _conditions(rows)
+    words += ["--condition", *conditions] if conditions else []
+    alone = {row["episode_seed"] for row in rows if row["training"].get("per_record")}
     seeds = {row["episode_seed"] for row in rows}
     words += ["--episodes", str(max(seeds) - min(seeds) + 1)]
-    own = {row["episode_seed"] for row in rows if row["training"].get("per_record")}
-    words += ["--trained-episodes", str(max(own) - min(own) + 1)] if own else []
+    words += ["--trained-episodes", str(max(alone) - min(alone) + 1)] if alone else []
     budgets = {row["training"].get("config", {}).get("budget") for row in rows} - {None}
     words += ["--budget", f"{max(budgets):g}"] if budgets else []
     words += ["--seed", str(min(seeds))] if min(seeds) else []
     return " ".join(words)
-
-
-def _conditions(rows: Sequence[Row]) -> list[str]:
-    """Nothing if every system was played under the nominal condition and its own alone; ``all`` if
-    only those that are not trained were played under others; else all conditions."""
-    usual = {row["condition"] for row in rows if row["ranked"]} | {"nominal"}
-    played = dict.fromkeys(row["condition"] for row in rows)
-    trained = {row["condition"] for row in rows if row["training"]}
-    if set(played) <= usual:
-        return []
-    return ["--condition", *(["all"] if trained and trained <= usual else played)]

@@ -80,21 +80,29 @@ def state(
     styled: Styled, index: int, title: str, end: float, limits: tuple[float, float], measured: bool
 ) -> Spec:
     """One state of the example episode within its limits, and what the selected estimator makes of
-    it; dots are an output that measures it alone."""
+    it; dots are an output that measures it alone. The page can set until when (s) it is drawn."""
     scale = alt.Scale(domain=list(limits), nice=False, clamp=True)
-    truth = named("truth").encode(x=time_of(end))
-    mine = named("estimates").transform_filter("datum.estimator === selected")
-    mine = mine.encode(x=time_of(end), color=styled.colour)
+    until = alt.Scale(domainMin=0, domainMax=alt.ExprRef(expr="until"), nice=False)
+    x = alt.X("t:Q", scale=until, axis=alt.Axis(tickCount=6), title="t (s)")
+    truth = named("truth").encode(x=x)
+    mine = (
+        named("estimates")
+        .transform_filter("datum.estimator === selected")
+        .transform_calculate(
+            low=f"isValid(datum.s{index}) ? datum.m{index} - datum.s{index} : null",
+            high=f"isValid(datum.s{index}) ? datum.m{index} + datum.s{index} : null",
+        )
+        .encode(x=x, color=styled.colour)
+    )
 
     def y(field: str) -> alt.Y:
-        axis = alt.Axis(tickCount=4, format="~g")
-        return alt.Y(f"{field}{index}:Q", scale=scale, title=title, axis=axis)
+        return alt.Y(f"{field}:Q", scale=scale, title=title, axis=alt.Axis(tickCount=4))
 
     layers = [
-        mine.mark_area(opacity=0.18, clip=True).encode(y=y("lo"), y2=f"hi{index}:Q"),
-        truth.mark_line(style="truth", clip=True).encode(y=y("x")),
-        mine.mark_line(strokeDash=[5, 3], clip=True).encode(y=y("m")),
+        mine.mark_area(opacity=0.18, clip=True).encode(y=y("low"), y2="high:Q"),
+        truth.mark_line(style="truth", clip=True).encode(y=y(f"x{index}")),
+        mine.mark_line(strokeDash=[5, 3], clip=True).encode(y=y(f"m{index}")),
     ]
     if measured:
-        layers.insert(0, truth.mark_point(style="measured", clip=True).encode(y=y("y")))
-    return finished(*layers, height=120, selected="")
+        layers.insert(0, truth.mark_point(style="measured", clip=True).encode(y=y(f"y{index}")))
+    return finished(*layers, height=120, selected="", until=end)

@@ -4,7 +4,7 @@
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const views = new Map(); // of charts that are drawn, by name
   const shown = new Set(page.shown);
-  const selected = new Map(); // estimator of the example episode, by game
+  const choices = new Map(); // of the example episode, by game: estimator, and until when
 
   // Data come by columns, names of estimators as a list and places in it; Vega takes rows.
   const rowsOf = (table) => {
@@ -35,24 +35,21 @@
         labelColor: soft, titleColor: soft, gridColor: line, domainColor: line, tickColor: line,
         labelFontSize: 11, titleFontSize: 12, titleFontWeight: "normal", titlePadding: 8,
       },
-      axisY: { minExtent: 38 },
+      axisY: { minExtent: 42 },
       line: { strokeWidth: 2, strokeJoin: "round" },
       style: {
-        others: { stroke: others, strokeWidth: 1 },
-        reference: { stroke: text, strokeWidth: 1.6, strokeDash: [1, 3], strokeCap: "round" },
-        truth: { stroke: text, strokeWidth: 1.6 },
-        measured: { fill: soft, stroke: null, filled: true, size: 7, opacity: 0.7 },
-        level: { stroke: soft, strokeDash: [3, 3], strokeWidth: 1 },
+        others: { color: others, strokeWidth: 1 },
+        reference: { color: text, strokeWidth: 1.6, strokeDash: [1, 3], strokeCap: "round" },
+        truth: { color: text, strokeWidth: 1.6 },
+        measured: { color: soft, filled: true, size: 7, opacity: 0.7 },
+        level: { color: soft, strokeDash: [3, 3], strokeWidth: 1 },
         middle: { color: text, thickness: 2.5, size: 14 },
-        name: { fill: text, fontSize: 11 },
+        name: { color: text, fontSize: 11 },
       },
     };
   };
 
-  const paramsOf = (name) => ({
-    shown: [...shown],
-    selected: selected.get(page.charts[name].data),
-  });
+  const paramsOf = (name) => ({ shown: [...shown], ...choices.get(page.charts[name].data) });
 
   async function draw(place) {
     const name = place.dataset.chart;
@@ -103,10 +100,15 @@
   }
   for (const choice of document.querySelectorAll("select[data-game]")) {
     const key = `game${choice.dataset.game}`;
-    selected.set(key, choice.value);
+    const name = choice.dataset.param;
+    const take = () => {
+      const end = page.data[key].truth.t.at(-1);
+      choices.set(key, { ...choices.get(key), [name]: name === "until" ? end * choice.value : choice.value });
+    };
+    take();
     choice.addEventListener("change", () => {
-      selected.set(key, choice.value);
-      set("selected", choice.value, key);
+      take();
+      set(name, choices.get(key)[name], key);
     });
   }
   document.getElementById("heat")?.addEventListener("change", (event) => {

@@ -26,7 +26,7 @@ from pinnobs_gym.site.data import Columns, Game
 from pinnobs_gym.site.palette import styles
 from pinnobs_gym.systems import SYSTEMS
 
-SHOWN = 5
+SHOWN = 3
 """How many of the best online estimators are chosen at first, besides the peer."""
 
 
@@ -51,7 +51,8 @@ def build(rows: Sequence[Row], folders: Sequence[Path]) -> str:
         header=leaderboard.HEADER,
         cells=leaderboard.cells,
         systems=_systems(games),
-        games=games,
+        number_of={id(game): number for number, game in enumerate(games)},
+        id=id,
         heat=[_heat(name, values) for name, values in data.conditions(rows).items()],
         methods=method.methods(players),
         versions=method.versions(rows),
@@ -59,7 +60,9 @@ def build(rows: Sequence[Row], folders: Sequence[Path]) -> str:
         dates=method.dates(rows),
         episodes=len(rows),
         styles=drawn.styles,
-        tracks={name: next(chain.from_iterable(g.values()))["track"] for name, g in players.items()},
+        tracks={
+            name: next(chain.from_iterable(g.values()))["track"] for name, g in players.items()
+        },
         charts=drawn.charts,
         css=Markup(_text("page.css")),
         vega=Markup(_bundle()),
@@ -97,7 +100,16 @@ class Drawings:
             return
         self._data["across"] = {"standings": _packed(standings), "one": {"at": [1]}}
         everything = [standings[part] for part in ("ratio", "low", "high")]
-        up = nice_range(list(chain(*everything)), 0.05, 30.0)
+        up = nice_range(list(chain(*everything)), 0.02, 50.0)
+        standings = standings | {
+            "named_us": _apart(standings["us"], standings["ratio"], standings["front"]),
+            "named_seconds": _apart(
+                standings["seconds"],
+                standings["ratio"],
+                [x is not None for x in standings["seconds"]],
+            ),
+        }
+        self._data["across"]["standings"] = _packed(standings)
         self._add("factors", "across", comparisons.factors(self._styled, names, *up), len(names))
         titles = {"us": "CPU time per step and episode (µs)", "seconds": "CPU time of training (s)"}
         for field, title in titles.items():
@@ -110,7 +122,9 @@ class Drawings:
     def play(self, number: int, game: Game) -> None:
         """The charts of one game, their names ending in its number."""
         key = f"game{number}"
-        parts = {name: getattr(game, name) for name in ("settling", "ratios", "errors", "reference")}
+        parts = {
+            name: getattr(game, name) for name in ("settling", "ratios", "errors", "reference")
+        }
         if game.states is not None:
             parts |= {"truth": game.states.truth, "estimates": game.states.estimates}
         self._data[key] = {name: _packed(part) for name, part in parts.items()}
@@ -124,7 +138,7 @@ class Drawings:
         order = game.ratios["estimator"]
         if order:
             seen = [*game.ratios["q10"], *game.ratios["q90"]]
-            low, high = nice_range(seen, 0.2, 100.0)
+            low, high = nice_range(seen, 0.01, 100.0)
             spec = comparisons.ratios(self._styled, order, min(low, 0.8), max(high, 2.0))
             self._add(f"ratios{number}", key, spec, len(order))
         if game.states is not None:
@@ -138,6 +152,19 @@ class Drawings:
         """A chart, and how high it will be, so that nothing moves when it is drawn."""
         inner = comparisons.STEP * lines if lines is not None else spec["height"]
         self.charts[name] = {"spec": spec, "data": key, "height": inner + 48}
+
+
+def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Sequence[bool]) -> list[bool]:
+    """Which of the points that want it can have a name beside them without one covering another,
+    the lowest first; both axes are logarithmic."""
+    places = {i: (np.log10(x[i] or 1.0), np.log10(y[i])) for i, want in enumerate(wanted) if want}
+    spread = np.ptp(list(places.values()), axis=0) + 1e-9 if places else (1.0, 1.0)
+    chosen: list[int] = []
+    for i in sorted(places, key=lambda i: y[i]):
+        gaps = [abs(np.subtract(places[i], places[j])) / spread for j in chosen]
+        if all(gap[0] > 0.25 or gap[1] > 0.06 for gap in gaps):
+            chosen.append(i)
+    return [i in chosen for i in range(len(wanted))]
 
 
 def _packed(table: Columns) -> dict[str, Any]:
@@ -204,8 +231,8 @@ def _bundle() -> str:
     version = alt.SCHEMA_VERSION.removeprefix("v").rpartition(".")[0]
     if version not in vl_convert.get_vegalite_versions():
         version = vl_convert.get_vegalite_versions()[-1]
-    return vl_convert.javascript_bundle(vl_version=version).replace("</script", "<\\/script")
+    return vl_convert.javascript_bundle(None, vl_version=version).replace("</script", "<\\/script")
 
 
 def _text(name: str) -> str:
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return resources.files("pinnobs_gym.site").joinpath(name).read_text(encoding="utf-8")
