@@ -309,6 +309,7 @@ def _common(
     text = json.dumps(identity, sort_keys=True)
     return {
         "schema": SCHEMA,
+        "kind": "score",
         "env_id": env_id,
         "setup": setup,
         "condition": condition,

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
+import threading
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the row format."""
 
 Row: TypeAlias = dict[str, Any]
-"""One scored episode. Its keys:
+"""One scored episode (``kind`` is ``score``). Its keys:
 
 - ``schema``: version of this format.
 - ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
@@ -30,6 +32,14 @@ Row: TypeAlias = dict[str, Any]
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
 - ``batch``: the size of that batch.
 - ``versions``, ``date``: of the packages, and when it was run (UTC).
+
+Or a job of a leaderboard that failed (``kind`` is ``failure``), or one that failed before and then
+went well (``recovery``), of which these are kept:
+
+- ``schema``, ``env_id``, ``setup``, ``condition``, ``estimator``, ``versions``, ``date`` as above.
+- ``episode_seed``, ``episodes``: the first episode of the job, and how many it has.
+- ``job``: a hash of all that was asked for.
+- ``error``: what went wrong, in one line; of failures alone.
 """
 
 KEY = (
@@ -42,61 +52,149 @@ KEY = (
     "episode_seed",
 )
 """The fields that name a row; no two rows of a file share them."""
+JOB = ("env_id", "setup", "condition", "estimator", "episode_seed", "episodes", "job")
+"""The fields that a failure has."""
+TOLERANCE = 1e-6
+"""By how much, relatively, scores of the same episode may differ from machine to machine."""
+
+_BEGINNING = b'{"schema": '
+"""What every line begins with."""
+_APPENDING = threading.Lock()
+"""A file's lock keeps other processes out; this one, the other threads of this process."""
+
+
+class Stored(NamedTuple):
+    """What a rows file holds."""
+
+    rows: list[Row]
+    """The scored episodes, in the order of the file."""
+    failures: list[Row]
+    """The jobs that failed and have not gone well since."""
+    warning: str = ""
+    """What to know about the file, if anything."""
+
+
+class CannotWrite(ValueError):
+    """Rows could not be written; what the file held is untouched."""
 
 
 def key(row: Row) -> tuple[Any, ...]:
     """What names a row."""
-    return tuple(row[name] for name in KEY)
+    return tuple([row[name] for name in KEY])
 
 
 def append(path: Path, rows: Iterable[Row]) -> None:
-    """Append rows to a file in one write, so that processes may share it and a kill leaves no half
-    line. If the file ends in one all the same, the rows begin on a line of their own.
+    """Append rows to a file, all or none of them, under a lock: processes and machines may share
+    it. A half line at its end, of a process that was killed, is cut off first.
 
     Raises:
-        ValueError: in one line, if the file cannot be written; what it held is untouched.
+        CannotWrite: in one line, if the file cannot be written; what it held is untouched.
     """
     data = "".join(json.dumps(_encoded(row)) + "\n" for row in rows).encode()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:
-            size = os.fstat(descriptor).st_size
-            if size and os.pread(descriptor, 1, size - 1) != b"\n":
-                data = b"\n" + data
-            written = os.write(descriptor, data)
-            if written < len(data):
-                raise OSError(f"only {written} of {len(data)} bytes fitted")
+            with _APPENDING:
+                fcntl.lockf(descriptor, fcntl.LOCK_EX)  # until the file is closed
+                _write(descriptor, data)
         finally:
             os.close(descriptor)
     except OSError as error:
-        raise ValueError(f"cannot write rows to {path}: {error}") from None
+        raise CannotWrite(f"cannot write rows to {path}: {error}") from None
+
+
+def _write(descriptor: int, data: bytes) -> None:
+    """Write at the end of a locked file, all or nothing."""
+    size = os.fstat(descriptor).st_size
+    begin, tail = _last_line(descriptor, size)
+    if _is_cut(tail):
+        os.ftruncate(descriptor, begin)
+        size = begin
+    elif tail:  # only the line's end is missing, or the line is not ours to delete
+        data = b"\n" + data
+    try:
+        written = os.write(descriptor, data)
+        if written < len(data):
+            raise OSError(f"only {written} of {len(data)} bytes fitted")
+    except BaseException:
+        os.ftruncate(descriptor, size)
+        raise
+
+
+def _last_line(descriptor: int, size: int) -> tuple[int, bytes]:
+    """Where the last line begins and what it holds, if it does not end; else the end, and nothing."""
+    begin, tail = size, b""
+    while begin > 0:
+        step = min(begin, 1 << 16 if tail else 1)  # most files end as they should
+        block = os.pread(descriptor, step, begin - step)
+        _, newline, rest = block.rpartition(b"\n")
+        tail = rest + tail
+        if newline:
+            return begin - len(rest), tail
+        begin -= step
+    return 0, tail
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a file, in its order; none if there is no such file.
+    """The scored episodes of a file; see `load`."""
+    return load(path).rows
+
+
+def load(path: Path) -> Stored:
+    """What a file holds; nothing if there is no such file.
+
+    Files may be joined by concatenation: an episode that is there twice counts once. A half line at
+    the end is what a killed process leaves; it is left out, with a warning.
 
     Raises:
         ValueError: in one line that names the file and the line, if one is not a whole row of this
             schema, or contradicts an earlier one.
     """
     if not path.exists():
-        return []
+        return Stored([], [])
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        *lines, tail = path.read_bytes().split(b"\n")
+    except OSError as error:
         raise ValueError(f"cannot read rows from {path}: {error}") from None
-    rows: dict[tuple[Any, ...], tuple[int, Row]] = {}
+    warning = ""
+    if not _is_cut(tail):
+        lines += [tail] if tail else []
+    else:
+        warning = (
+            f"{path}, line {len(lines) + 1}, is cut off, as a killed process leaves it; it is left "
+            f"out, and what it held is run anew"
+        )
+    rows: dict[tuple[Any, ...], Row] = {}
+    numbers: dict[tuple[Any, ...], int] = {}
+    failures: dict[str, Row] = {}
     for number, line in enumerate(lines, 1):
         row = _decoded(path, number, line)
+        if row["kind"] != "score":
+            known = failures.get(row["job"])
+            if known is None or known["date"] <= row["date"]:  # joined files are in any order
+                failures[row["job"]] = row
+            continue
         name = key(row)
-        if name in rows and any(rows[name][1][s] != row[s] for s in (*SCORES, "diverged")):
+        if name not in rows:
+            rows[name], numbers[name] = row, number
+        elif not _same(rows[name], row):
             raise ValueError(
-                f"{path}, lines {rows[name][0]} and {number}, give different scores of the same "
-                f"episode: {dict(zip(KEY, name, strict=True))}"
+                f"{path}, lines {numbers[name]} and {number}, give different scores of the same "
+                f"episode: {dict(zip(KEY, name, strict=True))}; delete one of them"
             )
-        rows.setdefault(name, (number, row))
-    return [row for _, row in rows.values()]
+    failed = [row for row in failures.values() if row["kind"] == "failure"]
+    return Stored(list(rows.values()), failed, warning)
+
+
+def _same(row: Row, other: Row) -> bool:
+    """Whether two rows of an episode agree, but for rounding; an episode that diverged magnifies
+    that without bound."""
+    if row["diverged"] or other["diverged"]:
+        return row["diverged"] == other["diverged"]
+    return all(
+        math.isclose(row[name], other[name], rel_tol=TOLERANCE, abs_tol=1e-12) for name in SCORES
+    )
 
 
 def read_all(paths: Iterable[Path]) -> list[Row]:
@@ -122,33 +220,61 @@ def read_all(paths: Iterable[Path]) -> list[Row]:
 
 
 def _encoded(row: Row) -> Row:
+    first = {"schema": row["schema"]}  # the key by which a half line is known
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in row.items()
+        for name, value in (first | row).items()
         if not (value is None and name in OPTIONAL_SCORES)
     }
 
 
-def _decoded(path: Path, number: int, line: str) -> Row:
+def _is_cut(tail: bytes) -> bool:
+    """Whether what follows the last line is the beginning of a row, but not all of it."""
+    begins = tail.startswith(_BEGINNING) or (tail and _BEGINNING.startswith(tail))
+    return bool(begins) and _parsed(tail) is None
+
+
+def _parsed(line: bytes) -> Row | None:
+    """The object that a line holds, if it holds one."""
     try:
         row = json.loads(line)
-    except json.JSONDecodeError:
-        row = None
-    if not isinstance(row, dict):
+    except ValueError:  # not JSON, or not text
+        return None
+    return row if isinstance(row, dict) else None
+
+
+_NEEDED = {
+    "score": frozenset((*KEY, *SCORES, "diverged", "ranked", "nx")),
+    "failure": frozenset((*JOB, "error", "date")),
+    "recovery": frozenset((*JOB, "date")),
+}
+"""What a row of each kind must have."""
+
+
+def _decoded(path: Path, number: int, line: bytes) -> Row:
+    row = _parsed(line)
+    if row is None:
+        shown = line[:40].decode(errors="replace")
         raise ValueError(
-            f"{path}, line {number}, is cut off or is not a row: {line[:40]!r}...; delete that "
-            f"line and run again, and only what it held is run anew"
+            f"{path}, line {number}, is cut off or is not a row: {shown!r}...; delete that line "
+            f"and run again, and only what it held is run anew"
         )
     if row.get("schema") != SCHEMA:
         raise ValueError(
             f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}: move "
             f"the file away and run again"
         )
-    missing = [name for name in (*KEY, *SCORES, "diverged", "ranked", "nx") if name not in row]
-    if missing:
-        raise ValueError(f"{path}, line {number}: a row without {', '.join(missing)}")
-    for name in SCORES:
-        row[name] = math.inf if row[name] is None else row[name]
-    for name in OPTIONAL_SCORES:
-        row[name] = math.inf if name in row and row[name] is None else row.get(name)
+    kind = row.get("kind")
+    if kind not in _NEEDED:
+        raise ValueError(
+            f"{path}, line {number}: a row of kind {kind!r}; expected {', '.join(_NEEDED)}"
+        )
+    if not _NEEDED[kind] <= row.keys():
+        missing = ", ".join(sorted(_NEEDED[kind] - row.keys()))
+        raise ValueError(f"{path}, line {number}: a row without {missing}")
+    if kind == "score":
+        for name in SCORES:
+            row[name] = math.inf if row[name] is None else row[name]
+        for name in OPTIONAL_SCORES:
+            row[name] = math.inf if name in row and row[name] is None else row.get(name)
     return row

@@ -1,5 +1,7 @@
 import json
 import multiprocessing
+import resource
+import signal
 
 import pytest
 
@@ -11,7 +13,7 @@ def row(seed=0, **changes):
     scores = dict.fromkeys(SCORES, 0.5)
     names = dict.fromkeys(rows.KEY, "x")
     facts = {"diverged": False, "episode_seed": seed, "ranked": True, "nx": 2}
-    base = {"schema": rows.SCHEMA, **names, **scores, **facts}
+    base = {"schema": rows.SCHEMA, "kind": "score", **names, **scores, **facts}
     return {**base, **changes}
 
 
@@ -47,38 +49,94 @@ def test_no_file_is_no_rows(tmp_path):
     assert rows.read(tmp_path / "none.jsonl") == []
 
 
-def test_a_truncated_line_is_named_and_the_file_kept(tmp_path):
+@pytest.mark.parametrize("cut", [1, 2, 30, 300])
+def test_a_half_line_at_the_end_is_left_out_and_cut_off_by_the_next_rows(tmp_path, cut):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(0), row(1)])
-    whole = path.read_text()
-    path.write_text(whole[:-30])
-    with pytest.raises(ValueError, match="line 2, is cut off") as caught:
+    whole = path.read_bytes()
+    assert len(whole) > 600  # the longest cut leaves the first line alone
+    path.write_bytes(whole[:-cut])
+    stored = rows.load(path)
+    kept = [0, 1] if cut == 1 else [0]  # only the line's end was missing
+    assert [r["episode_seed"] for r in stored.rows] == kept
+    assert path.read_bytes() == whole[:-cut]
+    assert ("line 2, is cut off" in stored.warning) == (cut > 1)
+    assert "\n" not in stored.warning
+    rows.append(path, [row(2), row(3)])
+    stored = rows.load(path)
+    assert [r["episode_seed"] for r in stored.rows] == [*kept, 2, 3]
+    assert stored.warning == ""
+
+
+def test_every_beginning_of_a_line_is_a_half_line(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    line = path.read_bytes()[:-1]
+    for length in range(1, len(line)):
+        path.write_bytes(line[:length])
+        assert rows.load(path) == ([], [], rows.load(path).warning)
+        rows.append(path, [row(1)])
+        assert [r["episode_seed"] for r in rows.read(path)] == [1]
+
+
+@pytest.mark.parametrize("content", ["notes of mine", "\0\0\0", "[1, 2]"])
+def test_what_is_no_row_is_named_and_never_deleted(tmp_path, content):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(content)
+    with pytest.raises(ValueError, match="line 1, is cut off or is not a row") as caught:
         rows.read(path)
     assert "\n" not in str(caught.value)
-    assert path.read_text() == whole[:-30]
+    rows.append(path, [row(0)])
+    assert path.read_text().startswith(content + "\n")
 
 
-@pytest.mark.parametrize("cut", [1, 30])
-def test_rows_appended_after_a_cut_begin_on_a_line_of_their_own(tmp_path, cut):
+def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
     path = tmp_path / "rows.jsonl"
-    rows.append(path, [row(0), row(1)])
-    path.write_text(path.read_text()[:-cut])
-    rows.append(path, [row(2), row(3)])
+    rows.append(path, [row(0), row(1), row(2)])
     lines = path.read_text().splitlines()
-    assert len(lines) == 4
-    if cut == 1:  # only the line's end was missing
-        assert [r["episode_seed"] for r in rows.read(path)] == [0, 1, 2, 3]
-    else:
-        with pytest.raises(ValueError, match="line 2, is cut off"):
-            rows.read(path)
-        path.write_text("\n".join([lines[0], *lines[2:]]) + "\n")  # as the error advises
-        assert [r["episode_seed"] for r in rows.read(path)] == [0, 2, 3]
+    path.write_text("\n".join([lines[0], lines[1][:-30], lines[2]]) + "\n")
+    with pytest.raises(ValueError, match="line 2, is cut off"):
+        rows.read(path)
+    path.write_text("\n".join([lines[0], lines[2]]) + "\n")  # as the error advises
+    assert [r["episode_seed"] for r in rows.read(path)] == [0, 2]
+
+
+def event(kind="failure", day=1, job="a", **changes):
+    names = dict.fromkeys(rows.JOB, "x") | {"job": job, "date": f"2026-01-{day:02d}"}
+    error = {"error": "out of luck"} if kind == "failure" else {}
+    return {"schema": rows.SCHEMA, "kind": kind, **names, **error, **changes}
+
+
+def test_failures_are_kept_apart_until_the_job_goes_well(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [event(job="a"), row(0), event(job="b"), event(job="a", error="again")])
+    stored = rows.load(path)
+    assert [r["episode_seed"] for r in stored.rows] == [0]
+    assert {r["job"]: r["error"] for r in stored.failures} == {"a": "again", "b": "out of luck"}
+    rows.append(path, [event("recovery", day=2)])
+    assert [r["job"] for r in rows.load(path).failures] == ["b"]
+    rows.append(path, [event(day=3)])
+    assert [r["job"] for r in rows.load(path).failures] == ["a", "b"]
+    rows.append(path, [event("dance")])
+    with pytest.raises(ValueError, match="line 7: a row of kind 'dance'; expected score"):
+        rows.load(path)
+
+
+def test_files_are_merged_by_concatenation_in_any_order(tmp_path):
+    here, there, both = (tmp_path / name for name in ("here", "there", "both"))
+    rows.append(here, [row(0), event(day=1)])
+    rows.append(there, [row(1), row(0), event("recovery", day=2)])
+    for parts in ((here, there), (there, here)):
+        both.write_bytes(b"".join(part.read_bytes() for part in parts))
+        stored = rows.load(both)
+        assert sorted(r["episode_seed"] for r in stored.rows) == [0, 1]
+        assert stored.failures == []
 
 
 def test_another_schema_and_missing_fields_are_refused(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(schema=99)])
-    with pytest.raises(ValueError, match="schema 99; expected 2: move the file"):
+    with pytest.raises(ValueError, match="schema 99; expected 3: move the file"):
         rows.read(path)
     path.unlink()
     incomplete = row()
@@ -90,10 +148,13 @@ def test_another_schema_and_missing_fields_are_refused(tmp_path):
 
 def test_equal_duplicates_count_once_and_contradictory_ones_are_an_error(tmp_path):
     path = tmp_path / "rows.jsonl"
-    rows.append(path, [row(0), row(0)])
+    rows.append(path, [row(0), row(0), row(0, nrmse=0.5 * (1 + 1e-9), date="later")])
     assert len(rows.read(path)) == 1
-    rows.append(path, [row(0, nrmse=0.7)])
-    with pytest.raises(ValueError, match="lines 1 and 3, give different scores"):
+    lost = {"diverged": True}
+    rows.append(path, [row(1, **lost, nrmse=1e30), row(1, **lost, nrmse=float("inf"))])
+    assert len(rows.read(path)) == 2
+    rows.append(path, [row(0, nrmse=0.5001)])
+    with pytest.raises(ValueError, match="lines 1 and 6, give different scores"):
         rows.read(path)
 
 
@@ -101,6 +162,25 @@ def test_an_unwritable_place_is_one_clear_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="cannot write rows to"):
         rows.append(tmp_path / "file" / "rows.jsonl", [row()])
+
+
+def test_a_full_disk_leaves_no_half_line(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 100, hard))
+    try:
+        with pytest.raises(rows.CannotWrite, match="only 100 of") as caught:
+            rows.append(path, [row(1)])
+        with pytest.raises(rows.CannotWrite, match="only 100 of"):
+            rows.append(path, [row(1)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+    assert "\n" not in str(caught.value)
+    assert path.read_bytes() == before
 
 
 def _write(path, first):
