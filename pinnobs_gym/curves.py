@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -152,7 +153,7 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
         "measured": list(curves.measured.items()),
         "example_seed": int(curves.example.seed),
     }
-    arrays = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
+    arrays: dict[str, Any] = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
     optional = {"reference": curves.reference, "std": curves.example.std}
     arrays |= {name: getattr(curves.example, name) for name in ("x", "xhat", "y")}
     arrays["example_t"] = curves.example.t
@@ -208,22 +209,23 @@ def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
     )
 
 
-def _of(about: dict[str, object], arrays: dict[str, np.ndarray]) -> Curves:
-    names = ("example_t", "x", "xhat", "y")
-    seed: object = about["example_seed"]
-    example = Example(int(str(seed)), *(arrays[name] for name in names), arrays.get("std"))
-    states: object = about["states"]
-    measured: object = about["measured"]
-    assert isinstance(states, list)
-    assert isinstance(measured, list)
+def _of(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves:
+    example = Example(
+        about["example_seed"],
+        arrays["example_t"],
+        arrays["x"],
+        arrays["xhat"],
+        arrays["y"],
+        arrays.get("std"),
+    )
     return Curves(
         arrays["t"],
         arrays["seeds"],
         arrays["error"],
         arrays.get("reference"),
         example,
-        tuple(states),
-        dict(measured),
+        tuple(about["states"]),
+        dict(about["measured"]),
     )
 
 

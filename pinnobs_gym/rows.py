@@ -187,6 +187,32 @@ def load(path: Path) -> Stored:
     return Stored(list(rows.values()), failed, warning)
 
 
+def load_all(paths: Iterable[Path]) -> Stored:
+    """What several files hold together, an episode that is in two of them once; as `load`.
+
+    Raises:
+        ValueError: in one line, as `load`, and if there is no such file, or two give different
+            scores of an episode.
+    """
+    rows: dict[tuple[Any, ...], tuple[Path, Row]] = {}
+    failures: dict[str, Row] = {}
+    warnings = []
+    for path in paths:
+        if not path.exists():
+            raise ValueError(f"there is no rows file {path}")
+        stored = load(path)
+        failures |= {row["job"]: row for row in stored.failures}
+        warnings += [stored.warning] if stored.warning else []
+        for row in stored.rows:
+            first, earlier = rows.setdefault(key(row), (path, row))
+            if first != path and not _same(earlier, row):
+                raise ValueError(
+                    f"{first} and {path} give different scores of the same episode: "
+                    f"{dict(zip(KEY, key(row), strict=True))}; leave one of them out"
+                )
+    return Stored([row for _, row in rows.values()], list(failures.values()), "; ".join(warnings))
+
+
 def _same(row: Row, other: Row) -> bool:
     """Whether two rows of an episode agree, but for rounding; an episode that diverged magnifies
     that without bound."""
@@ -195,28 +221,6 @@ def _same(row: Row, other: Row) -> bool:
     return all(
         math.isclose(row[name], other[name], rel_tol=TOLERANCE, abs_tol=1e-12) for name in SCORES
     )
-
-
-def read_all(paths: Iterable[Path]) -> list[Row]:
-    """The rows of several files, each once.
-
-    Raises:
-        ValueError: in one line, if there is no such file, and as `read` and where two files give
-            different scores of an episode.
-    """
-    found: dict[tuple[Any, ...], tuple[Path, Row]] = {}
-    for path in paths:
-        if not path.exists():
-            raise ValueError(f"there is no rows file {path}")
-        for row in read(path):
-            name = key(row)
-            first, earlier = found.setdefault(name, (path, row))
-            if any(earlier[score] != row[score] for score in (*SCORES, "diverged")):
-                raise ValueError(
-                    f"{first} and {path} give different scores of the same episode: "
-                    f"{dict(zip(KEY, name, strict=True))}"
-                )
-    return [row for _, row in found.values()]
 
 
 def _encoded(row: Row) -> Row:

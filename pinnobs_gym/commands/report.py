@@ -35,12 +35,14 @@ class Report:
             raise ValueError(
                 f"the page needs {error.name}: pip install 'pinnobs-gym[report]'"
             ) from None
-        scored = rows.read_all(self.rows)
-        if not scored:
-            raise ValueError(f"no rows in {', '.join(map(str, self.rows))}")
+        stored = rows.load_all(self.rows)
+        if stored.warning:
+            console.print(stored.warning, style="yellow", soft_wrap=True)
+        if not stored.rows:
+            raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
         check_writable(self.out)
         folders = list(dict.fromkeys(map(curves.folder_of, self.rows)))
-        text = page.build(scored, folders)
+        text = page.build(stored.rows, stored.failures, folders)
         path = self.out / "index.html"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")

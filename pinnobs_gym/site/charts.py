@@ -26,12 +26,10 @@ class Styled:
         names = list(styles)
         dashes = [list(style.dash) for style in styles.values()]
         shapes = [style.shape for style in styles.values()]
-        scale = {"domain": names}
-        self.colour = alt.Color("estimator:N", scale=alt.Scale(**scale), legend=None)
-        self.dash = alt.StrokeDash(
-            "estimator:N", scale=alt.Scale(**scale, range=dashes), legend=None
-        )
-        self.shape = alt.Shape("estimator:N", scale=alt.Scale(**scale, range=shapes), legend=None)
+        field = "estimator:N"
+        self.colour = alt.Color(field, scale=alt.Scale(domain=names), legend=None)
+        self.dash = alt.StrokeDash(field, scale=alt.Scale(domain=names, range=dashes), legend=None)
+        self.shape = alt.Shape(field, scale=alt.Scale(domain=names, range=shapes), legend=None)
 
 
 def named(data: str) -> alt.Chart:

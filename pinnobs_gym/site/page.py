@@ -30,8 +30,9 @@ SHOWN = 3
 """How many of the best online estimators are chosen at first, besides the peer."""
 
 
-def build(rows: Sequence[Row], folders: Sequence[Path]) -> str:
-    """The page of these rows, at least one, and of the curves that are in the folders."""
+def build(rows: Sequence[Row], failures: Sequence[Row], folders: Sequence[Path]) -> str:
+    """The page of these rows of scored episodes, at least one, of jobs that failed, and of the
+    curves that are in the folders."""
     lines = overview.lines(rows)
     players = data.ordered(overview.contenders(rows), lines)
     games = data.games_of(players, folders)
@@ -55,6 +56,7 @@ def build(rows: Sequence[Row], folders: Sequence[Path]) -> str:
         id=id,
         heat=[_heat(name, values) for name, values in data.conditions(rows).items()],
         methods=method.methods(players),
+        failures=failures,
         versions=method.versions(rows),
         commands=method.commands(rows),
         dates=method.dates(rows),
@@ -231,7 +233,8 @@ def _bundle() -> str:
     version = alt.SCHEMA_VERSION.removeprefix("v").rpartition(".")[0]
     if version not in vl_convert.get_vegalite_versions():
         version = vl_convert.get_vegalite_versions()[-1]
-    return vl_convert.javascript_bundle(None, vl_version=version).replace("</script", "<\\/script")
+    bundle = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", vl_version=version)
+    return bundle.replace("</script", "<\\/script")
 
 
 def _text(name: str) -> str:
