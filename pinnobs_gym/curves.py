@@ -176,7 +176,7 @@ def read(
     found: dict[tuple[str, str], list[Curves]] = {}
     for path in sorted(_place(folder, env_id, setup, condition).glob("*.npz")):
         try:
-            with np.load(path) as data:
+            with path.open("rb") as file, np.load(file) as data:
                 about = json.loads(str(data["about"]))
                 curves = _of(about, {name: data[name] for name in data.files})
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
