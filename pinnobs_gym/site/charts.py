@@ -15,6 +15,8 @@ Spec = dict[str, Any]
 """A chart in Vega-Lite."""
 SHOWN = "indexof(shown, datum.estimator) >= 0"
 """Whether the reader has chosen the estimator."""
+PLAIN = ".3~r"
+"""How ticks are written: without exponents."""
 HUGE = 1e9
 """Stands for infinity, beyond every axis."""
 
@@ -37,7 +39,7 @@ def named(data: str) -> alt.Chart:
     return alt.Chart(alt.NamedData(name=data))
 
 
-def finished(*layers: Any, height: Any, **params: Any) -> Spec:
+def finished(*layers: Any, height: int, **params: Any) -> Spec:
     """Layers as one chart as wide as its place; ``params`` can be set by the page."""
     fit = alt.AutoSizeParams(type="fit-x", contains="padding")
     chart = alt.layer(*layers).properties(width="container", height=height, autosize=fit)
@@ -52,14 +54,14 @@ def log_scale(low: float, high: float) -> alt.Scale:
     return alt.Scale(type="log", domain=[low, high], clamp=True, nice=False)
 
 
-def log_axis(low: float, high: float, **more: Any) -> alt.Axis:
+def log_axis(low: float, high: float) -> alt.Axis:
     """Ticks at 1, 2, 5, 10, ...; over many decades at powers of ten."""
     decades = np.log10(high / low)
     parts = (1, 2, 5) if decades < 1.6 else (1, 3) if decades < 3 else (1,)
     first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
     ticks = [float(f"{part}e{power}") for power in range(first, last + 1) for part in parts]
     inside = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-    return alt.Axis(values=inside, format="~g", labelOverlap=True, **more)
+    return alt.Axis(values=inside, format=PLAIN, labelOverlap=True)
 
 
 def time_of(end: float) -> alt.X:
@@ -70,7 +72,7 @@ def time_of(end: float) -> alt.X:
     values = [0.0, *(tick for tick in ticks if end / 200 <= tick <= 1.02 * end)]
     end = max(end, values[-1])
     scale = alt.Scale(type="symlog", constant=end / 200, domain=[0, end], nice=False)
-    axis = alt.Axis(values=values, format="~g", labelOverlap="greedy", labelFlush=True)
+    axis = alt.Axis(values=values, format=PLAIN, labelOverlap="greedy", labelFlush=True)
     return alt.X("t:Q", scale=scale, axis=axis, title="t (s)")
 
 

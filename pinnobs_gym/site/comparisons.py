@@ -52,7 +52,7 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
         level(scale, vertical=True),
         base.mark_rule(strokeWidth=2).encode(x=alt.X("low:Q", scale=scale), x2="upper:Q"),
         base.mark_point(filled=True, size=70, opacity=1).encode(x=x, shape=styled.shape),
-        height={"step": STEP},
+        height=STEP * len(order),
     )
 
 
@@ -81,7 +81,7 @@ def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spe
         base.transform_filter("isValid(datum.median)")
         .mark_tick(style="middle")
         .encode(x=alt.X("median:Q", scale=scale, axis=axis, title=title)),
-        height={"step": STEP},
+        height=STEP * len(order),
     )
 
 

@@ -45,7 +45,7 @@ def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
         base.transform_filter(f"!({SHOWN})")
         .mark_line(style="others", clip=True)
         .encode(detail="estimator:N"),
-        chosen.mark_area(opacity=0.13, clip=True).encode(
+        chosen.mark_area(opacity=0.11, clip=True).encode(
             y=alt.Y("low:Q", scale=scale), y2="high:Q", color=styled.colour
         ),
         chosen.mark_line(clip=True).encode(color=styled.colour, strokeDash=styled.dash),

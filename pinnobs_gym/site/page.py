@@ -112,7 +112,7 @@ class Drawings:
             ),
         }
         self._data["across"]["standings"] = _packed(standings)
-        self._add("factors", "across", comparisons.factors(self._styled, names, *up), len(names))
+        self._add("factors", "across", comparisons.factors(self._styled, names, *up))
         titles = {"us": "CPU time per step and episode (µs)", "seconds": "CPU time of training (s)"}
         for field, title in titles.items():
             known = [value for value in standings[field] if value]
@@ -142,7 +142,7 @@ class Drawings:
             seen = [*game.ratios["q10"], *game.ratios["q90"]]
             low, high = nice_range(seen, 0.01, 100.0)
             spec = comparisons.ratios(self._styled, order, min(low, 0.8), max(high, 2.0))
-            self._add(f"ratios{number}", key, spec, len(order))
+            self._add(f"ratios{number}", key, spec)
         if game.states is not None:
             for i, name in enumerate(game.states.names):
                 measured = f"y{i}" in game.states.truth
@@ -150,10 +150,9 @@ class Drawings:
                 spec = over_time.state(self._styled, i, name, end, limits, measured)
                 self._add(f"state{number}-{i}", key, spec)
 
-    def _add(self, name: str, key: str, spec: Spec, lines: int | None = None) -> None:
+    def _add(self, name: str, key: str, spec: Spec) -> None:
         """A chart, and how high it will be, so that nothing moves when it is drawn."""
-        inner = comparisons.STEP * lines if lines is not None else spec["height"]
-        self.charts[name] = {"spec": spec, "data": key, "height": inner + 48}
+        self.charts[name] = {"spec": spec, "data": key, "height": spec["height"] + 48}
 
 
 def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Sequence[bool]) -> list[bool]:
