@@ -123,7 +123,7 @@ def _write(descriptor: int, data: bytes) -> None:
 
 
 def _last_line(descriptor: int, size: int) -> tuple[int, bytes]:
-    """Where the last line begins and what it holds, if it does not end; else the end, and nothing."""
+    """Where the last line begins and what it holds, if it does not end; else the file's end."""
     begin, tail = size, b""
     while begin > 0:
         step = min(begin, 1 << 16 if tail else 1)  # most files end as they should

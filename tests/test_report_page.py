@@ -201,7 +201,7 @@ def test_all_charts_are_drawn_and_filled(opened):
     for name, full, width, height in charts:
         assert full, name
         assert width > 300, name
-        assert height > 70, name
+        assert height > 60, name
 
 
 def column(page, table, i):

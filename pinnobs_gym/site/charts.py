@@ -41,11 +41,10 @@ def named(data: str) -> alt.Chart:
 
 def finished(*layers: Any, height: int, **params: Any) -> Spec:
     """Layers as one chart as wide as its place; ``params`` can be set by the page."""
-    fit = alt.AutoSizeParams(type="fit-x", contains="padding")
-    chart = alt.layer(*layers).properties(width="container", height=height, autosize=fit)
-    chart = chart.add_params(*(alt.param(name=name, value=v) for name, v in params.items()))
-    spec = chart.to_dict(validate=False)  # the tests do that; it takes most of the time
+    spec = alt.layer(*layers).to_dict(validate=False)  # the tests do that; it takes long
     spec.pop("config", None)
+    own = [{"name": name, "value": value} for name, value in params.items()]
+    spec |= {"width": "container", "height": height, "params": own}
     return spec
 
 

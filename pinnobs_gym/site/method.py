@@ -74,7 +74,7 @@ def dates(rows: Sequence[Row]) -> str:
 def versions(rows: Iterable[Row]) -> dict[str, str]:
     """The versions of each package that rows were made with."""
     found: dict[str, set[str]] = {}
-    for versions in {tuple(sorted(row["versions"].items())) for row in rows}:
+    for versions in {tuple(row["versions"].items()) for row in rows}:
         for name, version in versions:
             found.setdefault(name, set()).add(version)
     return {name: ", ".join(sorted(those)) for name, those in sorted(found.items())}

@@ -101,8 +101,7 @@ class Drawings:
         if not names:
             return
         self._data["across"] = {"standings": _packed(standings), "one": {"at": [1]}}
-        everything = [standings[part] for part in ("ratio", "low", "high")]
-        up = nice_range(list(chain(*everything)), 0.02, 50.0)
+        up = _range_of(standings, [True] * len(names))
         standings = standings | {
             "named_us": _apart(standings["us"], standings["ratio"], standings["front"]),
             "named_seconds": _apart(
@@ -118,6 +117,7 @@ class Drawings:
             known = [value for value in standings[field] if value]
             if known:
                 across = min(known) / 1.6, max(known) * 4
+                up = _range_of(standings, [value is not None for value in standings[field]])
                 spec = comparisons.cost(self._styled, field, title, across, up)
                 self._add(field, "across", spec)
 
@@ -153,6 +153,13 @@ class Drawings:
     def _add(self, name: str, key: str, spec: Spec) -> None:
         """A chart, and how high it will be, so that nothing moves when it is drawn."""
         self.charts[name] = {"spec": spec, "data": key, "height": spec["height"] + 48}
+
+
+def _range_of(standings: Columns, wanted: Sequence[bool]) -> tuple[float, float]:
+    """What an axis of factors shows of those wanted: their intervals, and 1."""
+    parts = [standings[part] for part in ("ratio", "low", "high")]
+    seen = [value for part in parts for value, want in zip(part, wanted, strict=True) if want]
+    return nice_range([1.0, *seen], 0.02, 50.0)
 
 
 def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Sequence[bool]) -> list[bool]:
