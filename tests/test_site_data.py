@@ -7,7 +7,7 @@ from pinnobs_gym import overview
 from pinnobs_gym.curves import Curves, Example
 from pinnobs_gym.intervals import Interval
 from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
-from pinnobs_gym.site import data, method, palette
+from pinnobs_gym.site import across, data, method, palette
 
 
 def row(seed=0, **changes):
@@ -120,7 +120,7 @@ def test_standings_are_those_of_the_overview_with_the_cost_of_training():
         line("alone", None, 1.0),
         line("late", 3.0, 9.0, "offline"),
     ]
-    table = data.standings(lines, {"kkl": {"A": trained}, "ekf": {"A": [row()]}})
+    table = across.standings(lines, {"kkl": {"A": trained}, "ekf": {"A": [row()]}})
     assert table["estimator"] == ["kkl", "ekf", "slow", "late"]
     assert table["seconds"] == [2.0, None, None, None]
     assert table["ratio"] == [0.5, 1.0, 1.1, 3.0]
@@ -136,12 +136,12 @@ def test_conditions_compare_with_the_peer_on_the_same_episodes():
         for seed in range(4)
         for name, nrmse in (("ekf", 0.1), ("ukf", 0.05 if condition == "nominal" else 0.4))
     ]
-    found = data.conditions(both)
+    found = across.conditions(both)
     assert list(found) == ["all systems", "A-v0", "B-v0"]
     for values in found.values():
         assert values["nominal"] == {"ekf": 0.0, "ukf": pytest.approx(np.log(0.5))}
         assert values["noise5"]["ukf"] == pytest.approx(np.log(4))
-    assert data.conditions([r for r in both if r["condition"] == "nominal"]) == {}
+    assert across.conditions([r for r in both if r["condition"] == "nominal"]) == {}
 
 
 def test_games_are_the_ranked_one_and_then_the_nominal_one():

@@ -54,9 +54,11 @@ def log_scale(low: float, high: float) -> alt.Scale:
 
 
 def log_axis(low: float, high: float) -> alt.Axis:
-    """Ticks at 1, 2, 5, 10, ...; over many decades at powers of ten."""
+    """Ticks at 1, 2, 5, 10, ...; more within less than a decade, powers of ten over many."""
     decades = np.log10(high / low)
-    parts = (1, 2, 5) if decades < 1.6 else (1, 3) if decades < 3 else (1,)
+    parts: tuple[float, ...] = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if decades < 0.8 else (1, 2, 5)
+    if decades >= 1.6:
+        parts = (1, 3) if decades < 3 else (1,)
     first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
     ticks = [float(f"{part}e{power}") for power in range(first, last + 1) for part in parts]
     inside = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]

@@ -1,4 +1,4 @@
-"""The numbers that the page shows, from stored rows and curves."""
+"""The numbers that the page shows of each game, from stored rows and curves."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def settling(players: Players) -> Columns:
         final = shares[-1] if len(shares) else 0.0
         if not len(ends) or ends[0] > 0:
             ends, shares = np.insert(ends, 0, 0.0), np.insert(shares, 0, 0.0)
-        _extend(
+        extend(
             table,
             estimator=[name] * (len(ends) + 1),
             t=[*ends.tolist(), last],
@@ -168,9 +168,9 @@ def ratios(players: Players) -> Columns:
             found.append((float(np.median(values)), name, _quantiles(values[:, None])[:, 0]))
     found.sort(key=lambda line: line[0])
     table: Columns = {"estimator": [name for _, name, _ in found]}
-    table["median"] = [_number(median) for median, _, _ in found]
+    table["median"] = [number(median) for median, _, _ in found]
     for i, q in enumerate(QUANTILES):
-        table[f"q{100 * q:.0f}"] = [_number(values[i]) for _, _, values in found]
+        table[f"q{100 * q:.0f}"] = [number(values[i]) for _, _, values in found]
     return table
 
 
@@ -182,13 +182,13 @@ def errors(found: Mapping[str, Curves]) -> Columns:
         k = k[~np.isnan(own.error[:, k]).all(axis=0)]
         error = own.error[:, k].astype(float)
         quantiles = _quantiles(error)
-        _extend(
+        extend(
             table,
             estimator=[name] * len(k),
-            t=_numbers(own.t[k]),
-            median=_numbers(_median(error)),
-            q10=_numbers(quantiles[0]),
-            q90=_numbers(quantiles[-1]),
+            t=numbers(own.t[k]),
+            median=numbers(_median(error)),
+            q10=numbers(quantiles[0]),
+            q90=numbers(quantiles[-1]),
         )
     return table
 
@@ -208,7 +208,7 @@ def reference(found: Iterable[Curves]) -> Columns:
     k = curves.kept(len(t), POINTS)
     lines = np.stack(list(episodes.values()))[:, k].astype(float)
     some = ~np.isnan(lines).all(axis=0)
-    return {"t": _numbers(t[k][some]), "median": _numbers(_median(lines[:, some]))}
+    return {"t": numbers(t[k][some]), "median": numbers(_median(lines[:, some]))}
 
 
 def states(found: Mapping[str, Curves]) -> States | None:
@@ -220,66 +220,19 @@ def states(found: Mapping[str, Curves]) -> States | None:
     shown = {name: own for name, own in found.items() if own.example.seed == seed}
     first = next(iter(shown.values()))
     x, y = first.example.x, first.example.y
-    truth: Columns = {"t": _numbers(first.example.t)}
-    truth |= {f"x{i}": _numbers(x[:, i]) for i in range(x.shape[1])}
-    truth |= {f"y{i}": _numbers(y[:, output]) for i, output in first.measured.items()}
+    truth: Columns = {"t": numbers(first.example.t)}
+    truth |= {f"x{i}": numbers(x[:, i]) for i in range(x.shape[1])}
+    truth |= {f"y{i}": numbers(y[:, output]) for i, output in first.measured.items()}
     table: Columns = {"estimator": [], "t": []}
     table |= {f"{part}{i}": [] for i in range(x.shape[1]) for part in ("m", "s")}
     for name, own in shown.items():
         t, mean, std = own.example.t, own.example.xhat, own.example.std
         parts = {"m": mean, "s": np.full(mean.shape, np.nan) if std is None else 2 * std}
-        new = {f"{p}{i}": _numbers(v[:, i]) for p, v in parts.items() for i in range(x.shape[1])}
-        _extend(table, estimator=[name] * len(t), t=_numbers(t), **new)
+        new = {f"{p}{i}": numbers(v[:, i]) for p, v in parts.items() for i in range(x.shape[1])}
+        extend(table, estimator=[name] * len(t), t=numbers(t), **new)
     return States(
         seed, first.states, tuple(_limits(x[:, i]) for i in range(x.shape[1])), truth, table
     )
-
-
-def standings(lines: Sequence[overview.Line], players: Mapping[str, Any]) -> Columns:
-    """Each line of the overview: its factor to the peer with the interval, its µs per step, and the
-    CPU seconds that training took, a gap for those that are not trained. ``front`` is true of
-    those that no other of their track beats in both accuracy and speed. Lines whose factor is not
-    finite are left out."""
-    table: Columns = {name: [] for name in ("estimator", "track", "ratio", "low", "high", "us")}
-    table |= {"seconds": [], "front": []}
-    for line in lines:
-        if line.ratio is None or not np.isfinite(line.ratio.value):
-            continue
-        groups = players.get(line.estimator, {}).values()
-        spent = [row["training"].get("seconds") for group in groups for row in group]
-        known = [seconds for seconds in spent if seconds is not None]
-        _extend(
-            table,
-            estimator=[line.estimator],
-            track=[line.track],
-            ratio=[_number(line.ratio.value)],
-            low=[_number(line.ratio.low)],
-            high=[_number(line.ratio.high)],
-            us=[_number(line.us_per_step)],
-            seconds=[_number(float(np.median(known))) if known else None],
-            front=[not any(_beats(other, line) for other in lines)],
-        )
-    return table
-
-
-def _beats(other: overview.Line, line: overview.Line) -> bool:
-    """Whether the other is both faster and more accurate."""
-    if other.ratio is None or line.ratio is None or other.track != line.track:
-        return False
-    faster = other.us_per_step < line.us_per_step
-    return faster and other.ratio.value < line.ratio.value
-
-
-def conditions(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """`overview.log_ratios` of all systems together, under the name "all systems", and of each; of
-    those that were played under several conditions."""
-    online = [row for row in rows if row["track"] == "online"]
-    systems: dict[str, list[Row]] = defaultdict(list)
-    for row in online:
-        systems[row["env_id"].removeprefix("pinnobs/")].append(row)
-    every = {"all systems": online} | (dict(sorted(systems.items())) if len(systems) > 1 else {})
-    found = {name: overview.log_ratios(some) for name, some in every.items()}
-    return {name: values for name, values in found.items() if len(values) > 1}
 
 
 def _limits(x: np.ndarray) -> tuple[float, float]:
@@ -307,15 +260,17 @@ def _sorted(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.sort(values, axis=0), (~np.isnan(values)).sum(axis=0)
 
 
-def _extend(table: Columns, **new: list[Any]) -> None:
+def extend(table: Columns, **new: list[Any]) -> None:
+    """Add to the columns of a table."""
     for name, values in new.items():
         table[name] += values
 
 
-def _numbers(values: np.ndarray) -> list[float | None]:
-    return [_number(value) for value in np.asarray(values, dtype=float).tolist()]
+def numbers(values: np.ndarray) -> list[float | None]:
+    """Each as `number` gives it."""
+    return [number(value) for value in np.asarray(values, dtype=float).tolist()]
 
 
-def _number(value: float) -> float | None:
+def number(value: float) -> float | None:
     """Four significant digits; what is not finite is a gap."""
     return float(f"{value:.4g}") if np.isfinite(value) else None
