@@ -7,6 +7,7 @@ export OMP_NUM_THREADS ?= 1
 
 leaderboard: $(VENV)/installed
 	$(BIN)/python scripts/leaderboard.py
+	$(BIN)/pinnobs report runs/leaderboard/rows.jsonl -o runs/leaderboard/site
 
 test: $(VENV)/installed-dev
 	$(BIN)/pytest -n 2
@@ -28,7 +29,7 @@ $(VENV)/bin/python:
 
 $(VENV)/installed: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch>=2.8,<2.14"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[report]"
 	touch $@
 
 $(VENV)/installed-dev: pyproject.toml | $(VENV)/installed

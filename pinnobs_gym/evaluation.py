@@ -21,13 +21,14 @@ from pinnobs_gym import rows as rows_module
 from pinnobs_gym.bound import cramer_rao, expected_scores, step_error
 from pinnobs_gym.conditions import canonical_name
 from pinnobs_gym.consistency import consistency
+from pinnobs_gym.curves import Curves, Example, curves_of, folder_of, save
 from pinnobs_gym.env import EstimationVectorEnv
 from pinnobs_gym.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimator import Estimates, Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.figures import state_figure
 from pinnobs_gym.log import SILENT, Log
-from pinnobs_gym.metrics import OPTIONAL_SCORES, score
+from pinnobs_gym.metrics import OPTIONAL_SCORES, by_sample, score
 from pinnobs_gym.rows import SCHEMA, Row
 from pinnobs_gym.system import System, vector
 
@@ -83,7 +84,7 @@ def evaluate(
             ``noise5+dropout10``.
         options: settings of an estimator that is made here.
         results: a rows file to append to, in whole batches; episodes already in it are not run
-            again, and their rows are taken from it.
+            again, and their rows are taken from it. Curves for pictures go to a folder beside it.
         log: where scalars, figures and hyperparameters go for TensorBoard.
         progress: called with the number of episodes done.
 
@@ -139,12 +140,14 @@ def run_episodes(
     example = None
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
-        now = [row["episode_seed"] for row in batch]
-        scored, first_played = score_batch(made, env_id, setup, condition, now)
+        seeds_now = [row["episode_seed"] for row in batch]
+        scored, first_played, curves = play_batch(made, env_id, setup, condition, seeds_now)
         if example is None:
-            example = {"seed": now[0], **first_played}
+            example = {"seed": seeds_now[0], **first_played}
         done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
         if results is not None:
+            # Curves first: episodes that have rows are not run again.
+            save(folder_of(results.path), done[0], curves)
             rows_module.append(results.path, done, new=made.trains_on_record is not None)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
@@ -218,6 +221,19 @@ def score_batch(
 ) -> tuple[list[Row], dict[str, Any]]:
     """The scores of the episodes of these seeds, and the first of them for a picture; the env is
     made with the changes and reset with the options."""
+    return play_batch(estimator, env_id, setup, condition, seeds, reset_options, **changes)[:2]
+
+
+def play_batch(
+    estimator: Estimator,
+    env_id: str,
+    setup: str,
+    condition: str,
+    seeds: list[int],
+    reset_options: dict[str, Any] | None = None,
+    **changes: Any,
+) -> tuple[list[Row], dict[str, Any], Curves]:
+    """What `score_batch` returns, and the curves of all episodes."""
     env = make_vector_env(env_id, len(seeds), setup, condition, **changes)
     _, infos = env.reset(seed=seeds, options=reset_options)
     record = env.record()
@@ -240,6 +256,7 @@ def score_batch(
         alternatives=system.indistinguishable(x),
     )
     optional = consistency(x, estimates, np.isnan(record.y))
+    reference = None
     if reset_options is None and not changes:
         reference = _reference(type(system), setup, condition, tuple(seeds))
         for name, whole in (("reference_ratio", "nrmse"), ("reference_ratio_tail", "nrmse_tail")):
@@ -254,17 +271,26 @@ def score_batch(
     ]
     P = None if estimates.P is None else estimates.P[0]
     example = {"t": record.t, "xhat": xhat[0], "x": x[0], "y": record.y[0], "P": P}
-    return rows, example
+    std = None if P is None else np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0))
+    curves = curves_of(
+        system,
+        seeds,
+        record.t,
+        by_sample(xhat - x, system.scale, system.observable(x)),
+        None if reference is None else reference["by_sample"],
+        Example(seeds[0], record.t, x[0], xhat[0], record.y[0], std),
+    )
+    return rows, example, curves
 
 
 @lru_cache(maxsize=8)
 def _reference(
     system: type[System], setup: str, condition: str, seeds: tuple[int, ...]
 ) -> dict[str, np.ndarray] | None:
-    """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each;
-    None where there is none: without noise, from a fixed initial state, or under a condition that
-    is not in the model (`Condition.reference`). NaN where it is below what a single step of the
-    model errs by."""
+    """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each, NaN
+    where it is below what a single step of the model errs by; and as ``by_sample`` what is expected
+    of each sample, (batch, num_samples). None where there is none: without noise, from a fixed
+    initial state, or under a condition that is not in the model (`Condition.reference`)."""
     source = EpisodeSource(system, setup, condition)
     std = vector(source.setup.noise_std, source.system.ny, "noise_std")
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
@@ -281,7 +307,8 @@ def _reference(
         error = step_error(source.system, record.t, x)
         floor = expected_scores(error[..., None] * error[..., None, :], *counted)
         expected = {n: np.where(v > floor[n], v, np.nan) for n, v in expected.items()}
-    return expected
+    std = np.sqrt(np.einsum("bkii->bki", P))
+    return expected | {"by_sample": by_sample(std, *counted)}
 
 
 def _number_of(values: np.ndarray | None, row: int) -> float | None:

@@ -40,7 +40,7 @@ def state_figure(
 
     figure = Figure(figsize=(8, 1.0 + 1.6 * system.nx), layout="constrained")
     panels = figure.subplots(system.nx, 1, sharex=True, squeeze=False)[:, 0]
-    measured = _measured_states(system)
+    measured = measured_states(system)
     for i, (panel, name) in enumerate(zip(panels, system.state_names, strict=True)):
         unit = system.units.get(name)
         panel.set_ylabel(f"{name} ({unit})" if unit else name)
@@ -65,7 +65,7 @@ def state_figure(
     return figure
 
 
-def _measured_states(system: System) -> dict[int, int]:
+def measured_states(system: System) -> dict[int, int]:
     """The states that are measured alone, each with the index of the output that does so."""
     H = system.h_jacobian(vector(system.setups["benchmark"].xhat0, system.nx, "xhat0"))
     return {
@@ -141,7 +141,7 @@ class EpisodePicture:
         figure.set_dpi(80)
         self._canvas = FigureCanvasAgg(figure)
         self._lines, self._dots = [], []
-        measured = _measured_states(self._system)
+        measured = measured_states(self._system)
         for state, panel in enumerate(figure.axes):
             panel.set_xlim(self._times[0], self._times[-1])
             for line in panel.lines:

@@ -103,6 +103,24 @@ def score(
     return scores
 
 
+def by_sample(
+    error: np.ndarray, scale: Sequence[float], scored: np.ndarray | None = None
+) -> np.ndarray:
+    """The NRMSE of each sample, shape (batch, num_samples), of errors (batch, num_samples, nx);
+    not a number where none of them counts.
+
+    Args:
+        error: x̂ − x, or the standard deviation of that.
+        scale: what it is divided by, one number per state.
+        scored: which of it counts, bool, shape of error; all if None.
+    """
+    counts = np.ones(error.shape, dtype=bool) if scored is None else scored
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is infinite
+        total, number = _sums(error, scale, counts)
+        mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+    return np.sqrt(mean)
+
+
 def _sums(
     error: np.ndarray, scale: Sequence[float], counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

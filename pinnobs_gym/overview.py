@@ -53,13 +53,13 @@ class Line:
 def lines(rows: Iterable[Row]) -> list[Line]:
     """Every estimator on the systems under the conditions that these are ranked under, best first,
     online before offline."""
-    contenders = _contenders(row for row in rows if row["ranked"])
-    peer = contenders.get(PEER, {})
-    found = []
-    for name, games in contenders.items():
+    found = contenders(row for row in rows if row["ranked"])
+    peer = found.get(PEER, {})
+    result = []
+    for name, games in found.items():
         standings = {game: standing(group) for game, group in games.items()}
         strata = _strata(games, peer)
-        found.append(
+        result.append(
             Line(
                 estimator=name,
                 track=next(iter(games.values()))[0]["track"],
@@ -69,14 +69,25 @@ def lines(rows: Iterable[Row]) -> list[Line]:
                 us_per_step=float(np.median([s.us_per_step for s in standings.values()])),
             )
         )
-    return sorted(found, key=lambda line: line.place)
+    return sorted(result, key=lambda line: line.place)
 
 
 def ranks(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
-    """Each online estimator's rank under every condition, by the interquartile mean of
-    log(NRMSE/NRMSE of the `PEER`) over all systems and episodes; of those alone that played every
-    system that the peer did. By condition, in the order in which these are listed, and estimator.
-    """
+    """Each online estimator's rank under every condition, by `log_ratios`; by condition and
+    estimator."""
+    return {
+        condition: {
+            name: 1 + sum(other < value for other in values.values())
+            for name, value in values.items()
+        }
+        for condition, values in log_ratios(rows).items()
+    }
+
+
+def log_ratios(rows: Iterable[Row]) -> dict[str, dict[str, float]]:
+    """Each online estimator's interquartile mean of log(NRMSE/NRMSE of the `PEER`) over all systems
+    and episodes under every condition; of those alone that played every system that the peer did.
+    By condition, in the order in which these are listed, and estimator."""
     online: dict[str, list[Row]] = defaultdict(list)
     for row in rows:
         if row["track"] == "online":
@@ -84,26 +95,23 @@ def ranks(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
     order = list(CONDITIONS)
     found = {}
     for condition in sorted(online, key=lambda c: (order.index(c) if c in order else 99, c)):
-        contenders = _contenders(online[condition])
-        peer = contenders.get(PEER, {})
+        players = contenders(online[condition])
+        peer = players.get(PEER, {})
         values = {}
-        for name, games in contenders.items():
+        for name, games in players.items():
             strata = _strata(games, peer)
             if strata and len(strata) == len(peer):
                 value = float(interquartile_mean(np.concatenate([s.ravel() for s in strata])))
                 values[name] = np.inf if np.isnan(value) else value
         if values:
-            found[condition] = {
-                name: 1 + sum(other < value for other in values.values())
-                for name, value in values.items()
-            }
+            found[condition] = values
     return found
 
 
-def _contenders(rows: Iterable[Row]) -> dict[str, dict[str, list[Row]]]:
-    """Rows by the name of their estimator, and by what is played. Training seeds are of one name;
-    budgets of training are in it, and settings where they tell two of a name apart: all but those
-    that the most rows are of."""
+def contenders(rows: Iterable[Row]) -> dict[str, dict[str, list[Row]]]:
+    """Estimators as the lines of the overview tell them apart: rows by the name of their estimator,
+    and by what is played. Training seeds are of one name; budgets of training are in it, and
+    settings where they tell two of a name apart: all but those that the most rows are of."""
     groups: dict[tuple[str, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         budget = row["training"].get("config", {}).get("budget")

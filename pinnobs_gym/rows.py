@@ -220,6 +220,32 @@ def _parsed_together(lines: list[bytes]) -> list[Any] | None:
     return parsed if whole else None
 
 
+def load_all(paths: Iterable[Path]) -> Stored:
+    """What several files hold together, an episode that is in two of them once; as `load`.
+
+    Raises:
+        ValueError: in one line, as `load`, and if there is no such file, or two give different
+            scores of an episode.
+    """
+    rows: dict[tuple[Any, ...], tuple[Path, Row]] = {}
+    failures: dict[str, Row] = {}
+    warnings = []
+    for path in paths:
+        if not path.exists():
+            raise ValueError(f"there is no rows file {path}")
+        stored = load(path)
+        failures |= {row["job"]: row for row in stored.failures}
+        warnings += [stored.warning] if stored.warning else []
+        for row in stored.rows:
+            first, earlier = rows.setdefault(key(row), (path, row))
+            if first != path and not _same(earlier, row):
+                raise ValueError(
+                    f"{first} and {path} give different scores of the same episode: "
+                    f"{dict(zip(KEY, key(row), strict=True))}; leave one of them out"
+                )
+    return Stored([row for _, row in rows.values()], list(failures.values()), "; ".join(warnings))
+
+
 def _same(row: Row, other: Row) -> bool:
     """Whether two rows of an episode agree, but for rounding; an episode that diverged magnifies
     that without bound."""

@@ -24,6 +24,8 @@ ALLOWED = {
     "systems": {"system", "registry"},
     "actions": {"estimator", "kalman", "simulate", "system"},
     "bound": {"kalman", "metrics", "record", "simulate", "system"},
+    "curves": {"figures", "report", "rows", "system"},
+    "site": {"conditions", "curves", "leaderboard", "overview", "rows", "site", "systems"},
     "consistency": {"estimator", "kalman"},
     "kalman": {"estimator", "record", "simulate", "system"},
     "gains": {"simulate", "system"},

@@ -12,6 +12,7 @@ from pinnobs_gym.console import console, print_table, progress
 from pinnobs_gym.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.evaluation import (
+    Results,
     log_episodes,
     log_summary,
     make_vector_env,
@@ -94,7 +95,7 @@ class Evaluate:
                 bar.advance(task, done)
 
             scored, made, example = run_episodes(
-                estimator, name, seeds, *game, options, self._rows, told
+                estimator, name, seeds, *game, options, Results(self._rows), told
             )
             bar.update(task, completed=episodes)
         with Log(suite.log_folder(self.out, scored[0])) as log:

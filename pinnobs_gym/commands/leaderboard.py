@@ -131,6 +131,10 @@ class Leaderboard:
         ):
             if where.exists():
                 console.print(f"{what + ':':14} {where}", soft_wrap=True)
+        console.print(
+            f"to make a page: pinnobs report {self.out / 'rows.jsonl'} -o {self.out / 'site'}",
+            soft_wrap=True,
+        )
 
 
 def run(arguments: Sequence[str]) -> int:
