@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from pinnobs_gym.agent_side import AgentSide
-from pinnobs_gym.episodes import Changes, Draws, Episodes, EpisodeSource, Stream
+from pinnobs_gym.episodes import Ahead, Changes, Draws, Episodes, EpisodeSource, Stream
 from pinnobs_gym.figures import EpisodePicture
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.system import System
@@ -214,6 +214,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._any_over = False
         self._together = True
         self._streams: list[Stream] = []
+        self._ahead = Ahead(self.source, num_envs)
         self._episodes: Episodes | None = None
         self._noise: np.ndarray | None = None
         self._prior = Prior.of(self.source.system, self.source.setup, num_envs)
@@ -328,6 +329,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if not self._streams:
             self._streams = [Stream(np.random.SeedSequence(s)) for s in seeds]
         elif seed is not None:
+            self._ahead.forget(rows.tolist())
             for row in rows:
                 self._streams[row] = Stream(np.random.SeedSequence(seeds[row]))
 
@@ -341,16 +343,17 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     def _begin(self, rows: np.ndarray, xhat0: np.ndarray, x0: np.ndarray | None = None) -> None:
         """Begin the next episode of these rows, from prior means (len(rows), nx)."""
         self._prior.mean[rows] = xhat0
-        # Arrays of this size are slow to allocate: those of the episodes that are over serve again.
-        everything = len(rows) == self.num_envs
-        draws = self.source.draw(
-            [self._streams[row] for row in rows], self._noise if everything else None
-        )
-        self._noise = draws.noise if everything else self._noise
-        new = self.source.play(draws, x0, self._episodes if everything else None)
-        if everything:
-            self._episodes = new
+        chosen = rows.tolist()
+        if len(rows) == self.num_envs and not self._ahead.any(chosen):
+            # Arrays of this size are slow to allocate: those of episodes that are over serve again.
+            draws = self.source.draw(self._streams, self._noise)
+            self._noise = draws.noise
+            self._episodes = self.source.play(draws, x0, self._episodes)
         else:
+            if x0 is None:
+                new = self._ahead.take(chosen, self._streams)
+            else:
+                new = self.source.play(self._ahead.draw(chosen, self._streams), x0)
             for name in ("x", "y", "observations"):
                 getattr(self._playing, name)[:, rows] = getattr(new, name)
         self._k[rows] = 0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import islice
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -18,6 +19,9 @@ _DRAWS = 64
 """Initial states drawn at a time."""
 _ATTEMPTS = 1000
 """Such draws without an admissible state before the initial set is taken to be empty."""
+
+_BLOCK = 64
+"""Episodes simulated at a time where rows begin anew one by one."""
 
 
 class Changes(TypedDict, total=False):
@@ -59,6 +63,10 @@ class Episodes:
     """Outputs as measured, shape (num_steps + 1, batch, ny)."""
     observations: np.ndarray
     """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
+
+    def row(self, i: int) -> Episodes:
+        """One of them."""
+        return Episodes(*(getattr(self, f.name)[:, i : i + 1] for f in fields(self)))
 
 
 class EpisodeSource:
@@ -166,6 +174,60 @@ class EpisodeSource:
         u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
         prior = Prior.of(self.system, self.setup, batch, xhat0)
         return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
+
+
+class Ahead:
+    """The next episode of each row of an env, simulated before it is played.
+
+    Many episodes take little longer than one: where a row begins anew by itself, those that others
+    need next are simulated with it.
+
+    Args:
+        source: of the episodes.
+        rows: how many rows there are.
+    """
+
+    def __init__(self, source: EpisodeSource, rows: int) -> None:
+        self._source = source
+        self._waiting: dict[int, tuple[Draws, Episodes]] = {}
+        self._rows = range(rows)
+
+    def forget(self, rows: Iterable[int]) -> None:
+        """Drop what waits for these rows, whose streams are others now."""
+        for row in rows:
+            self._waiting.pop(row, None)
+
+    def any(self, rows: Iterable[int]) -> bool:
+        """Whether an episode waits for one of these rows."""
+        return any(row in self._waiting for row in rows)
+
+    def draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
+        """What chance decides in the next episodes of these rows, waiting or not."""
+        drawn = []
+        for row in rows:
+            waiting = self._waiting.pop(row, None)
+            drawn.append(self._source.draw([streams[row]]) if waiting is None else waiting[0])
+        seeds = tuple(seed for draws in drawn for seed in draws.seeds)
+        x0 = np.concatenate([draws.x0 for draws in drawn])
+        return Draws(x0, np.concatenate([draws.noise for draws in drawn]), seeds)
+
+    def take(self, rows: Sequence[int], streams: Sequence[Stream]) -> Episodes:
+        """The next episodes of these rows."""
+        missing = [row for row in rows if row not in self._waiting]
+        if missing:
+            others = (row for row in self._rows if row not in self._waiting and row not in missing)
+            block = missing + list(islice(others, max(0, _BLOCK - len(missing))))
+            draws = self._source.draw([streams[row] for row in block])
+            played = self._source.play(draws)
+            for i, row in enumerate(block):
+                self._waiting[row] = draws.row(i), played.row(i)
+        taken = [self._waiting.pop(row)[1] for row in rows]
+        return Episodes(
+            *(
+                np.concatenate([getattr(episodes, f.name) for episodes in taken], axis=1)
+                for f in fields(Episodes)
+            )
+        )
 
 
 class Stream:

@@ -709,3 +709,40 @@ def test_an_episode_ended_early_is_drawn_no_further_than_it_went() -> None:
     np.testing.assert_array_equal(*halves)  # the later part of the time axis stays empty
     with pytest.raises(RuntimeError, match="the episode is over"):
         env.step(np.zeros(2))
+
+
+def test_episodes_that_wait_for_their_row_are_its_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows that begin anew one by one, at given states, and all together, play what single envs
+    do; and simulations are few."""
+    blocks = []
+    play = EpisodeSource.play
+    monkeypatch.setattr(
+        EpisodeSource,
+        "play",
+        lambda self, draws, *rest: blocks.append(1) or play(self, draws, *rest),
+    )
+    env = make_vec(DUFFING, 3, duration=0.5, condition="outliers")
+    env.reset(seed=5)
+    played: list[tuple[int, int, Any]] = []  # (row, episode of that row, observation)
+    for row, episode in [(1, 1), (0, 1), (2, 1), (1, 2)]:
+        mask = np.arange(3) == row
+        observations, _ = env.reset(options={"reset_mask": mask})
+        played.append((row, episode, observations[row]))
+    assert len(blocks) == 3  # the first, that of the three second episodes, and the third's
+    given = np.array([1.0, -0.5])
+    observations, infos = env.reset(options={"reset_mask": np.arange(3) == 0, "x0": given})
+    assert np.array_equal(infos["state"][0], given)
+    played.append((0, 2, observations[0]))
+    observations, _ = env.reset()
+    played += [(0, 3, observations[0]), (1, 3, observations[1]), (2, 2, observations[2])]
+    monkeypatch.undo()
+    for row, episode, observation in played:
+        single = make(DUFFING, duration=0.5, condition="outliers")
+        single.reset(seed=5 + row)
+        for _ in range(episode - 1):
+            single.reset()
+        if (row, episode) == (0, 2):
+            expected = single.reset(options={"x0": given})[0]
+        else:
+            expected = single.reset()[0]
+        np.testing.assert_allclose(observation, expected, atol=1e-7)
