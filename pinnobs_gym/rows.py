@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
-from pinnobs_gym.shared_file import locked, write_whole
+from pinnobs_gym.shared_file import json_line, locked, write_whole
 
 SCHEMA = 3
 """Version of the row format."""
@@ -258,12 +258,8 @@ def _same(row: Row, other: Row) -> bool:
 
 def _line(row: Row) -> bytes:
     first = {"schema": row["schema"]}  # the key by which a half line is known
-    encoded = {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in (first | row).items()
-        if not (value is None and name in OPTIONAL_SCORES)
-    }
-    return json.dumps(encoded).encode() + b"\n"
+    absent = {name for name in OPTIONAL_SCORES if row.get(name) is None}
+    return json_line({n: v for n, v in (first | row).items() if n not in absent})
 
 
 def _is_cut(tail: bytes) -> bool:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import json
+import math
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 _THREADS = threading.Lock()
 """A file's lock keeps other processes out; this one, the other threads of this process."""
@@ -29,6 +32,33 @@ def locked(path: Path, *, make: bool = True) -> Iterator[int]:
             yield descriptor
         finally:
             os.close(descriptor)
+
+
+def json_line(values: Mapping[str, Any]) -> bytes:
+    """One line of JSON, with null where a number is not finite."""
+    encoded = {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
+    return json.dumps(encoded).encode() + b"\n"
+
+
+def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
+    """Append objects to a file of JSON lines, all or none of them, under a lock, and on a line of
+    their own where the file ends in half a line.
+
+    Raises:
+        ValueError: in one line, if the file cannot be written; what it held is untouched.
+    """
+    data = b"".join(map(json_line, objects))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(path) as descriptor:
+            size = os.fstat(descriptor).st_size
+            ends = not size or os.pread(descriptor, 1, size - 1) == b"\n"
+            write_whole(descriptor, data if ends else b"\n" + data, size)
+    except OSError as error:
+        raise ValueError(f"cannot write to {path}: {error}") from None
 
 
 def write_whole(descriptor: int, data: bytes, size: int) -> None:

@@ -32,7 +32,8 @@ from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColum
 from rich.table import Table as RichTable
 
 from pinnobs_gym.report import check_writable, replacing
-from pinnobs_gym.rows import Row, append
+from pinnobs_gym.rows import Row
+from pinnobs_gym.shared_file import append_lines
 from trainers.pinn_obs import Config
 
 COMPARISON = "comparison"
@@ -137,7 +138,7 @@ def work(jobs: Sequence[Job], processes: int, results: Path) -> int:
                 failed += 1
                 console.print(f"{job.case.name} failed: {found}", style="red", markup=False)
             else:
-                append(results, [found])
+                append_lines(results, [found])
                 figures = f"RMSE {found['rmse']:.4g}, loss {found['loss']:.3g}"
                 console.print(
                     f"{job.case.name}: {figures}, {found['seconds']:.0f} CPU s; {job.folder}"

@@ -10,8 +10,9 @@ from pinnobs_gym.cli import main
 from pinnobs_gym.conditions import CONDITIONS, canonical_name, fitting, parse_condition
 from pinnobs_gym.env import EstimationEnv
 from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym.planning import jobs_of
 from pinnobs_gym.report import page
-from pinnobs_gym.suite import jobs_of
+from pinnobs_gym.suites import Entry, Suite
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.satellite import Satellite
@@ -181,17 +182,8 @@ def test_both_spellings_are_one_condition_to_rows_jobs_and_files(tmp_path, monke
     assert found[0] == found[1]  # its date too: the second is the stored row
     (row,) = rows.read(tmp_path / "rows.jsonl")
     assert row["condition"] == "dt5+outliers"
-    jobs = jobs_of(
-        ["Academic"],
-        ["ekf"],
-        setup="benchmark",
-        conditions=spellings,
-        episodes=1,
-        trained_episodes=1,
-        seed=0,
-        folder=tmp_path,
-        training={},
-    )
+    suite = Suite(systems=("Academic",), estimators=(Entry("ekf"),), conditions=tuple(spellings))
+    jobs = jobs_of(suite, tmp_path)
     assert [job.condition for job in jobs] == ["dt5+outliers"]
     pytest.importorskip("optuna")
     for name in spellings:

@@ -24,7 +24,8 @@ from pinnobs_gym.evaluation import canonical
 from pinnobs_gym.kkl.observer import KKL
 from pinnobs_gym.metrics import score
 from pinnobs_gym.record import Record
-from pinnobs_gym.rows import Row, append
+from pinnobs_gym.rows import Row
+from pinnobs_gym.shared_file import append_lines
 
 METHODS: Mapping[str, ModuleType] = {
     "pinn_obs": trainers.pinn_obs,
@@ -125,7 +126,7 @@ def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]
             trained = module.train(system, config, record=first, noise_std=0.0)
             xhat = KKL(system, trained=trained).run(record).xhat
             rows = [_row(comparison, method, i, trained, record.t, x[i], xhat[i]) for i in missing]
-            append(results, rows)
+            append_lines(results, rows)
             yield f"{method}: trained in {trained.seconds:.0f} CPU s, run on {len(rows)} records"
             continue
         for i in missing:
@@ -134,7 +135,7 @@ def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]
             replayed = method == "pinn_obs_replay"
             observer = PinnObsReplay.of(system, trained)
             xhat = observer.run(own).xhat[0] if replayed else trained.xhat(record.t)
-            append(results, [_row(comparison, method, i, trained, record.t, x[i], xhat)])
+            append_lines(results, [_row(comparison, method, i, trained, record.t, x[i], xhat)])
             yield f"{method}: record {i} of {comparison.records}, {trained.seconds:.1f} CPU s"
 
 
