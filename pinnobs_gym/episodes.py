@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from itertools import islice
+from itertools import chain, cycle, islice
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -177,10 +178,10 @@ class EpisodeSource:
 
 
 class Ahead:
-    """The next episode of each row of an env, simulated before it is played.
+    """The next episodes of an env's rows, simulated before they are played.
 
-    Many episodes take little longer than one: where a row begins anew by itself, those that others
-    need next are simulated with it.
+    Many episodes take little longer than one: where rows begin anew one by one, a block is
+    simulated at a time, of the rows that have none waiting and then of those that ask.
 
     Args:
         source: of the episodes.
@@ -189,45 +190,42 @@ class Ahead:
 
     def __init__(self, source: EpisodeSource, rows: int) -> None:
         self._source = source
-        self._waiting: dict[int, tuple[Draws, Episodes]] = {}
-        self._rows = range(rows)
+        self._waiting: list[deque[tuple[Draws, Episodes]]] = [deque() for _ in range(rows)]
 
     def forget(self, rows: Iterable[int]) -> None:
         """Drop what waits for these rows, whose streams are others now."""
         for row in rows:
-            self._waiting.pop(row, None)
+            self._waiting[row].clear()
 
     def any(self, rows: Iterable[int]) -> bool:
         """Whether an episode waits for one of these rows."""
-        return any(row in self._waiting for row in rows)
+        return any(self._waiting[row] for row in rows)
 
     def draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
         """What chance decides in the next episodes of these rows, waiting or not."""
-        drawn = []
-        for row in rows:
-            waiting = self._waiting.pop(row, None)
-            drawn.append(self._source.draw([streams[row]]) if waiting is None else waiting[0])
+        waiting = [self._waiting[row].popleft()[0] if self._waiting[row] else None for row in rows]
+        drawn = [
+            self._source.draw([streams[row]]) if found is None else found
+            for row, found in zip(rows, waiting, strict=True)
+        ]
         seeds = tuple(seed for draws in drawn for seed in draws.seeds)
         x0 = np.concatenate([draws.x0 for draws in drawn])
         return Draws(x0, np.concatenate([draws.noise for draws in drawn]), seeds)
 
     def take(self, rows: Sequence[int], streams: Sequence[Stream]) -> Episodes:
         """The next episodes of these rows."""
-        missing = [row for row in rows if row not in self._waiting]
+        missing = [row for row in rows if not self._waiting[row]]
         if missing:
-            others = (row for row in self._rows if row not in self._waiting and row not in missing)
-            block = missing + list(islice(others, max(0, _BLOCK - len(missing))))
+            asked = set(missing)
+            others = (r for r, found in enumerate(self._waiting) if not found and r not in asked)
+            block = list(islice(chain(missing, others, cycle(missing)), max(_BLOCK, len(missing))))
             draws = self._source.draw([streams[row] for row in block])
             played = self._source.play(draws)
             for i, row in enumerate(block):
-                self._waiting[row] = draws.row(i), played.row(i)
-        taken = [self._waiting.pop(row)[1] for row in rows]
-        return Episodes(
-            *(
-                np.concatenate([getattr(episodes, f.name) for episodes in taken], axis=1)
-                for f in fields(Episodes)
-            )
-        )
+                self._waiting[row].append((draws.row(i), played.row(i)))
+        taken = [self._waiting[row].popleft()[1] for row in rows]
+        parts = (np.concatenate([getattr(t, f.name) for t in taken], 1) for f in fields(Episodes))
+        return Episodes(*parts)
 
 
 class Stream:
