@@ -1,7 +1,8 @@
 """Make the README's picture and tables from stored scores.
 
     python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
-        [--paper-file runs/paper/results.jsonl] [--figures-file runs/benchmark.jsonl]
+        [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
+        [--figures-file runs/benchmark.jsonl]
 
 All measured figures go to docs/benchmarks.md, the README gets a summary of them. What has no stored
 scores stays as it is.
@@ -31,6 +32,7 @@ from pinnobs_gym.report import replacing, write_figure
 ROOT = Path(__file__).parents[1]
 END = "<!-- end -->"
 PAPER_HEADING = "## The paper's figures"
+COMPARISON_HEADING = "### Beside the learned observers"
 FIGURES_HEADING = "## Measured figures"
 BEFORE = "## Development"
 """The heading before which a section goes that is not there yet."""
@@ -84,6 +86,7 @@ def replaced(text: str, name: str, content: str, heading: str) -> str:
 def main(
     rows_file: Path = ROOT / "runs/leaderboard/rows.jsonl",
     paper_file: Path = ROOT / "runs/paper/results.jsonl",
+    comparison_file: Path = ROOT / "runs/paper/comparison.md",
     figures_file: Path = ROOT / "runs/benchmark.jsonl",
 ) -> int:
     """Rewrite the picture and the tables.
@@ -91,12 +94,14 @@ def main(
     Args:
         rows_file: the leaderboard's scores.
         paper_file: the results of reproduce_paper.py.
+        comparison_file: the table that reproduce_paper.py comparison wrote.
         figures_file: what benchmark.py printed.
     """
     scored = rows.read(rows_file)
     section = paper.readme_section(paper.read(paper_file), TABLES.values())
     figures = measured.read(figures_file)
-    if not scored and not section and not figures:
+    compared = comparison_file.read_text(encoding="utf-8") if comparison_file.exists() else ""
+    if not (scored or section or compared or figures):
         print(
             f"nothing in {rows_file}, {paper_file} or {figures_file}; run make leaderboard, "
             "reproduce_paper.py or benchmark.py",
@@ -110,6 +115,9 @@ def main(
         text = replaced(text, "leaderboard", summary(scored), "## Leaderboard")
     if section:
         text = replaced(text, "paper", section, PAPER_HEADING)
+    if compared:
+        table = compared.partition("\n\n")[2].strip()  # under the README's own heading
+        text = replaced(text, "comparison", table, COMPARISON_HEADING)
     if figures:
         text = replaced(text, "figures", measured.readme_section(figures), FIGURES_HEADING)
         with replacing(ROOT / "docs" / "benchmarks.md") as temporary:
