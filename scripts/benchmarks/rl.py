@@ -78,8 +78,8 @@ def readme_table(lines: Sequence[dict[str, Any]]) -> str:
             )
         )
     what = (
-        "**Agents.** PPO with gain actions, at most 300,000 steps, three training seeds: median tail "
-        f"NRMSE of the benchmark's {EPISODES} episodes, that over the EKF's, CPU s of training."
+        "**Agents.** PPO with gain actions, at most 300,000 steps, three training seeds: median "
+        f"tail NRMSE of {EPISODES} benchmark episodes, that over the EKF's, CPU s of training."
     )
     seeds = (f"seed {seed}" for seed in range(SEEDS))
     return f"{what}\n\n{markdown_table(('system', *seeds, '/ EKF', 'training s'), table)}"
