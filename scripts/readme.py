@@ -1,6 +1,7 @@
 """Make the README's picture and tables from stored scores.
 
     python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
+        [--conditions-file runs/conditions/rows.jsonl]
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
         [--figures-file runs/benchmark.jsonl]
 
@@ -32,6 +33,7 @@ from pinnobs_gym.report import replacing, write_figure
 ROOT = Path(__file__).parents[1]
 END = "<!-- end -->"
 PAPER_HEADING = "## The paper's figures"
+CONDITIONS_HEADING = "### Under every condition"
 COMPARISON_HEADING = "### Beside the learned observers"
 FIGURES_HEADING = "## Measured figures"
 BEFORE = "## Development"
@@ -72,6 +74,17 @@ def summary(scored: list[rows.Row]) -> str:
     return "\n\n".join(parts)
 
 
+def under_conditions(scored: list[rows.Row]) -> str:
+    """The table of ranks under every condition."""
+    episodes = len({row["episode_seed"] for row in scored})
+    told = (
+        "Estimators that need no training under every condition, by `pinnobs leaderboard "
+        f"--condition all --episodes {episodes}`."
+    )
+    table = markdown_table(*overview.rank_cells(overview.ranks(scored)))
+    return "\n\n".join([told, overview.RANK_NOTE, table])
+
+
 def replaced(text: str, name: str, content: str, heading: str) -> str:
     """The text with the content between the marks of that name; under the heading, before that of
     development, if they are not there yet."""
@@ -86,6 +99,7 @@ def replaced(text: str, name: str, content: str, heading: str) -> str:
 def main(
     rows_file: Path = ROOT / "runs/leaderboard/rows.jsonl",
     paper_file: Path = ROOT / "runs/paper/results.jsonl",
+    conditions_file: Path = ROOT / "runs/conditions/rows.jsonl",
     comparison_file: Path = ROOT / "runs/paper/comparison.md",
     figures_file: Path = ROOT / "runs/benchmark.jsonl",
 ) -> int:
@@ -94,6 +108,7 @@ def main(
     Args:
         rows_file: the leaderboard's scores.
         paper_file: the results of reproduce_paper.py.
+        conditions_file: scores under every condition.
         comparison_file: the table that reproduce_paper.py comparison wrote.
         figures_file: what benchmark.py printed.
     """
@@ -101,7 +116,8 @@ def main(
     section = paper.readme_section(paper.read(paper_file), TABLES.values())
     figures = measured.read(figures_file)
     compared = comparison_file.read_text(encoding="utf-8") if comparison_file.exists() else ""
-    if not (scored or section or compared or figures):
+    everywhere = rows.read(conditions_file)
+    if not (scored or everywhere or section or compared or figures):
         print(
             f"nothing in {rows_file}, {paper_file} or {figures_file}; run make leaderboard, "
             "reproduce_paper.py or benchmark.py",
@@ -115,6 +131,8 @@ def main(
         text = replaced(text, "leaderboard", summary(scored), "## Leaderboard")
     if section:
         text = replaced(text, "paper", section, PAPER_HEADING)
+    if everywhere:
+        text = replaced(text, "conditions", under_conditions(everywhere), CONDITIONS_HEADING)
     if compared:
         table = compared.partition("\n\n")[2].strip()  # under the README's own heading
         text = replaced(text, "comparison", table, COMPARISON_HEADING)
