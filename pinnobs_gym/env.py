@@ -13,16 +13,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from pinnobs_gym.agent_side import AgentSide
-from pinnobs_gym.episodes import Ahead, Changes, Draws, Episodes, EpisodeSource, Stream
+from pinnobs_gym.episodes import Ahead, Changes, Episodes, EpisodeSource, Stream
 from pinnobs_gym.figures import EpisodePicture
 from pinnobs_gym.record import Prior, Record
 from pinnobs_gym.system import System
 
 NOT_FINITE_REWARD = -1e4
 """Reward of an action that is not finite; it ends the episode."""
-
-_SAMPLES_AHEAD = 65536
-"""Samples that a single env simulates ahead, in whole episodes."""
 
 
 class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -78,7 +75,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         self._k = 0
         self._over = True
         self._stream: Stream | None = None
-        self._ahead: list[tuple[Draws, np.ndarray, np.ndarray]] = []
+        self._ahead = Ahead(self.source, 1)
         self._picture: EpisodePicture | None = None
 
     def reset(
@@ -90,13 +87,9 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         x0 = _given_x0(self.source, options, 1)
         if seed is not None or self._stream is None:
             self._stream = Stream(_seeds_of(self.np_random))
-            self._ahead = []
-        if not self._ahead:
-            self._ahead = self._simulate_ahead(self._stream)
-        draws, self._x, self._observations = self._ahead.pop()
-        if x0 is not None:
-            episode = self.source.play(draws, x0)
-            self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]
+            self._ahead.forget([0])
+        episode = self._ahead.take([0], [self._stream], x0)
+        self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]
         self._k = 0
         self._over = False
         if self.render_mode is not None:
@@ -155,16 +148,6 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         if self._picture is not None:
             self._picture.close()
             self._picture = None
-
-    def _simulate_ahead(self, stream: Stream) -> list[tuple[Draws, np.ndarray, np.ndarray]]:
-        """The next episodes, the first of them last: simulating many costs little more than one."""
-        count = max(1, _SAMPLES_AHEAD // len(self.source.times))
-        draws = self.source.draw([stream] * count)
-        episodes = self.source.play(draws)
-        return [
-            (draws.row(i), episodes.x[:, i].copy(), episodes.observations[:, i].copy())
-            for i in reversed(range(count))
-        ]
 
 
 class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -350,10 +333,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             self._noise = draws.noise
             self._episodes = self.source.play(draws, x0, self._episodes)
         else:
-            if x0 is None:
-                new = self._ahead.take(chosen, self._streams)
-            else:
-                new = self.source.play(self._ahead.draw(chosen, self._streams), x0)
+            new = self._ahead.take(chosen, self._streams, x0)
             for name in ("x", "y", "observations"):
                 getattr(self._playing, name)[:, rows] = getattr(new, name)
         self._k[rows] = 0

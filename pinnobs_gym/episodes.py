@@ -21,8 +21,8 @@ _DRAWS = 64
 _ATTEMPTS = 1000
 """Such draws without an admissible state before the initial set is taken to be empty."""
 
-_BLOCK = 64
-"""Episodes simulated at a time where rows begin anew one by one."""
+_SAMPLES_AHEAD = 65536
+"""Samples simulated at a time where rows begin anew one by one."""
 
 
 class Changes(TypedDict, total=False):
@@ -201,7 +201,7 @@ class Ahead:
         """Whether an episode waits for one of these rows."""
         return any(self._waiting[row] for row in rows)
 
-    def draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
+    def _draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
         """What chance decides in the next episodes of these rows, waiting or not."""
         waiting = [self._waiting[row].popleft()[0] if self._waiting[row] else None for row in rows]
         drawn = [
@@ -212,13 +212,18 @@ class Ahead:
         x0 = np.concatenate([draws.x0 for draws in drawn])
         return Draws(x0, np.concatenate([draws.noise for draws in drawn]), seeds)
 
-    def take(self, rows: Sequence[int], streams: Sequence[Stream]) -> Episodes:
-        """The next episodes of these rows."""
+    def take(
+        self, rows: Sequence[int], streams: Sequence[Stream], x0: np.ndarray | None = None
+    ) -> Episodes:
+        """The next episodes of these rows, from initial states (len(rows), nx) if given."""
+        if x0 is not None:
+            return self._source.play(self._draw(rows, streams), x0)
         missing = [row for row in rows if not self._waiting[row]]
         if missing:
             asked = set(missing)
             others = (r for r, found in enumerate(self._waiting) if not found and r not in asked)
-            block = list(islice(chain(missing, others, cycle(missing)), max(_BLOCK, len(missing))))
+            size = max(len(missing), _SAMPLES_AHEAD // len(self._source.times))
+            block = list(islice(chain(missing, others, cycle(missing)), size))
             draws = self._source.draw([streams[row] for row in block])
             played = self._source.play(draws)
             for i, row in enumerate(block):
