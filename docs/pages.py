@@ -13,18 +13,21 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from pinnobs_gym import consistency, env_id, metrics, rows, suite
-from pinnobs_gym.conditions import CONDITIONS
-from pinnobs_gym.docstrings import field_docs, variable_docs
-from pinnobs_gym.estimator import Estimator
+from pinnobs_gym import registry
+from pinnobs_gym.cli.docstrings import field_docs, variable_docs
+from pinnobs_gym.cli.output import write_figure
+from pinnobs_gym.cli.system_page import page
+from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.evaluation import score_batch
-from pinnobs_gym.figures import state_figure
-from pinnobs_gym.leaderboard import markdown_table
-from pinnobs_gym.report import page, write_figure
-from pinnobs_gym.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
-from pinnobs_gym.system import System
+from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.scoring import consistency, metrics, rows
+from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.simulation.conditions import CONDITIONS
+from pinnobs_gym.simulation.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
+from pinnobs_gym.simulation.system import System
 from pinnobs_gym.systems import SYSTEMS
 
 
@@ -45,7 +48,8 @@ def write(folder: Path) -> None:
 
 def pages() -> dict[str, str]:
     """Their texts by file name."""
-    systems, estimators, trainers = SYSTEMS.classes(), ESTIMATORS.classes(), suite.trainers()
+    systems, estimators = SYSTEMS.classes(), ESTIMATORS.classes()
+    trainers = {name: registry.trainer(name) for name in registry.trainers()}
     return {
         **{f"systems/{name}.md": system_page(cls) for name, cls in systems.items()},
         "systems/index.md": _systems(systems),

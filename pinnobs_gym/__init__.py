@@ -1,38 +1,44 @@
 """Nonlinear state estimation as Gymnasium environments, with estimators and a leaderboard.
 
 Importing this package registers the env ids, one per system: ``pinnobs/ReverseDuffing-v0`` and so
-on. It does not import torch.
+on. Everything else is imported when it is first used.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
-
-from pinnobs_gym.estimator import Estimator
-from pinnobs_gym.system import Setup, System
-from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.envs.registration import register_envs, register_system
 
 if TYPE_CHECKING:
-    from pinnobs_gym.evaluation import evaluate
+    from pinnobs_gym.estimation.estimator import Estimator, State
+    from pinnobs_gym.scoring.evaluation import evaluate
+    from pinnobs_gym.simulation.system import Setup, System, stack
 
-__all__ = ["Estimator", "Setup", "System", "env_id", "evaluate", "register"]
+__all__ = [
+    "Estimator",
+    "Setup",
+    "State",
+    "System",
+    "__version__",
+    "evaluate",
+    "register",
+    "stack",
+]
 
+__version__: str
+"""Version of the installed package."""
 
-def env_id(system: str | type[System]) -> str:
-    """The env id of a system, given by class, name or ``module:Class``, which is then registered.
-
-    Raises:
-        ValueError: listing the known systems, if it is unknown.
-    """
-    cls = SYSTEMS.resolve(system)
-    register(cls)
-    return _id(cls)
-
-
-def _id(cls: type[System]) -> str:
-    return f"pinnobs/{cls.__name__}-v{cls.version}"
+_HOMES = {
+    "Estimator": "estimation.estimator",
+    "State": "estimation.estimator",
+    "Setup": "simulation.system",
+    "System": "simulation.system",
+    "stack": "simulation.system",
+    "evaluate": "scoring.evaluation",
+}
+"""The module below this package that each name of the face comes from."""
 
 
 def register(cls: type) -> type:
@@ -45,37 +51,31 @@ def register(cls: type) -> type:
         TypeError: in one line, if the class is neither or is not complete.
         ValueError: if its name is taken.
     """
-    if isinstance(cls, type) and issubclass(cls, System):
-        cls.validate()
-        SYSTEMS.register(cls)
-        _register_env(cls)
-    elif isinstance(cls, type) and issubclass(cls, Estimator):
-        from pinnobs_gym.estimators import ESTIMATORS
+    from pinnobs_gym.estimation.estimator import Estimator
+    from pinnobs_gym.estimators import ESTIMATORS
+    from pinnobs_gym.simulation.system import System
 
+    if isinstance(cls, type) and issubclass(cls, System):
+        register_system(cls)
+    elif isinstance(cls, type) and issubclass(cls, Estimator):
         ESTIMATORS.register(cls)
     else:
         raise TypeError(f"{cls!r} is neither a System nor an Estimator")
     return cls
 
 
-def _register_env(cls: type[System]) -> None:
-    name = _id(cls)
-    if name not in gymnasium.registry:
-        gymnasium.register(
-            name,
-            entry_point="pinnobs_gym.env:EstimationEnv",
-            vector_entry_point="pinnobs_gym.env:EstimationVectorEnv",
-            kwargs={"system": cls.__name__},
-        )
-
-
 def __getattr__(name: str) -> Any:
-    if name == "evaluate":  # the harness imports more than an env needs
-        from pinnobs_gym.evaluation import evaluate
+    if name == "__version__":
+        from importlib.metadata import version
 
-        return evaluate
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return version("pinnobs-gym")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
-for _cls in SYSTEMS.classes().values():
-    _register_env(_cls)
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register_envs()

@@ -1,49 +1,86 @@
-"""Finding systems, estimators and trainers by name: files of a package, entry points, plug-ins."""
+"""How a file becomes a name: systems, estimators and trainers are found by reading their sources.
+
+A name is resolved by importing the one file that gives it; the others are not even looked at. Only
+a name that no source shows, and a list of all classes, takes importing everything.
+"""
 
 from __future__ import annotations
 
+import ast
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import entry_points
-from typing import Generic, TypeVar
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Generic, NamedTuple, TypeVar
 
 T = TypeVar("T")
+
+
+class Origin(NamedTuple):
+    """Where a name comes from, as the source of a file shows it."""
+
+    module: str
+    """Dotted name of the module."""
+    constants: dict[str, Any]
+    """The class attributes that are given as plain constants."""
 
 
 class Registry(Generic[T]):
     """The classes of one kind that can be named.
 
-    Found are: every concrete subclass of ``base`` defined in a module of the ``packages``, those
-    that installed packages announce in the entry-point group named like the first of these, and
-    those given to `register`.
-    A class is named by its class attribute ``name``, or else by its own name.
+    Found are: the classes of the package's modules whose source assigns one of the ``attributes``,
+    those that installed packages announce in the entry-point group of the package's name, and those
+    given to `register`. A class is named by its class attribute ``name``, or else by its own name.
+
+    Args:
+        kind: what one is called in messages, such as ``"system"``.
+        base: ``module:Class`` of the base class; imported when it is first needed.
+        package: dotted name of the package whose files are looked at.
+        attributes: the class attributes by which a source shows that a class is one.
     """
 
-    def __init__(self, kind: str, base: type[T], *packages: str) -> None:
+    def __init__(self, kind: str, base: str, package: str, *attributes: str) -> None:
         self._kind = kind
-        self._base = base
-        self._packages = packages
-        self._classes: dict[str, type[T]] | None = None
+        self._base_path = base
+        self._package = package
+        self._attributes = attributes
+        self._known: dict[str, type[T]] = {}
+        """The classes that are imported."""
+        self._all_imported = False
+
+    @property
+    def sources(self) -> dict[str, Origin]:
+        """The names that the sources of the package show, without importing any of them."""
+        return _shown(self._package, self._attributes)
 
     def classes(self) -> dict[str, type[T]]:
         """All classes by name, sorted; imports their modules on the first call."""
-        if self._classes is None:
-            self._classes = {}
-            for package in map(importlib.import_module, self._packages):
-                for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-                    for cls in vars(importlib.import_module(module.name)).values():
-                        if self._is_one(cls) and cls.__module__ == module.name:
-                            self.register(cls)
-            for point in entry_points(group=self._packages[0]):
-                try:
-                    self.register(point.load())
-                except Exception as error:
-                    warnings.warn(
-                        f"{self._kind} plug-in {point.name!r} is left out: {error}", stacklevel=2
-                    )
-        return dict(sorted(self._classes.items()))
+        if not self._all_imported:
+            self._all_imported = True
+            for name in self.sources:
+                self._take(name)
+            self.plug_ins()
+        return dict(sorted(self._known.items()))
+
+    def plug_ins(self) -> list[type[T]]:
+        """The classes that installed packages announce, which are imported; a warning for each that
+        cannot be."""
+        found = []
+        for point in entry_points(group=self._package):
+            try:
+                found.append(self.register(point.load()))
+            except Exception as error:  # whatever another package raises
+                warnings.warn(
+                    f"{self._kind} plug-in {point.name!r} is left out: {error}", stacklevel=2
+                )
+        return found
 
     def register(self, cls: type[T]) -> type[T]:
         """Add a class; usable as a decorator.
@@ -54,17 +91,11 @@ class Registry(Generic[T]):
         """
         if not self._is_one(cls):
             raise TypeError(f"{cls!r} is not a concrete subclass of {self._base.__name__}")
-        classes = self._classes if self._classes is not None else self.classes()
-        assert self._classes is not None
         name = self.name_of(cls)
-        known = classes.get(name)
-        same = known is not None and (known.__module__, known.__qualname__) == (
-            cls.__module__,
-            cls.__qualname__,
-        )  # a class that was imported anew replaces what it was
-        if known is not None and not same:
-            raise ValueError(f"{self._kind} {name!r} is already {known.__module__}.{name}")
-        self._classes[name] = cls
+        taken = self._owner(name)
+        if taken is not None and taken != (cls.__module__, cls.__qualname__):
+            raise ValueError(f"{self._kind} {name!r} is already {taken[0]}.{name}")
+        self._known[name] = cls  # a class that was imported anew replaces what it was
         return cls
 
     def resolve(self, spec: str | type[T]) -> type[T]:
@@ -76,20 +107,134 @@ class Registry(Generic[T]):
         if not isinstance(spec, str):
             return self.register(spec)
         if ":" in spec:
-            module, _, name = spec.partition(":")
-            try:
-                return self.register(getattr(importlib.import_module(module), name))
-            except Exception as error:  # whatever the user's module raises
-                kind = type(error).__name__
-                raise ValueError(f"cannot load {self._kind} {spec!r}: {kind}: {error}") from error
-        classes = self.classes()
-        if spec not in classes:
-            raise ValueError(f"unknown {self._kind} {spec!r}; known are {', '.join(classes)}")
-        return classes[spec]
+            return self._imported(spec)
+        if spec not in self._known and spec in self.sources:
+            self._take(spec)
+        known = self._known if spec in self._known else self.classes()
+        if spec not in known:
+            raise ValueError(f"unknown {self._kind} {spec!r}; known are {', '.join(known)}")
+        return known[spec]
 
     def name_of(self, cls: type[T]) -> str:
         """The name a class is found by."""
         return getattr(cls, "name", cls.__name__)
 
+    @contextmanager
+    def isolated(self) -> Iterator[None]:
+        """A context after which everything that was registered in it is forgotten."""
+        before, whole = dict(self._known), self._all_imported
+        try:
+            yield
+        finally:
+            self._known, self._all_imported = before, whole
+
+    @property
+    def _base(self) -> type[T]:
+        module, _, name = self._base_path.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+    def _imported(self, spec: str) -> type[T]:
+        """The class at ``module:Class``, which is registered."""
+        module, _, name = spec.partition(":")
+        try:
+            return self.register(getattr(importlib.import_module(module), name))
+        except Exception as error:  # whatever the user's module raises
+            for cls in self._known.values():  # of a function or a notebook's cell
+                if (cls.__module__, cls.__qualname__) == (module, name):
+                    return cls
+            kind = type(error).__name__
+            raise ValueError(f"cannot load {self._kind} {spec!r}: {kind}: {error}") from error
+
+    def _owner(self, name: str) -> tuple[str, str] | None:
+        """Module and qualified name of the class that has a name, if one has."""
+        if name not in self._known and name in self.sources:
+            self._take(name)
+        cls = self._known.get(name)
+        return None if cls is None else (cls.__module__, cls.__qualname__)
+
+    def _take(self, name: str) -> None:
+        """Import the class that a source shows under a name."""
+        module = importlib.import_module(self.sources[name].module)
+        for cls in vars(module).values():
+            if (
+                self._is_one(cls)
+                and cls.__module__ == module.__name__
+                and self.name_of(cls) == name
+            ):
+                self._known.setdefault(name, cls)
+
     def _is_one(self, cls: object) -> bool:
         return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
+
+
+def trainers() -> dict[str, str]:
+    """The trainers by name, and the dotted name of each one's module: those of the package
+    ``trainers`` whose source defines both ``Config`` and ``train``. None is imported."""
+    found = {}
+    for module in _modules("trainers"):
+        tree = ast.parse(_source(module))
+        if {"Config", "train"} <= set(_top_level_names(tree)):
+            found[module.rpartition(".")[2]] = module
+    return found
+
+
+def trainer(name: str) -> ModuleType:
+    """The module of the trainer of that name, which is imported.
+
+    Raises:
+        ValueError: listing the known ones, if it is unknown.
+    """
+    known = trainers()
+    if name not in known:
+        raise ValueError(f"unknown trainer {name!r}; known are {', '.join(known)}")
+    return importlib.import_module(known[name])
+
+
+@cache
+def _shown(package: str, attributes: tuple[str, ...]) -> dict[str, Origin]:
+    """What `Registry.sources` returns."""
+    found = {}
+    for module in _modules(package):
+        for node in ast.parse(_source(module)).body:
+            if isinstance(node, ast.ClassDef):
+                constants = _constants(node)
+                if constants.keys() & set(attributes):
+                    found[constants.get("name", node.name)] = Origin(module, constants)
+    return dict(sorted(found.items()))
+
+
+@cache
+def _modules(package: str) -> tuple[str, ...]:
+    """Dotted names of the modules of a package, sorted; the package alone is imported."""
+    path = importlib.import_module(package).__path__
+    return tuple(sorted(m.name for m in pkgutil.iter_modules(path, f"{package}.")))
+
+
+def _source(module: str) -> str:
+    """A module's source, without importing it."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise ImportError(f"module {module} has no source")
+    return Path(spec.origin).read_text(encoding="utf-8")
+
+
+def _constants(node: ast.ClassDef) -> dict[str, Any]:
+    """The class attributes that a body assigns, with their values where these are constants."""
+    found = {}
+    for statement in node.body:
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            value = statement.value
+            constant = value.value if isinstance(value, ast.Constant) else None
+            found[statement.targets[0].id] = constant
+    return found
+
+
+def _top_level_names(tree: ast.Module) -> Iterator[str]:
+    """The names that a module's source binds at its top level."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.Assign):
+            yield from (target.id for target in node.targets if isinstance(target, ast.Name))
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            yield from (alias.asname or alias.name for alias in node.names)

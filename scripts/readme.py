@@ -23,12 +23,14 @@ from machine import processor
 from reproduction import report as paper
 from reproduction.tables import TABLES
 
-from pinnobs_gym import overview, rows
-from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym.cli.output import write_figure
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.figures import state_figure
-from pinnobs_gym.leaderboard import markdown_table
-from pinnobs_gym.report import replacing, write_figure
+from pinnobs_gym.files import replacing
+from pinnobs_gym.leaderboard import ranks, ranks_table
+from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.scoring import rows
 
 ROOT = Path(__file__).parents[1]
 END = "<!-- end -->"
@@ -67,10 +69,10 @@ def summary(scored: list[rows.Row]) -> str:
         f"({processor()}), by `make leaderboard`, which writes the details of each system to "
         "`runs/leaderboard/leaderboard.md`."
     )
-    parts = [told, overview.NOTE, markdown_table(*overview.cells(overview.lines(scored)))]
-    placed = overview.ranks(scored)
+    parts = [told, ranks_table.NOTE, markdown_table(*ranks_table.cells(ranks.lines(scored)))]
+    placed = ranks.ranks(scored)
     if len(placed) > 2:
-        parts += [overview.RANK_NOTE, markdown_table(*overview.rank_cells(placed))]
+        parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(placed))]
     return "\n\n".join(parts)
 
 
@@ -81,8 +83,8 @@ def under_conditions(scored: list[rows.Row]) -> str:
         "Estimators that need no training under every condition, by `pinnobs leaderboard "
         f"--condition all --episodes {episodes}`."
     )
-    table = markdown_table(*overview.rank_cells(overview.ranks(scored)))
-    return "\n\n".join([told, overview.RANK_NOTE, table])
+    table = markdown_table(*ranks_table.rank_cells(ranks.ranks(scored)))
+    return "\n\n".join([told, ranks_table.RANK_NOTE, table])
 
 
 def replaced(text: str, name: str, content: str, heading: str) -> str:

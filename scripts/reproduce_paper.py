@@ -31,9 +31,8 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
-from pinnobs_gym.report import check_writable, replacing
-from pinnobs_gym.rows import Row
-from pinnobs_gym.shared_file import append_lines
+from pinnobs_gym.files import append_lines, check_writable, replacing
+from pinnobs_gym.scoring.rows import Row
 from trainers.pinn_obs import Config
 
 COMPARISON = "comparison"

@@ -23,14 +23,16 @@ import numpy as np
 import torch
 import tyro
 
-from pinnobs_gym import env_id, evaluate, suite
-from pinnobs_gym.estimator import Estimator
+from pinnobs_gym import evaluate
+from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.estimators.sb3 import Sb3
-from pinnobs_gym.log import Log
-from pinnobs_gym.report import check_writable
-from pinnobs_gym.rows import Row
+from pinnobs_gym.files import check_writable
+from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.trained_file import check_same
+from pinnobs_gym.training import by_name
+from pinnobs_gym.training.log import Log
 from trainers.rl import Config
 
 
@@ -64,14 +66,14 @@ class Main:
 
     def _trained(self, name: str, config: Config) -> Estimator:
         """The agent, trained unless its file is there."""
-        played = suite.Played(env_id(name), "benchmark", "nominal", suite.TRAINING_SEED)
+        played = by_name.Played(env_id(name), "benchmark", "nominal", by_name.TRAINING_SEED)
         title = f"{played.env_id.removeprefix('pinnobs/')}-{config.algorithm}-{config.action_mode}"
         path = self.out / f"{title}-seed{config.seed}.pt"
         system = SYSTEMS.resolve(name)()
         if not path.exists():
             checkpoint = path.with_suffix(".checkpoint.zip")
             with Log(self.out / "tensorboard" / path.stem) as log:
-                trained = suite.train(
+                trained = by_name.train(
                     "rl",
                     config,
                     played,

@@ -8,11 +8,8 @@ from pinnobs_gym.systems import SYSTEMS
 @pytest.fixture(autouse=True)
 def registries_as_they_were():
     """What a test registers is gone after it."""
-    registries = (SYSTEMS, ESTIMATORS)
-    before = [registry.classes() for registry in registries]
     ids = set(gym.registry)
-    yield
-    for registry, classes in zip(registries, before, strict=True):
-        registry._classes = classes
+    with SYSTEMS.isolated(), ESTIMATORS.isolated():
+        yield
     for name in set(gym.registry) - ids:
         del gym.registry[name]

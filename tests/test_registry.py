@@ -1,17 +1,19 @@
+import sys
+from typing import ClassVar
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import pinnobs_gym
 from pinnobs_gym import Setup, System
+from pinnobs_gym.envs import registration
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import Registry
 from pinnobs_gym.systems import SYSTEMS
 
 PLUG_IN = '''
-from pinnobs_gym import Estimator, Setup, System
-from pinnobs_gym.estimator import State
-from pinnobs_gym.system import stack
+from pinnobs_gym import Estimator, Setup, State, System, stack
 
 
 class Decay(System):
@@ -50,7 +52,7 @@ def plug_in(tmp_path, monkeypatch):
 
 
 def test_a_system_and_an_estimator_by_path(plug_in):
-    env_id = pinnobs_gym.env_id(f"{plug_in}:Decay")
+    env_id = registration.env_id(f"{plug_in}:Decay")
     assert env_id == "pinnobs/Decay-v0"
     rows = pinnobs_gym.evaluate(f"{plug_in}:Mirror", env_id, episodes=2)
     assert [row["rmse"] for row in rows] == [0, 0]  # measured without noise
@@ -65,11 +67,77 @@ def test_entry_points_are_found_and_broken_ones_left_out(plug_in, tmp_path, monk
     (info / "entry_points.txt").write_text(
         f"[pinnobs_gym.systems]\nDecay = {plug_in}:Decay\nbroken = {plug_in}:Nothing\n"
     )
-    fresh: Registry[System] = Registry("system", System, "pinnobs_gym.systems")
+    fresh: Registry[System] = made("pinnobs_gym.systems")
     with pytest.warns(UserWarning, match="system plug-in 'broken' is left out"):
         classes = fresh.classes()
     assert "Decay" in classes
     assert "ReverseDuffing" in classes
+
+
+def made(package: str) -> Registry[System]:
+    """A registry of systems whose files lie in a package."""
+    return Registry("system", "pinnobs_gym.simulation.system:System", package, "state_names")
+
+
+ZOO = {
+    "__init__": "",
+    "first": PLUG_IN
+    + """
+
+class Second(Decay):
+    name = "another name"
+    state_names = ("z",)
+    version = 3
+
+
+class Helper:
+    name = "no system"
+    state_names = ()
+""",
+    "broken": "raise RuntimeError('imported')\n\nclass Broken:\n    state_names = ()\n",
+}
+
+
+@pytest.fixture
+def zoo(tmp_path, monkeypatch):
+    folder = tmp_path / "zoo_package"
+    folder.mkdir()
+    for name, text in ZOO.items():
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield made("zoo_package")
+    for name in [name for name in sys.modules if name.startswith("zoo_package")]:
+        del sys.modules[name]
+
+
+def test_names_are_read_without_importing_and_resolved_alone(zoo):
+    assert list(zoo.sources) == ["Broken", "Decay", "another name", "no system"]
+    assert zoo.sources["another name"].constants["version"] == 3
+    assert zoo.resolve("another name").state_names == ("z",)
+    assert zoo.resolve("Decay").__name__ == "Decay"
+    assert "zoo_package.broken" not in sys.modules
+    with pytest.raises(RuntimeError, match="imported"):
+        zoo.resolve("Broken")
+
+
+def test_what_a_registry_forgets(zoo):
+    class Own(System):
+        state_names = output_names = ("x",)
+        scale = (1.0,)
+        setups: ClassVar = {}
+
+        def f(self, t, x, u):
+            return -x
+
+        def h(self, x):
+            return x
+
+    with zoo.isolated():
+        zoo.register(Own)
+        assert zoo.resolve("Own") is Own
+        assert zoo.resolve(f"{Own.__module__}:{Own.__qualname__}") is Own  # of a function
+    with pytest.raises(RuntimeError, match="imported"):  # it is not known: all are looked at
+        zoo.resolve("Own")
 
 
 def test_unknown_names_list_the_known_ones():

@@ -16,12 +16,12 @@ from types import MappingProxyType
 import numpy as np
 import torch
 
-from pinnobs_gym.kkl import course
-from pinnobs_gym.kkl.config import DEFAULT, KKLConfig
-from pinnobs_gym.kkl.fitting import Equations, Objective, Term
-from pinnobs_gym.kkl.pictures import figures
-from pinnobs_gym.kkl.run import Method, Run
-from pinnobs_gym.training import expect
+from pinnobs_gym.training.loop import expect
+from trainers.kkl import course
+from trainers.kkl.config import DEFAULT, KKLConfig
+from trainers.kkl.fitting import Equations, Objective, Term
+from trainers.kkl.pictures import figures
+from trainers.kkl.run import Method, Run
 
 __all__ = ["Config", "figures", "train"]
 
@@ -89,4 +89,4 @@ def physics(run: Run) -> Objective:
 
 
 train = partial(course.train, Method("kkl_pinn", physics))
-"""See `pinnobs_gym.kkl.course.train`."""
+"""See `trainers.kkl.course.train`."""

@@ -1,8 +1,15 @@
 """The estimators, one file each. A file put here is found, checked and ranked."""
 
-from pinnobs_gym.estimator import Estimator
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from pinnobs_gym.registry import Registry
 
-ESTIMATORS: Registry[Estimator] = Registry("estimator", Estimator, __name__, "trainers")
-"""All estimators by name; those that train on the record they are given stand beside their
-trainer."""
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.estimator import Estimator
+
+ESTIMATORS: Registry[Estimator] = Registry(
+    "estimator", "pinnobs_gym.estimation.estimator:Estimator", __name__, "name"
+)
+"""All estimators by name."""

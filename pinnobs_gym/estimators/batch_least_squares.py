@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimates, OfflineEstimator
-from pinnobs_gym.kalman import checked, sandwich
-from pinnobs_gym.least_squares import Fit, linearised, root, solved
-from pinnobs_gym.record import Record
+from pinnobs_gym.estimation.adapters import OfflineEstimator
+from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimation.gaussian import checked
+from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
+from pinnobs_gym.simulation.matrices import sandwich
+from pinnobs_gym.simulation.record import Record
 
 
 @dataclass(frozen=True)

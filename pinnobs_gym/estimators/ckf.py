@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.sigma_points import SigmaPointFilter
+from pinnobs_gym.estimation.sigma_points import SigmaPointFilter
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from pinnobs_gym.estimator import State
-from pinnobs_gym.kalman import (
-    GaussianEstimator,
-    checked,
-    joseph_update,
-    observe,
-    predicted,
-    sandwich,
-    squared_size,
-)
-from pinnobs_gym.record import Prior
-from pinnobs_gym.system import vector
+from pinnobs_gym.estimation.estimator import State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
+from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.simulation.matrices import sandwich, squared_size
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import vector
 
 
 @dataclass(frozen=True)

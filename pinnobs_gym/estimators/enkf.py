@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import Range, State
-from pinnobs_gym.kalman import GaussianEstimator, checked, divide, outer
-from pinnobs_gym.least_squares import root
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.estimation.estimator import Range, State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
+from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.simulation.matrices import divide, outer
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)

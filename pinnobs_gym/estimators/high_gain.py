@@ -6,17 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Range, State
-from pinnobs_gym.gains import default_rate
-from pinnobs_gym.kalman import (
-    GaussianEstimator,
-    checked,
-    covariances,
-    joseph_update,
-    observe,
-    predict,
-)
-from pinnobs_gym.record import Prior
+from pinnobs_gym.estimation.estimator import Range, State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
+from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
+from pinnobs_gym.estimation.observer_gains import default_rate
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)

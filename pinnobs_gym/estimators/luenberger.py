@@ -7,10 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, Range, State
-from pinnobs_gym.gains import default_rate, injection, lmi_gain, placed_gain, settling_gain
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.observer_gains import (
+    default_rate,
+    injection,
+    lmi_gain,
+    placed_gain,
+    settling_gain,
+)
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
@@ -18,19 +24,21 @@ class Luenberger(Estimator):
     """The Luenberger observer x̂' = f(x̂, u) + L(y − h(x̂)) with a constant gain (Luenberger 1964).
 
     Between samples the model alone; at a sample the correction over the time since the last, by
-    Euler's implicit method (`pinnobs_gym.gains.injection`). A missing output corrects nothing.
+    Euler's implicit method (`pinnobs_gym.estimation.observer_gains.injection`). A missing output
+    corrects nothing.
 
     Default tuning, the same rule for all systems: L places the poles of the model, linearised where
     it is from x̂₀ after a quarter of a benchmark episode, to the left of −`rate`
-    (`pinnobs_gym.gains.placed_gain`). That promises nothing far from there: if less of it leaves a
-    smaller error along the model's path from x̂₀, less is taken (`pinnobs_gym.gains.settling_gain`).
+    (`pinnobs_gym.estimation.observer_gains.placed_gain`). That promises nothing far from there: if
+    less of it leaves a smaller error along the model's path from x̂₀, less is taken
+    (`pinnobs_gym.estimation.observer_gains.settling_gain`).
     """
 
     gain: Sequence[Sequence[float]] | None = None
     """L, nx rows of ny numbers, in state units per output unit and s; designed if None."""
     design: str = "poles"
     """How it is designed: ``poles``, or ``lmi`` for one gain for the whole initial set
-    (`pinnobs_gym.gains.lmi_gain`; needs the extra lmi)."""
+    (`pinnobs_gym.estimation.observer_gains.lmi_gain`; needs the extra lmi)."""
     poles: Sequence[complex] | None = None
     """The poles to place, nx of them in 1/s; by the rate if None."""
     rate: float | None = None

@@ -6,20 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import Range, State
-from pinnobs_gym.kalman import (
-    GaussianEstimator,
-    checked,
-    cholesky,
-    divide,
-    joseph_update,
-    observe,
-    predict,
-    sandwich,
-)
-from pinnobs_gym.least_squares import Fit, linearised
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import identity, product
+from pinnobs_gym.estimation.estimator import Range, State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
+from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
+from pinnobs_gym.estimation.least_squares import Fit, linearised
+from pinnobs_gym.simulation.matrices import cholesky, divide, identity, product, sandwich
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, State
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)

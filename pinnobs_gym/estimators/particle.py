@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, Range, State
-from pinnobs_gym.kalman import checked, factor
-from pinnobs_gym.least_squares import root
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.gaussian import checked
+from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.simulation.matrices import factor
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
 
 _FEW = 10
 """One particle in so many must be left, or the likelihood is taken in parts."""

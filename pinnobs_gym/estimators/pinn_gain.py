@@ -11,8 +11,10 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from pinnobs_gym.estimator import State, output_scale
-from pinnobs_gym.estimators.gain_network import (
+from pinnobs_gym.estimation.estimator import State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
+from pinnobs_gym.estimation.kalman import kalman_gain, observe, update_with
+from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
     corrected_gain,
     memory_size,
@@ -20,18 +22,10 @@ from pinnobs_gym.estimators.gain_network import (
     remembered,
     shapes,
 )
-from pinnobs_gym.kalman import (
-    GaussianEstimator,
-    checked,
-    kalman_gain,
-    observe,
-    predicted,
-    update_with,
-)
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
-from pinnobs_gym.system import System, vector
-from pinnobs_gym.trained_file import check_same, identity, read, write
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import System, output_scale, vector
 
 Layers = tuple[tuple[np.ndarray, np.ndarray], ...]
 """Weights (rows, columns) and biases (rows,) of each layer."""

@@ -15,12 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.estimator import Estimates, Estimator, OfflineEstimator, State
-from pinnobs_gym.network import Architecture, Layers, Network, evaluate, layers_of
-from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.simulate import substeps
-from pinnobs_gym.system import System
-from pinnobs_gym.trained_file import check_same, identity, read, write
+from pinnobs_gym.estimation.adapters import OfflineEstimator
+from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.estimation.learned.mlp import Architecture, Layers, Network, evaluate, layers_of
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.registry import trainer
+from pinnobs_gym.simulation.model import substeps
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import System
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,3 +281,42 @@ class PinnObsDirect(_Learned, OfflineEstimator):
     @classmethod
     def of(cls, system: System, trained: Trained) -> Self:
         return cls(system, trained=trained)
+
+
+@dataclass(frozen=True)
+class PinnObs(OfflineEstimator):
+    """PINN-Obs trained anew on every record it is given, and its network's x̂(t)."""
+
+    config: Any = field(default_factory=lambda: trainer("pinn_obs").Config())
+    """The recipe; its seed is that of every row."""
+    folder: Path | None = field(default=None, repr=False)
+    """Where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained network; None
+    keeps nothing."""
+
+    name = "pinn_obs"
+    equations = r"""
+(\hat x(t), L(t)) &= \text{network}_\vartheta(t) \\
+\min_\vartheta \; & w_0 \| \hat x(t_0) - \hat x_0 \|^2
++ w_y \operatorname{mean} \| h(\hat x) - y \|^2 \\
+& + w_{\mathrm{ode}} \operatorname{mean}
+\bigl\| \dot{\hat x} - f(t, \hat x, u) - L\, (y - h(\hat x)) \bigr\|^2 \\
+& + w_{\mathrm{guide}} \operatorname{mean} \| \hat x - x^{\mathrm{smoother}} \|^2
++ w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2
+"""
+    trains_on_record = "pinn_obs"
+
+    @property
+    def training(self) -> dict[str, Any]:
+        facts = {"trainer": "pinn_obs", "seed": self.config.seed, "per_record": True}
+        return {**facts, "config": asdict(self.config)}
+
+    def fit(self, record: Record) -> list[Trained]:
+        """Train on each row of the record; see `trainers.pinn_obs.train_rows`."""
+        benchmark = self.system.setups["benchmark"].noise_std
+        noise_std = benchmark if self.noise_std is None else self.noise_std
+        return trainer("pinn_obs").train_rows(
+            self.system, self.config, record=record, noise_std=noise_std, folder=self.folder
+        )
+
+    def run(self, record: Record) -> Estimates:
+        return estimates_of(self.fit(record), record.t)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimates, OfflineEstimator
-from pinnobs_gym.kalman import GaussianEstimator, checked
-from pinnobs_gym.record import Record
-from pinnobs_gym.smoother import backward, forward
+from pinnobs_gym.estimation.adapters import OfflineEstimator
+from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
+from pinnobs_gym.estimation.smoother import backward, forward
+from pinnobs_gym.simulation.record import Record
 
 
 @dataclass(frozen=True)

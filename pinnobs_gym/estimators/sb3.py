@@ -13,11 +13,11 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from pinnobs_gym.actions import Form, Memory, form_of
-from pinnobs_gym.estimator import Estimator, State
-from pinnobs_gym.record import Prior
-from pinnobs_gym.system import Setup, System
-from pinnobs_gym.trained_file import check_same, identity, read, write
+from pinnobs_gym.envs.actions import Form, Memory, form_of
+from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import Setup, System
 
 Layer = tuple[np.ndarray, np.ndarray]
 """Weights (rows, columns) and biases (rows,)."""
@@ -173,8 +173,8 @@ class Sb3(Estimator):
     """An agent that was trained by reinforcement learning with Stable-Baselines3, at work without
     exploration. Its reward in training was made of the true states.
 
-    What its actions mean is a form of `pinnobs_gym.actions`: with ``gain`` it is an observer on the
-    model whose gain the agent chooses at every sample.
+    What its actions mean is a form of `pinnobs_gym.envs.actions`: with ``gain`` it is an observer
+    on the model whose gain the agent chooses at every sample.
     """
 
     trained: TrainedAgent = field(kw_only=True, repr=False)

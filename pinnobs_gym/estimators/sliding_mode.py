@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Estimator, Range, State
-from pinnobs_gym.gains import default_rate, injection, settling_gain
-from pinnobs_gym.record import Prior
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.observer_gains import default_rate, injection, settling_gain
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class SlidingMode(Estimator):
     method with the secant of the saturation, so that it does not chatter.
 
     Default tuning, the same rule for all systems: L as in the Luenberger observer
-    (`pinnobs_gym.gains.settling_gain`), ε = `layer` standard deviations of the output noise, ρ =
-    `switching`·ε.
+    (`pinnobs_gym.estimation.observer_gains.settling_gain`), ε = `layer` standard deviations of the
+    output noise, ρ = `switching`·ε.
     """
 
     rate: float | None = None

@@ -6,16 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimator import Range, State
-from pinnobs_gym.kalman import (
-    GaussianEstimator,
-    checked,
-    joseph_update,
-    observe,
-    predicted,
-    sandwich,
-)
-from pinnobs_gym.record import Prior
+from pinnobs_gym.estimation.estimator import Range, State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
+from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.simulation.matrices import sandwich
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,15 @@
 """The plants, one file each. A file put here is found, registered as an env, checked and ranked."""
 
-from pinnobs_gym.registry import Registry
-from pinnobs_gym.system import System
+from __future__ import annotations
 
-SYSTEMS: Registry[System] = Registry("system", System, __name__)
+from typing import TYPE_CHECKING
+
+from pinnobs_gym.registry import Registry
+
+if TYPE_CHECKING:
+    from pinnobs_gym.simulation.system import System
+
+SYSTEMS: Registry[System] = Registry(
+    "system", "pinnobs_gym.simulation.system:System", __name__, "state_names", "setups"
+)
 """All systems by class name."""

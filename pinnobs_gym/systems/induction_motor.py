@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from array_api_compat import array_namespace
 
-from pinnobs_gym.system import Array, Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pinnobs_gym.system import Array, Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 
 @dataclass(frozen=True)

@@ -10,18 +10,18 @@ import numpy as np
 from benchmarks import Figure, at_least, at_most, cpu_seconds
 from benchmarks.core import filterpy_ekf, system_step
 from pinnobs_gym import evaluate
-from pinnobs_gym.bound import cramer_rao, expected_scores
-from pinnobs_gym.episodes import EpisodeSource, Stream
-from pinnobs_gym.estimator import Estimator
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
 from pinnobs_gym.estimators.ukf import UKF
-from pinnobs_gym.kalman import GaussianEstimator
-from pinnobs_gym.metrics import score
-from pinnobs_gym.record import Record
-from pinnobs_gym.simulate import model_step
+from pinnobs_gym.scoring.cramer_rao import cramer_rao, expected_scores
+from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 

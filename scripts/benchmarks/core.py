@@ -9,11 +9,12 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from benchmarks import Figure, at_least, at_most, cpu_seconds, median_ratio
-from pinnobs_gym import env_id, evaluate
-from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym import evaluate
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.record import Record
-from pinnobs_gym.simulate import truth
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 

@@ -14,15 +14,16 @@ import trainers.kkl_autoencoder
 import trainers.kkl_pinn
 import trainers.kkl_supervised
 from benchmarks import Figure, at_most
-from pinnobs_gym import env_id, evaluate
+from pinnobs_gym import evaluate
+from pinnobs_gym.envs.registration import env_id, record_of
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.kkl.observer import KKL, TrainedKKL
-from pinnobs_gym.leaderboard import markdown_table
-from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.simulate import truth
-from pinnobs_gym.suite import TRAINING_SEED, record_of
+from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
+from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+from pinnobs_gym.training.by_name import TRAINING_SEED
 
 MODULES: dict[str, ModuleType] = {
     "kkl_supervised": trainers.kkl_supervised,

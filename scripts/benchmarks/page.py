@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import Figure, at_most
-from pinnobs_gym import curves, env_id, rows
-from pinnobs_gym.conditions import CONDITIONS
-from pinnobs_gym.curves import Example
-from pinnobs_gym.evaluation import versions
-from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
-from pinnobs_gym.rows import Row
-from pinnobs_gym.site import page
+from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.leaderboard.site import page
+from pinnobs_gym.scoring import curves, rows
+from pinnobs_gym.scoring.curves import Example
+from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.scoring.provenance import versions
+from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.systems import SYSTEMS
 
 ESTIMATORS = 20

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from benchmarks import Figure, at_most, cpu_seconds
-from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.estimation.learned.mlp import Architecture, Network
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, Trained
-from pinnobs_gym.network import Architecture, Network
-from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.simulate import truth
-from pinnobs_gym.system import System
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import Config, train
 from trainers.pinn_obs.fast import FastRun

@@ -7,12 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks import Figure, at_most, cpu_seconds
-from pinnobs_gym import env_id, evaluate
+from pinnobs_gym import evaluate
+from pinnobs_gym.envs.registration import env_id, record_of
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
-from pinnobs_gym.rows import Row
-from pinnobs_gym.suite import TRAINING_SEED, record_of
+from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.training.by_name import TRAINING_SEED
 from trainers.pinn_gain import Config, train
 
 SEEDS = 3

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from benchmarks import Figure, at_least, cpu_seconds, median_ratio
-from pinnobs_gym.episodes import EpisodeSource, Stream
-from pinnobs_gym.record import Record
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.simulation.record import Record
 from trainers.pinn_obs import Config, train, train_many
 from trainers.pinn_obs.fast import FastRun
 from trainers.pinn_obs.objective import Objective

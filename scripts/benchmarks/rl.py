@@ -13,13 +13,14 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from benchmarks import Figure, at_least, at_most, median_ratio
-from pinnobs_gym import env_id, evaluate, suite
+from pinnobs_gym import evaluate
+from pinnobs_gym.envs.registration import env_id, make_vector_env
+from pinnobs_gym.envs.sb3_env import Sb3VecEnv
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
-from pinnobs_gym.evaluation import make_vector_env
-from pinnobs_gym.leaderboard import markdown_table
-from pinnobs_gym.rows import Row
-from pinnobs_gym.sb3_env import Sb3VecEnv
+from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.training import by_name
 from trainers.rl import Config
 
 SEEDS = 3
@@ -93,8 +94,8 @@ def _of(values: dict[str, float], start: str, end: str = "") -> float:
 
 def trained_on(name: str, seed: int) -> TrainedAgent:
     """An agent trained by the default recipe."""
-    played = suite.Played(env_id(name), "benchmark", "nominal", suite.TRAINING_SEED)
-    return suite.train("rl", Config(seed=seed), played)
+    played = by_name.Played(env_id(name), "benchmark", "nominal", by_name.TRAINING_SEED)
+    return by_name.train("rl", Config(seed=seed), played)
 
 
 def scores(name: str, trained: TrainedAgent) -> list[Row]:

@@ -17,11 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import Figure, at_least, at_most
-from pinnobs_gym import leaderboard, overview, planning, rows
-from pinnobs_gym.engine import Engine, Where
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.metrics import OPTIONAL_SCORES, SCORES
-from pinnobs_gym.suites import Entry, Suite
+from pinnobs_gym.leaderboard import ranks, ranks_table, standings_table
+from pinnobs_gym.leaderboard.jobs import plan
+from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
+from pinnobs_gym.leaderboard.suites import Entry, Suite
+from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.systems import SYSTEMS
 
 JOBS = 2000
@@ -159,7 +161,7 @@ def two_over_one(repeats: int) -> Figure:
 
     def seconds(processes: int) -> float:
         with tempfile.TemporaryDirectory() as folder:
-            jobs = planning.jobs_of(suite, Path(folder))
+            jobs = plan.jobs_of(suite, Path(folder))
             begun = time.perf_counter()
             for job, error in Engine(Where(processes)).run(jobs):
                 assert error is None, (job, error)
@@ -179,8 +181,8 @@ def many_rows() -> Iterator[Figure]:
         begun = time.perf_counter()
         stored = rows.load(path)
         read = time.perf_counter()
-        leaderboard.markdown(leaderboard.tables(stored.rows, stored.failures))
-        overview.markdown(overview.lines(stored.rows), overview.ranks(stored.rows))
+        standings_table.markdown(standings_table.tables(stored.rows, stored.failures))
+        ranks_table.markdown(ranks.lines(stored.rows), ranks.ranks(stored.rows))
         end = time.perf_counter()
     yield at_most(f"{ROWS:,} rows read", read - begun, "s", 4)
     yield at_most(f"{ROWS:,} rows read, and all tables", end - begun, "s", 4)

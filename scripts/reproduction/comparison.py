@@ -18,14 +18,14 @@ import trainers.kkl_autoencoder
 import trainers.kkl_pinn
 import trainers.kkl_supervised
 import trainers.pinn_obs
-from pinnobs_gym.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.estimators.kkl import KKL
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
-from pinnobs_gym.evaluation import canonical
-from pinnobs_gym.kkl.observer import KKL
-from pinnobs_gym.metrics import score
-from pinnobs_gym.record import Record
-from pinnobs_gym.rows import Row
-from pinnobs_gym.shared_file import append_lines
+from pinnobs_gym.files import append_lines
+from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.scoring.provenance import canonical
+from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.simulation.record import Record
 
 METHODS: Mapping[str, ModuleType] = {
     "pinn_obs": trainers.pinn_obs,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.pinn_obs import Trained
-from pinnobs_gym.figures import state_figure
-from pinnobs_gym.system import System
+from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs import gain_figure
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pinnobs_gym.rows import Row
+from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
 from reproduction.running import PLAYED, REPEATS, Job
 from reproduction.tables import Case, Printed, Table

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from machine import processor
 
-from pinnobs_gym import env_id
+from pinnobs_gym.cli.output import write_figure
+from pinnobs_gym.envs.registration import env_id, record_of
 from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, Trained
-from pinnobs_gym.evaluation import canonical, score_batch, versions
-from pinnobs_gym.log import Log
-from pinnobs_gym.report import write_figure
-from pinnobs_gym.rows import Row
-from pinnobs_gym.suite import record_of
-from pinnobs_gym.system import System
+from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.scoring.provenance import canonical, versions
+from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.training.log import Log
 from reproduction.figures import estimates_figure, loss_figure, readable_gain_figure
 from reproduction.tables import Case
 from trainers.pinn_obs import Config, train

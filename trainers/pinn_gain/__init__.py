@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from pinnobs_gym.estimators.pinn_gain import TrainedGain
-from pinnobs_gym.log import SILENT, Log
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System, vector
-from pinnobs_gym.training import bar, interruption
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.training.log import SILENT, Log
+from pinnobs_gym.training.loop import bar, interruption
 from trainers.pinn_gain.checkpoint import restore, save
 from trainers.pinn_gain.config import Config
 from trainers.pinn_gain.run import Run

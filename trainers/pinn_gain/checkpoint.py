@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.trained_file import check_same, identity, read, write
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
 from trainers.pinn_gain.run import Best, Run
 
 _FREE = ("iterations", "budget", "checkpoint_every", "log_every")

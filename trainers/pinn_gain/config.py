@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import get_args
 
-from pinnobs_gym.estimators.gain_network import Variant
-from pinnobs_gym.training import expect
+from pinnobs_gym.estimation.learned.gain_network import Variant
+from pinnobs_gym.training.loop import expect
 
 
 @dataclass(frozen=True)

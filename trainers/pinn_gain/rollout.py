@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.estimators.gain_network import (
+from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
     corrected_gain,
     recurrent_gain,
     remembered,
 )
-from pinnobs_gym.simulate import model_step_jacobian
-from pinnobs_gym.system import System
+from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.system import System
 
 Weights = Sequence[tuple[Tensor, Tensor]]
 

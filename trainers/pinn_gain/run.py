@@ -12,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.estimator import output_scale
+from pinnobs_gym.estimation.learned.gain_network import memory_size, shapes
+from pinnobs_gym.estimation.learned.trained_file import identity
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.gain_network import memory_size, shapes
 from pinnobs_gym.estimators.pinn_gain import Layers, TrainedGain
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System, vector
-from pinnobs_gym.trained_file import identity
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System, output_scale, vector
 from trainers.pinn_gain.config import Config
 from trainers.pinn_gain.held_out import HeldOut
 from trainers.pinn_gain.rollout import Model

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pinnobs_gym.estimation.smoother import backward, forward
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.record import Record
-from pinnobs_gym.smoother import backward, forward
-from pinnobs_gym.system import vector
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import vector
 
 PROCESS_NOISE = (30.0, 1.0)
 """Process noise, over the EKF's, of further attempts at records that the first leaves unexplained,

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
 from trainers.pinn_gain.rollout import Model, Moment, Weights, predict, update
 from trainers.pinn_gain.smooth import Smoothed
 

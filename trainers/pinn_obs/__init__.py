@@ -7,19 +7,16 @@ Nonlinear Dynamical Systems". Equation numbers are the paper's.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from pinnobs_gym.estimator import Estimates, OfflineEstimator
-from pinnobs_gym.estimators.pinn_obs import Trained, estimates_of
-from pinnobs_gym.log import SILENT, Log
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System, vector
-from pinnobs_gym.training import bar, interruption
+from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.training.log import SILENT, Log
+from pinnobs_gym.training.loop import bar, interruption
 from trainers.pinn_obs.config import Config
 from trainers.pinn_obs.fast import FastRun
 from trainers.pinn_obs.paper import PaperRun
@@ -27,7 +24,7 @@ from trainers.pinn_obs.progress import described, gain_figure, log_end, log_term
 from trainers.pinn_obs.run import Run
 from trainers.pinn_obs.stacked import advance
 
-__all__ = ["Config", "PinnObs", "gain_figure", "train", "train_many"]
+__all__ = ["Config", "gain_figure", "train", "train_many", "train_rows"]
 
 MIN_SAMPLES = 10
 """The shortest record that is trained on."""
@@ -128,6 +125,43 @@ def train_many(
         return found
 
 
+def train_rows(
+    system: System,
+    config: Config,
+    *,
+    record: Record,
+    noise_std: Sequence[float] | float | None = None,
+    folder: Path | None = None,
+) -> list[Trained]:
+    """Train on each row of a record, and keep what comes of it in a folder if one is given.
+
+    Args:
+        system: the model.
+        config: the recipe; its seed is that of every row.
+        record: the samples of all episodes.
+        noise_std: see `train`.
+        folder: where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained
+            network, by `train`; without one nothing is kept, and `train_many` is used.
+    """
+    if folder is None:
+        return train_many(system, config, record=record, noise_std=noise_std)
+    found = []
+    for i in range(record.batch):
+        place = folder / f"row-{i}"
+        with Log(place) as log:
+            trained = train(
+                system,
+                config,
+                record=record.rows(slice(i, i + 1)),
+                noise_std=noise_std,
+                log=log,
+                checkpoint=place / "checkpoint.pt",
+            )
+        trained.save(place / "trained.pt")
+        found.append(trained)
+    return found
+
+
 def _device(config: Config) -> str:
     there = torch.cuda.is_available()
     if config.device == "cuda" and not there:
@@ -176,60 +210,3 @@ def _check(system: System, record: Record, config: Config) -> None:
     there = [column[~np.isnan(column)] for column in y.T]
     if not any(len(column) and np.ptp(column) > 0 for column in there):
         raise ValueError(f"y of {name} does not vary over the record; there is nothing to learn")
-
-
-@dataclass(frozen=True)
-class PinnObs(OfflineEstimator):
-    """PINN-Obs trained anew on every record it is given, and its network's x̂(t)."""
-
-    config: Config = field(default_factory=Config)
-    """The recipe; its seed is that of every row."""
-    folder: Path | None = field(default=None, repr=False)
-    """Where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained network; None
-    keeps nothing."""
-
-    name = "pinn_obs"
-    equations = r"""
-(\hat x(t), L(t)) &= \text{network}_\vartheta(t) \\
-\min_\vartheta \; & w_0 \| \hat x(t_0) - \hat x_0 \|^2
-+ w_y \operatorname{mean} \| h(\hat x) - y \|^2 \\
-& + w_{\mathrm{ode}} \operatorname{mean}
-\bigl\| \dot{\hat x} - f(t, \hat x, u) - L\, (y - h(\hat x)) \bigr\|^2 \\
-& + w_{\mathrm{guide}} \operatorname{mean} \| \hat x - x^{\mathrm{smoother}} \|^2
-+ w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2
-"""
-    trains_on_record = "pinn_obs"
-
-    @property
-    def training(self) -> dict[str, Any]:
-        facts = {"trainer": "pinn_obs", "seed": self.config.seed, "per_record": True}
-        return {**facts, "config": asdict(self.config)}
-
-    def fit(self, record: Record) -> list[Trained]:
-        """Train on each row of the record: by `train` if it is kept in a folder, or else by
-        `train_many`."""
-        if self.folder is None:
-            told = self._told_noise
-            return train_many(self.system, self.config, record=record, noise_std=told)
-        return [self._fit_row(record, i, self.folder / f"row-{i}") for i in range(record.batch)]
-
-    def run(self, record: Record) -> Estimates:
-        return estimates_of(self.fit(record), record.t)
-
-    @property
-    def _told_noise(self) -> Sequence[float] | float:
-        benchmark = self.system.setups["benchmark"].noise_std
-        return benchmark if self.noise_std is None else self.noise_std
-
-    def _fit_row(self, record: Record, i: int, folder: Path) -> Trained:
-        with Log(folder) as log:
-            trained = train(
-                self.system,
-                self.config,
-                record=record.rows(slice(i, i + 1)),
-                noise_std=self._told_noise,
-                log=log,
-                checkpoint=folder / "checkpoint.pt",
-            )
-        trained.save(folder / "trained.pt")
-        return trained

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.quasi_newton import Objective
+from trainers.pinn_obs.quasi_newton import Objective
 
 _MEAN, _SQUARE = 0.9, 0.999
 """β₁ and β₂, what the two averages keep of themselves in a step."""

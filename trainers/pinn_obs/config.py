@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
-from pinnobs_gym.network import Activation, Architecture, Precision
-from pinnobs_gym.training import expect
+from pinnobs_gym.estimation.learned.mlp import Activation, Architecture, Precision
+from pinnobs_gym.training.loop import expect
 
 Preset: TypeAlias = Literal["fast", "paper"]
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from pinnobs_gym.estimation.learned.mlp import Architecture, Network
 from pinnobs_gym.estimators.pinn_obs import Covariance
-from pinnobs_gym.network import Architecture, Network
-from pinnobs_gym.quasi_newton import Inverse, QuasiNewton
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
 from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
+from trainers.pinn_obs.quasi_newton import Inverse, QuasiNewton
 from trainers.pinn_obs.run import Run
 
 UNITS = 20

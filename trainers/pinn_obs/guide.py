@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.record import Prior, Record
-from pinnobs_gym.smoother import Filtered
-from pinnobs_gym.system import System
+from pinnobs_gym.estimation.smoother import Filtered
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.objective import Points
 from trainers.pinn_obs.points import on_lines
 from trainers.pinn_obs.smoother import forward, smooth

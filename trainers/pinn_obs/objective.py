@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from array_api_compat import array_namespace
 
-from pinnobs_gym.network import Architecture
-from pinnobs_gym.system import Array, System
+from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.simulation.system import Array, System
 from trainers.pinn_obs.passes import Passes, inputs_of
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pinnobs_gym.network import Architecture, Network
+from pinnobs_gym.estimation.learned.mlp import Architecture, Network
 from trainers.pinn_obs.adam import Adam
 from trainers.pinn_obs.objective import Objective, Weights
 from trainers.pinn_obs.points import samples_of

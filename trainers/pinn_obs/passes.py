@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from array_api_compat import array_namespace, device
 
-from pinnobs_gym.network import Architecture, Network
-from pinnobs_gym.system import Array
+from pinnobs_gym.estimation.learned.mlp import Architecture, Network
+from pinnobs_gym.simulation.system import Array
 
 _CHUNK = 2000
 """Columns of a matrix product whose result is small; more of them fall out of the cache."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.objective import Points
 
 _FIRST = 30

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.pinn_obs import Trained
-from pinnobs_gym.figures import state_figure
-from pinnobs_gym.log import Log
-from pinnobs_gym.system import System
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.training.log import Log
 from trainers.pinn_obs.run import Run
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from pinnobs_gym.estimation.learned.mlp import Architecture, Network
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
 from pinnobs_gym.estimators.pinn_obs import Covariance, Trained
-from pinnobs_gym.network import Architecture, Network
-from pinnobs_gym.record import Record
-from pinnobs_gym.system import System
-from pinnobs_gym.trained_file import check_same, identity, read, write
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.config import Config
 from trainers.pinn_obs.minimum import Best, Mark, Method
 from trainers.pinn_obs.objective import Objective

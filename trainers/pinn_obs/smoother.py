@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pinnobs_gym import smoother
-from pinnobs_gym.record import Record
-from pinnobs_gym.smoother import Filtered, Path, backward
-from pinnobs_gym.system import System, vector
+from pinnobs_gym.estimation import smoother
+from pinnobs_gym.estimation.smoother import Filtered, Path, backward
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System, vector
 
 DRIFT = 1e-4
 """Standard deviation of the model's defect from one sample to the next, over the scale."""
@@ -31,7 +31,7 @@ def smooth(system: System, record: Record, noise: np.ndarray, caution: float) ->
         system: the model.
         record: the samples.
         noise: standard deviations of the output noise, shape (ny,), in output units; positive.
-        caution: see `pinnobs_gym.smoother.forward`; of the first pass.
+        caution: see `pinnobs_gym.estimation.smoother.forward`; of the first pass.
     """
     path = backward(forward(system, record, noise, caution=caution))
     narrowed = _WIDE * _NARROWING ** np.arange(2 * _PASSES)
@@ -53,7 +53,7 @@ def forward(
     drift: float = DRIFT,
     caution: float = 0.0,
 ) -> Filtered:
-    """`pinnobs_gym.smoother.forward`, told standard deviations.
+    """`pinnobs_gym.estimation.smoother.forward`, told standard deviations.
 
     Args:
         system: the model.

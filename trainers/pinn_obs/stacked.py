@@ -16,7 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.quasi_newton import (
+from trainers.pinn_obs.minimum import FIRST_STEP
+from trainers.pinn_obs.objective import Objective
+from trainers.pinn_obs.quasi_newton import (
     CURVATURE,
     Search,
     curved,
@@ -24,8 +26,6 @@ from pinnobs_gym.quasi_newton import (
     trials,
     update_weights,
 )
-from trainers.pinn_obs.minimum import FIRST_STEP
-from trainers.pinn_obs.objective import Objective
 from trainers.pinn_obs.run import Run
 
 
@@ -60,7 +60,7 @@ def advance(runs: Sequence[Run], device: str, stopped: Sequence[bool]) -> None:
 
 class Minimisations:
     """Self-scaled Broyden minimisations in progress, one per objective: what
-    `pinnobs_gym.quasi_newton.QuasiNewton` is for one.
+    `trainers.pinn_obs.quasi_newton.QuasiNewton` is for one.
 
     Args:
         objectives: of networks of one shape, at as many points each.

@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 
 from pinnobs_gym.estimators.sb3 import TrainedAgent
-from pinnobs_gym.log import SILENT, Log
-from pinnobs_gym.suite import Played
-from pinnobs_gym.system import System
-from pinnobs_gym.training import bar, interruption
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.training.by_name import Played
+from pinnobs_gym.training.log import SILENT, Log
+from pinnobs_gym.training.loop import bar, interruption
 from trainers.rl.config import Config
 
 __all__ = ["Config", "train"]

@@ -19,12 +19,12 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import nn
 
+from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.sb3_env import Sb3VecEnv
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity
 from pinnobs_gym.estimators.sb3 import Layer, TrainedAgent, setup_of
-from pinnobs_gym.evaluation import make_vector_env
-from pinnobs_gym.sb3_env import Sb3VecEnv
-from pinnobs_gym.suite import Played
-from pinnobs_gym.system import System
-from pinnobs_gym.trained_file import check_same, identity
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.training.by_name import Played
 from trainers.rl.config import Config
 
 SEEDS_APART = 1000

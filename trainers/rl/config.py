@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
-from pinnobs_gym.training import expect
+from pinnobs_gym.training.loop import expect
 
 Algorithm: TypeAlias = Literal["ppo", "sac", "td3", "recurrent_ppo"]
 Mode: TypeAlias = Literal["gain", "correction", "normalized"]
@@ -59,7 +59,7 @@ class Config:
     algorithm: Algorithm = "ppo"
     """The algorithm; recurrent_ppo needs the extra ``rl``."""
     action_mode: Mode = "gain"
-    """What the agent's actions mean; see `pinnobs_gym.actions`."""
+    """What the agent's actions mean; see `pinnobs_gym.envs.actions`."""
     steps: int = 300_000
     """Most steps of training, those of all rows together; only whole rollouts are made."""
     rows: int | None = None

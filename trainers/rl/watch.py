@@ -12,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
-from pinnobs_gym.evaluation import score_batch
+from pinnobs_gym.scoring.playing import score_batch
 from trainers.rl.agent import Training
 
 HELD_OUT = 500_000

@@ -1,0 +1,76 @@
+"""The command `pinnobs`: each of its commands is a module of `pinnobs_gym.cli.commands`."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Sequence
+
+from threadpoolctl import threadpool_limits
+
+from pinnobs_gym.cli import commands
+
+COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
+"""What the command can do."""
+
+
+def usage() -> str:
+    """One line for each command, from the first line of its module."""
+    lines = ["usage: pinnobs COMMAND ...", ""]
+    for name in COMMANDS:
+        module = importlib.import_module(f"{commands.__name__}.{name}")
+        call, _, what = (module.__doc__ or name).partition("\n")[0].partition(": ")
+        lines.append(f"  {call.strip('`'):21} {what.rstrip('.')}")
+    return "\n".join(
+        [
+            *lines,
+            "",
+            "pinnobs COMMAND --help says more. A system or estimator of your own is given as "
+            "module:Class.",
+            "With PINNOBS_TRACEBACK=1 in the environment an error shows where it came from.",
+        ]
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status: 0, 1 if a job failed, 2 for bad input."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if arguments else 2
+    _one_thread()
+    sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
+    name, rest = arguments[0], list(arguments[1:])
+    try:
+        if name not in COMMANDS:
+            raise ValueError(f"unknown command {name!r}; known are {', '.join(COMMANDS)}")
+        return importlib.import_module(f"{commands.__name__}.{name}").run(rest)
+    except (ValueError, TypeError, FloatingPointError) as error:
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        print(f"pinnobs: error: {error}", file=sys.stderr)
+        return 2
+    except ConnectionError as error:  # to other machines, while they worked
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        print(f"pinnobs: error: {error}", file=sys.stderr)
+        return 1
+    except Exception as error:  # of a plug-in, or a fault of ours
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        print(f"pinnobs: error: {what} (PINNOBS_TRACEBACK=1 shows where)", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("pinnobs: stopped; what was written is kept", file=sys.stderr)
+        return 130
+
+
+def _one_thread() -> None:
+    """Run numerical libraries on one thread unless OMP_NUM_THREADS says otherwise: the arrays are
+    so small that several threads mostly wait for each other."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        os.environ["OMP_NUM_THREADS"] = "1"  # for what is loaded later, torch and workers among it
+        threadpool_limits(1)

@@ -1,0 +1,82 @@
+"""`estimate ...`: estimate the states behind a sensor log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.options import parse, settings_of
+from pinnobs_gym.cli.output import write_estimates, write_figure
+from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.files import check_writable
+from pinnobs_gym.simulation.record import Prior, read_log
+from pinnobs_gym.systems import SYSTEMS
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate the states behind a sensor log: a CSV file with columns t, y1, ... and u1, ..."""
+
+    system: str
+    """Name or module:Class of the model."""
+    log: Path
+    """The CSV file; sample times may be irregular, empty cells are missing outputs."""
+    estimator: str = "ekf"
+    """Name or module:Class of the estimator."""
+    set: tuple[str, ...] = ()
+    """Settings of the estimator, such as process_noise=1e-3."""
+    xhat0: tuple[float, ...] | None = None
+    """Initial estimate; the benchmark's if not given."""
+    P0_std: tuple[float, ...] | None = None
+    """Its standard deviations; the benchmark's if not given."""
+    noise_std: tuple[float, ...] | None = None
+    """Standard deviations of the output noise; the benchmark's if not given."""
+    out: Path = Path("estimates.csv")
+    """Where the estimates go; a picture of the same name and the ending .png lies beside it."""
+
+    def run(self) -> int:
+        """Estimate and write."""
+        env_id(self.system)  # checks and registers a system of the user's
+        cls = SYSTEMS.resolve(self.system)
+        system, setup = cls.configured(noise_std=self.noise_std)
+        given = {"xhat0": self.xhat0, "P0_std": self.P0_std}
+        setup = replace(setup, **{name: value for name, value in given.items() if value})
+        prior = Prior.of(system, setup, 1)
+        system, record = read_log(self.log, system, prior)
+        kind = ESTIMATORS.resolve(self.estimator)
+        if kind.needs_training is not None:
+            raise ValueError(
+                f"estimator {self.estimator!r} is trained beforehand; for a log take one that is "
+                f"not, or trains on the record"
+            )
+        picture = self.out.with_suffix(".png")
+        if picture == self.out or self.log.resolve() in (self.out.resolve(), picture.resolve()):
+            raise ValueError(f"out={self.out} would overwrite the log or the picture; name a .csv")
+        check_writable(self.out.parent)
+        estimator = kind.for_setup(system, setup, **settings_of(kind, self.set))
+        estimates = estimator.run(record)
+        if not np.isfinite(estimates.xhat).all():
+            console.print("warning: the estimates leave the finite numbers", style="yellow")
+        write_estimates(self.out, system, record, estimates)
+        P = None if estimates.P is None else estimates.P[0]
+        title = f"{self.log.name}: {type(system).__name__}, {estimator.label}"
+        figure = state_figure(system, record.t, estimates.xhat[0], y=record.y[0], P=P, title=title)
+        write_figure(picture, figure)
+        last = ", ".join(
+            f"{name} = {value:.6g}"
+            for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
+        )
+        console.print(f"{record.num_samples} samples; at t = {record.t[-1]:g} s: {last}")
+        console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
+        return 0
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns its exit status."""
+    return parse(Estimate, "estimate", arguments).run()

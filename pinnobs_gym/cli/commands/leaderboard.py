@@ -1,0 +1,144 @@
+"""`leaderboard ...`: run every estimator on every system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pinnobs_gym.cli.console import RunView, console, print_grid, print_table
+from pinnobs_gym.cli.options import parse
+from pinnobs_gym.files import check_writable, replacing
+from pinnobs_gym.leaderboard import ranks, ranks_table, standings_table, suites
+from pinnobs_gym.leaderboard.jobs import plan
+from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
+from pinnobs_gym.scoring import rows, tensorboard
+
+PROCESSES = 2
+"""At a time, if none are asked for."""
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """Run every estimator on every system and print the tables; what is already there is kept."""
+
+    suite: str = "leaderboard"
+    """What is played: full, leaderboard, paper, quick, or the path of a TOML file of your own. The
+    options from systems to seed change it."""
+    systems: tuple[str, ...] = ()
+    """Names or module:Class of systems."""
+    estimators: tuple[str, ...] = ()
+    """Names or module:Class of estimators."""
+    setup: str | None = None
+    """Setup that is played."""
+    condition: tuple[str, ...] = ()
+    """Conditions; nominal, and the one that a system is ranked under, if neither this nor the suite
+    names any. With "all", those that need no training play every condition that fits the system."""
+    episodes: int | None = None
+    """Episodes of each estimator and system."""
+    trained_episodes: int | None = None
+    """Episodes of those that train on every record."""
+    budget: tuple[float, ...] = ()
+    """CPU seconds of each training; of several, one after the other."""
+    training_seeds: tuple[int, ...] = ()
+    """Seeds of each training."""
+    seed: int | None = None
+    """Seed of the first episode."""
+    jobs: int | None = None
+    """Processes at a time on this machine, one thread each; 2 if not given."""
+    backend: Literal["loky", "dask"] = "loky"
+    """Where jobs are run: processes of this machine, or the workers of a Dask scheduler."""
+    scheduler: str | None = None
+    """Address of the Dask scheduler, such as tcp://host:8786."""
+    retry_failed: bool = False
+    """Run the jobs again that failed before; they are left out otherwise."""
+    out: Path = Path("runs/leaderboard")
+    """Folder of rows, tables, TensorBoard log and trained files."""
+
+    def run(self) -> int:
+        """Run what is missing, then print and write the tables."""
+        where = self._where()
+        played = suites.load(self.suite).changed(
+            systems=self.systems,
+            estimators=self.estimators,
+            setup=self.setup,
+            conditions=self.condition,
+            episodes=self.episodes,
+            trained_episodes=self.trained_episodes,
+            budgets=self.budget,
+            training_seeds=self.training_seeds,
+            seed=self.seed,
+        )
+        check_writable(self.out)
+        path = self.out / "rows.jsonl"
+        stored = rows.load(path)  # a damaged file is refused before anything is run
+        if stored.warning:
+            console.print(stored.warning, style="yellow", soft_wrap=True)
+        jobs = plan.jobs_of(played, self.out.absolute())
+        to_run, left_out = plan.left(jobs, stored, self.retry_failed)
+        engine = Engine(where)
+        with RunView(len(to_run), lambda: [job.name for job in engine.running]) as view:
+            for job, error in engine.run(to_run):
+                view.ended(job.name, error)
+        stored = rows.load(path)
+        tensorboard.log_summaries(self.out, stored.rows)
+        self._report(stored, {job.condition for job in jobs})
+        if left_out:
+            console.print(
+                f"{len(left_out)} job(s) failed before and were left out; --retry-failed runs "
+                "them again",
+                style="yellow",
+                soft_wrap=True,
+            )
+        return 1 if view.failed or left_out else 0
+
+    def _where(self) -> Where:
+        if self.backend == "dask":
+            if self.scheduler is None:
+                raise ValueError("backend 'dask' without a scheduler; expected --scheduler ADDRESS")
+            if self.jobs is not None:
+                told = "the scheduler's workers say how many run at a time"
+                raise ValueError(f"jobs={self.jobs} with backend 'dask': {told}")
+            return Where(scheduler=self.scheduler)
+        if self.scheduler is not None:
+            raise ValueError(f"scheduler={self.scheduler!r} goes with --backend dask")
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"jobs={self.jobs}; expected at least 1")
+        return Where(self.jobs or PROCESSES)
+
+    def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
+        """Print and write what came of it."""
+        scored = stored.rows
+        lines, placed = ranks.lines(scored), ranks.ranks(scored)
+        tables = standings_table.tables(scored, stored.failures)
+        shown = [table for table in tables if table.condition in conditions]
+        for table in shown if len(conditions) <= 2 else ():
+            print_table(table)
+        console.print(standings_table.NOTE if len(conditions) <= 2 else "")
+        print_grid("Across systems", *ranks_table.cells(lines))
+        console.print(ranks_table.NOTE)
+        if len(placed) > 1:
+            print_grid("Ranks", *ranks_table.rank_cells(placed))
+            console.print(ranks_table.RANK_NOTE)
+        path = self.out / "leaderboard.md"
+        with replacing(path) as temporary:
+            text = ranks_table.markdown(lines, placed) + "\n" + standings_table.markdown(tables)
+            temporary.write_text(text, encoding="utf-8")
+        for what, where in (
+            ("tables", path),
+            ("rows", self.out / "rows.jsonl"),
+            ("TensorBoard", self.out / "tensorboard"),
+            ("trained files", self.out / "trained"),
+        ):
+            if where.exists():
+                console.print(f"{what + ':':14} {where}", soft_wrap=True)
+        console.print(
+            f"to make a page: pinnobs report {self.out / 'rows.jsonl'} -o {self.out / 'site'}",
+            soft_wrap=True,
+        )
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns its exit status."""
+    return parse(Leaderboard, "leaderboard", arguments).run()

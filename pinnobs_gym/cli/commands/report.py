@@ -1,0 +1,55 @@
+"""`report ROWS -o site/`: make the page of a leaderboard."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.options import parse
+from pinnobs_gym.files import check_writable, replacing
+from pinnobs_gym.scoring import curves, rows
+
+
+@dataclass(frozen=True)
+class Report:
+    """Make one static page of scores, which needs no server and no network."""
+
+    rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Rows files, such as runs/leaderboard/rows.jsonl; what a folder "curves" beside each holds is
+    drawn too."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("site")
+    """Folder of the page, index.html."""
+
+    def run(self) -> int:
+        """Write the page."""
+        if not self.rows:
+            raise ValueError("no rows file is given; such as runs/leaderboard/rows.jsonl")
+        try:
+            from pinnobs_gym.leaderboard.site import page
+        except ImportError as error:
+            raise ValueError(
+                f"the page needs {error.name}: pip install 'pinnobs-gym[report]'"
+            ) from None
+        stored = rows.load_all(self.rows)
+        if stored.warning:
+            console.print(stored.warning, style="yellow", soft_wrap=True)
+        if not stored.rows:
+            raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
+        check_writable(self.out)
+        folders = list(dict.fromkeys(map(curves.folder_of, self.rows)))
+        text = page.build(stored.rows, stored.failures, folders)
+        path = self.out / "index.html"
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        console.print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+        return 0
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns its exit status."""
+    return parse(Report, "report", arguments).run()

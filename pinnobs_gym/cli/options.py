@@ -1,0 +1,92 @@
+"""What is given on a command line: options, and ``name=value`` settings of an estimator."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import tyro
+from rich.text import Text
+
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.registry import trainer
+
+T = TypeVar("T")
+
+
+def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any) -> T:
+    """A command's options from its arguments; ``options`` are those of `tyro.cli`.
+
+    Raises:
+        ValueError: in one line, if they are not what the command takes.
+    """
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.cli(kind, prog=f"pinnobs {command}", args=arguments, **options)
+    except SystemExit as end:
+        if not end.code:  # help was asked for, and printed
+            raise
+    raise ValueError(f"{_first_of(told.getvalue())}; see pinnobs {command} --help") from None
+
+
+def _first_of(box: str) -> str:
+    """What a framed message says between its title and its next rule, in one line."""
+    parts: list[list[str]] = [[]]
+    for line in Text.from_ansi(box).plain.splitlines():
+        text = line.strip("│| ")
+        if "──" in text or "---" in text:  # a rule, or the title within the frame
+            parts.append([])
+        else:
+            parts[-1].append(text)
+    said = [" ".join(" ".join(part).split()) for part in parts[1:]]
+    return next(filter(None, said), "the arguments are wrong").removesuffix(".")
+
+
+def settings_of(cls: type[Estimator], settings: Sequence[str]) -> dict[str, Any]:
+    """The values of ``name=value`` settings of an estimator, or of the recipe it trains by.
+
+    Raises:
+        ValueError: in one line, naming what is unknown and what is known.
+    """
+    base = {f.name for f in fields(Estimator)}
+    own = {f.name: f for f in fields(cls) if f.name not in base and f.repr}
+    trained_by = cls.trains_on_record
+    recipes = {} if trained_by is None else {"config": trainer(trained_by).Config}
+    hints = {n: h for n, h in get_type_hints(cls).items() if n in own and n not in recipes}
+    nested = {
+        name: (field_name, hint)
+        for field_name, recipe in recipes.items()
+        for name, hint in get_type_hints(recipe).items()
+    }
+    values: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if equals and name in hints:
+            values[name] = _parsed(setting, text, hints[name])
+        elif equals and name in nested:
+            field_name, hint = nested[name]
+            values.setdefault(field_name, {})[name] = _parsed(setting, text, hint)
+        else:
+            listed = ", ".join(sorted([*hints, *nested])) or "none"
+            raise ValueError(f"setting {setting!r}; expected name=value with a name of: {listed}")
+    for name, recipe in recipes.items():
+        if name in values:
+            values[name] = recipe(**values[name])
+    return values
+
+
+def _parsed(setting: str, text: str, hint: Any) -> Any:
+    """The text as the number or string that a field is declared to hold."""
+    kinds = get_args(hint) or (hint,)
+    for kind in (int, float):
+        if kind in kinds:
+            try:
+                return kind(text)
+            except ValueError:
+                expected = "a whole number" if kind is int else "a number"
+                raise ValueError(f"setting {setting!r}; expected {expected}") from None
+    return text

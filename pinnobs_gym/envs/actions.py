@@ -1,0 +1,332 @@
+"""What an agent's action means, and what it observes: forms of the same estimation task.
+
+A form turns the samples of a batch of episodes into features and actions into estimates. It sees
+what an estimator sees, outputs, inputs and the model, and is the same for single and vectorised
+envs, and for a trained agent at work (`pinnobs_gym.estimators.sb3`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from pinnobs_gym.estimation.gaussian import GaussianEstimator
+from pinnobs_gym.estimation.kalman import joseph_update, predict
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_scale, vector
+
+LARGEST_REWARD = 10.0
+"""Where the reward ``improvement`` is cut off, on either side."""
+OUTSIDE = 2.0
+"""Estimates of the gain and correction forms stay in the box of estimates times this."""
+_DRAWS = 33
+"""Episodes of the model that the typical error is taken from."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a form remembers of a batch of episodes."""
+
+    xhat: np.ndarray
+    """The prediction x̂(k|k−1), or after an action the estimate x̂(k|k), shape (batch, nx)."""
+    start: np.ndarray
+    """Times of the first samples in s, shape (batch,)."""
+    t: np.ndarray
+    """Times of the last samples in s, shape (batch,)."""
+    u: np.ndarray
+    """Inputs at the last samples, shape (batch, nu)."""
+    y: np.ndarray
+    """The last outputs, newest first, shape (batch, stack, ny); NaN before the first."""
+    surprise: np.ndarray
+    """Innovations over their typical standard deviation, shape (batch, ny); zero where y is
+    missing."""
+
+    def rows(self, rows: np.ndarray) -> Memory:
+        """That of some rows."""
+        return Memory(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def with_rows(self, rows: np.ndarray, other: Memory) -> Memory:
+        """The same with some rows replaced."""
+        merged = {}
+        for f in fields(self):
+            merged[f.name] = getattr(self, f.name).copy()
+            merged[f.name][rows] = getattr(other, f.name)
+        return Memory(**merged)
+
+
+class Form(ABC):
+    """A form of the task.
+
+    Args:
+        system: the model.
+        setup: how it is played; says the length of episodes, the prior and the noise.
+        stack: how many of the last outputs the features hold.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
+        if not (isinstance(stack, int | np.integer) and stack >= 1):
+            raise ValueError(f"stack={stack!r}; expected a whole number of at least 1")
+        self.system, self.setup, self.stack = system, setup, int(stack)
+        self.scale = vector(system.scale, system.nx, "scale")
+        bound = system.state_bound or tuple(10 * s for s in system.scale)
+        self.bound = np.asarray(bound, dtype=float)
+        self.duration = float(setup.times[-1])
+        self.observation_space = _features_box(self.num_features)
+        self.action_space = self._actions()
+
+    @property
+    @abstractmethod
+    def num_features(self) -> int:
+        """Number of features; the last is a time from 0 to 1."""
+
+    def _actions(self) -> Box:
+        """The space of actions."""
+        return Box(-1.0, 1.0, (self.system.nx,), np.float32)
+
+    def begin(self, mean: np.ndarray, t: np.ndarray, u: np.ndarray) -> Memory:
+        """The memory before the first samples.
+
+        Args:
+            mean: prior means x̂₀, shape (batch, nx).
+            t: times of the first samples in s, shape (batch,).
+            u: inputs at these, shape (batch, nu).
+        """
+        y = np.full((len(mean), self.stack, self.system.ny), np.nan)
+        return Memory(np.asarray(mean, dtype=float), t, t, u, y, y[:, 0])
+
+    def look(
+        self, memory: Memory, t: np.ndarray, y: np.ndarray, u: np.ndarray
+    ) -> tuple[np.ndarray, Memory]:
+        """The features (batch, num_features) of the samples at times t.
+
+        Args:
+            memory: after the action before.
+            t: sample times in s, shape (batch,).
+            y: outputs, shape (batch, ny); NaN is a missing one.
+            u: inputs, shape (batch, nu).
+        """
+        outputs = np.concatenate([y[:, None], memory.y[:, :-1]], axis=1)
+        memory = self._predicted(replace(memory, y=outputs), t, u)
+        memory = replace(memory, t=t, u=u)
+        return self._features(memory), memory
+
+    def _predicted(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+        """With what the model says of the samples at times t, whose outputs are there already."""
+        return memory
+
+    @abstractmethod
+    def _features(self, memory: Memory) -> np.ndarray: ...
+
+    @abstractmethod
+    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+        """The memory with the estimates that actions (batch, ...) mean."""
+
+    def checked(self, actions: np.ndarray) -> np.ndarray:
+        """Actions (batch, ...) in double precision.
+
+        Raises:
+            ValueError: in one line, if their shape does not fit.
+        """
+        actions = np.asarray(actions, dtype=float)
+        shape: tuple[int, ...] = self.action_space.shape
+        if actions.shape[1:] != shape:
+            raise ValueError(
+                f"action has shape {actions.shape[1:]}; action_mode={self.name!r} of "
+                f"{type(self.system).__name__} expects {shape}"
+            )
+        return actions
+
+
+class Estimate(Form):
+    """The action is x̂ in physical units; the features are y, u and t/T, as the env gives them."""
+
+    name = "estimate"
+
+    @property
+    def num_features(self) -> int:
+        return self.stack * self.system.ny + self.system.nu + 1
+
+    def _actions(self) -> Box:
+        largest = self.bound.astype(np.float32)
+        return Box(-largest, largest)
+
+    def _features(self, memory: Memory) -> np.ndarray:
+        """The last outputs, newest first, zero before the first; then u and t/T."""
+        y = memory.y
+        if self.stack > 1:
+            y = np.concatenate([y[:, :1], np.nan_to_num(y[:, 1:])], axis=1)
+        time = (memory.t - memory.start) / self.duration
+        return np.concatenate([y.reshape(len(y), -1), memory.u, time[:, None]], axis=1)
+
+    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+        return replace(memory, xhat=self.checked(actions))
+
+
+class Normalized(Estimate):
+    """The action is x̂ over the largest states to expect."""
+
+    name = "normalized"
+
+    def _actions(self) -> Box:
+        return Form._actions(self)
+
+    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+        return replace(memory, xhat=self.bound * self.checked(actions))
+
+    def _features(self, memory: Memory) -> np.ndarray:
+        """Those of `Estimate`, but zero where an output is missing, which no network takes."""
+        features = super()._features(memory)
+        return np.where(np.isnan(features), 0.0, features)
+
+
+class Gain(Form):
+    """The action is a gain L on the innovation: x̂ = x̂⁻ + L(y − h(x̂⁻)), x̂⁻ from the model.
+
+    Kalman's gain of state i and output j is ρσᵢ/√Sⱼ, where σᵢ is the standard deviation of the
+    prediction's error, √Sⱼ that of the innovation, and ρ their correlation. The action is ρ, nx·ny
+    numbers, row by row; σ(k) and S(k) are fixed schedules (`typical`), the same in all episodes, so
+    that the agent need not find over which powers of ten a gain decays. What the right ρ is in
+    this episode, it must say.
+
+    Features: asinh of the innovation over √S, x̂⁻ over its scale, u over its largest, and
+    log(1 + k)/log(1 + N), k the sample's number and N the episode's last.
+    """
+
+    name = "gain"
+
+    def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
+        super().__init__(system, setup, stack)
+        if stack != 1:
+            raise ValueError(f"stack={stack} goes with estimates; {self.name!r} has a prediction")
+        self.sigma, self.root_S = typical(system, setup)
+        u = abs(np.asarray(system.input(setup.times))).max(axis=0, initial=0.0)
+        self.u_scale = np.where(u > 0, u, 1.0)
+
+    @property
+    def num_features(self) -> int:
+        return self.system.ny + self.system.nx + self.system.nu + 1
+
+    def _actions(self) -> Box:
+        return Box(-1.0, 1.0, (self.system.nx * self.system.ny,), np.float32)
+
+    def _predicted(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+        xhat = model_step(self.system, memory.t, t, memory.xhat, memory.u, u)
+        y = memory.y[:, 0]
+        surprise = (y - self.system.h(xhat)) / self.root_S[self._samples(t, memory)]
+        return replace(memory, xhat=xhat, surprise=np.where(np.isnan(y), 0.0, surprise))
+
+    def _features(self, memory: Memory) -> np.ndarray:
+        k = np.minimum((memory.t - memory.start) / self.setup.dt, self.setup.num_steps)
+        time = np.log1p(k) / np.log1p(self.setup.num_steps)
+        parts = (np.arcsinh(memory.surprise), memory.xhat / self.scale, memory.u / self.u_scale)
+        return np.concatenate([*parts, time[:, None]], axis=1)
+
+    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+        correlation = self.checked(actions).reshape(-1, self.system.nx, self.system.ny)
+        with np.errstate(all="ignore"):  # of rows that are not finite
+            share = np.einsum("bij,bj->bi", correlation, memory.surprise)
+        return self._corrected(memory, share)
+
+    def _corrected(self, memory: Memory, share: np.ndarray) -> Memory:
+        """The predictions corrected by a share (batch, nx) of the typical error, within bounds."""
+        largest = OUTSIDE * self.bound
+        xhat = memory.xhat + share * self.sigma[self._samples(memory.t, memory)]
+        return replace(memory, xhat=np.clip(xhat, -largest, largest))
+
+    def improvement(self, memory: Memory, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """By how much the correction lessened the squared error, over the typical one, (batch,).
+
+        Which gain is best at a sample is the same as for −mean(((x̂ − x)/scale)²), since what is
+        subtracted and divided by do not depend on the action; but the rewards of all samples are of
+        one size, where squared errors span six powers of ten.
+        """
+        nis = (memory.surprise**2).sum(axis=1) / self.system.ny
+        with np.errstate(all="ignore"):
+            less = (memory.xhat - x) ** 2 - (xhat - x) ** 2
+            less /= self.sigma[self._samples(memory.t, memory)] ** 2
+            return np.clip(less.mean(axis=1) / (1 + nis), -LARGEST_REWARD, LARGEST_REWARD)
+
+    def _samples(self, t: np.ndarray, memory: Memory) -> np.ndarray:
+        """The place of samples in the schedules."""
+        k = np.rint((t - memory.start) / self.setup.dt).astype(int)
+        return np.minimum(k, len(self.sigma) - 1)
+
+
+class Correction(Gain):
+    """The action is what is added to the model's prediction, over the typical error σ(k).
+
+    Features are those of `Gain`.
+    """
+
+    name = "correction"
+
+    def _actions(self) -> Box:
+        return Form._actions(self)
+
+    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+        return self._corrected(memory, LARGEST_CORRECTION * self.checked(actions))
+
+
+LARGEST_CORRECTION = 3.0
+"""Typical errors that an action of one adds, as `Correction`."""
+
+FORMS: dict[str, type[Form]] = {f.name: f for f in (Estimate, Normalized, Gain, Correction)}
+"""The forms by the name that ``action_mode`` gives."""
+
+
+def form_of(action_mode: str, system: System, setup: Setup, stack: int = 1) -> Form:
+    """The form of that name.
+
+    Raises:
+        ValueError: listing the known ones, if it is unknown.
+    """
+    if action_mode not in FORMS:
+        raise ValueError(f"unknown action_mode {action_mode!r}; known are {', '.join(FORMS)}")
+    return FORMS[action_mode](system, setup, stack)
+
+
+def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
+    """How large errors of a prediction typically are, σ (num_steps + 1, nx) in state units, and
+    innovations, √S (num_steps + 1, ny) in output units, at each sample of an episode.
+
+    Both are medians of a Kalman filter's covariances along trajectories of the model that begin at
+    draws from the prior; they depend on the model, prior and noise alone.
+    """
+    times, nx = setup.times, system.nx
+    mean, std = vector(setup.xhat0, nx, "xhat0"), vector(setup.P0_std, nx, "P0_std")
+    x = mean + std * np.random.default_rng(0).standard_normal((_DRAWS, nx))
+    P = np.broadcast_to(np.diag(std**2)[..., None], (nx, nx, _DRAWS))
+    scale = vector(system.scale, nx, "scale")
+    Q = np.diag((GaussianEstimator.process_noise * scale) ** 2)[..., None]
+    floor = NOISE_FLOOR * output_scale(system)
+    noise = np.maximum(vector(setup.noise_std, system.ny, "noise_std"), floor)
+    R = np.diag(noise**2)[..., None]
+    u = np.broadcast_to(np.asarray(system.input(times))[:, None], (len(times), _DRAWS, system.nu))
+    zero = np.zeros((_DRAWS, system.ny))
+    variance, S_all = np.empty((len(times), nx, _DRAWS)), np.empty((len(times), system.ny, _DRAWS))
+    with np.errstate(all="ignore"):  # of draws from which the model runs away
+        for k, t in enumerate(times):
+            if k:
+                x, P, _ = predict(system, (times[k - 1], t), x, P, Q, (u[k - 1], u[k]))
+            variance[k] = np.einsum("iib->ib", P)
+            H = system.h_jacobian(x).transpose(1, 2, 0)
+            _, P, S = joseph_update(x, P, zero, H, R)
+            S_all[k] = np.einsum("iib->ib", S)
+        sound = np.isfinite(variance).all(axis=(0, 1)) & np.isfinite(S_all).all(axis=(0, 1))
+    if not sound.any():
+        name = type(system).__name__
+        raise ValueError(f"{name}: the model runs away from every draw of its prior; no gain scale")
+    sigma = np.sqrt(np.median(variance[..., sound], axis=2))
+    return sigma, np.sqrt(np.median(S_all[..., sound], axis=2))
+
+
+def _features_box(size: int) -> Box:
+    low, high = np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32)
+    low[-1], high[-1] = 0, 1
+    return Box(low, high)

@@ -1,0 +1,57 @@
+"""What the single and the vectorised environment do with their arguments alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.simulation.system import System
+
+NOT_FINITE_REWARD = -1e4
+"""Reward of an action that is not finite; it ends the episode."""
+
+
+def _reward_weights(system: System) -> np.ndarray:
+    """What each squared error counts in minus the reward."""
+    return 1 / (np.asarray(system.scale, dtype=float) ** 2 * system.nx)
+
+
+def _seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
+    """The seeds that Gymnasium made an env's generator from."""
+    seeds = rng.bit_generator.seed_seq
+    if not isinstance(seeds, np.random.SeedSequence):
+        raise TypeError(f"np_random was made from {type(seeds).__name__}; expected SeedSequence")
+    return seeds
+
+
+def _check_render_mode(mode: str | None, known: Sequence[str]) -> None:
+    if mode is not None and mode not in known:
+        raise ValueError(f"render_mode={mode!r}; expected {' or '.join(known)}")
+
+
+def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
+    for name in options or {}:
+        if name not in known:
+            raise ValueError(f"unknown reset option {name!r}; known are {', '.join(known)}")
+    return options or {}
+
+
+def _given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.ndarray | None:
+    """The initial states (batch, nx) among the reset options, if there; a warning if they are
+    outside the setup's set."""
+    if "x0" not in options:
+        return None
+    nx = source.system.nx
+    x0 = np.asarray(options["x0"], dtype=float)
+    if x0.shape not in ((nx,), (batch, nx)):
+        raise ValueError(f"x0 has shape {x0.shape}; expected ({nx},)")
+    if not np.isfinite(x0).all():
+        raise ValueError(f"x0={x0.tolist()} is not finite")
+    if not np.all(source.contains(x0)):
+        name = type(source.system).__name__
+        gym.logger.warn(f"x0={x0.tolist()} is outside the initial set of {name}")
+    return np.broadcast_to(x0, (batch, nx)).copy()

@@ -1,0 +1,152 @@
+"""The environment: one episode at a time."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any, Unpack
+
+import gymnasium as gym
+import numpy as np
+
+from pinnobs_gym.envs.agent_side import AgentSide
+from pinnobs_gym.envs.arguments import (
+    NOT_FINITE_REWARD,
+    _check_options,
+    _check_render_mode,
+    _given_x0,
+    _reward_weights,
+    _seeds_of,
+)
+from pinnobs_gym.envs.episodes import Ahead, Changes, EpisodeSource, Stream
+from pinnobs_gym.envs.figures import EpisodePicture
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import System
+
+
+class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
+    """One episode at a time of estimating a plant's state from its noisy outputs.
+
+    `reset` returns the observation of y₀. The action is the estimate x̂(k|k), in physical units; it
+    is scored against the true x_k, and time advances. The reward is −mean(((x̂ − x)/scale)²). The
+    estimate never acts on the plant. Raw actions are scored, never clipped; one that is not finite
+    ends the episode with `NOT_FINITE_REWARD`; otherwise only the time limit ends it. The
+    observation after the last action is never scored.
+
+    For agents that learn, ``action_mode`` gives actions another meaning and, with it, observations:
+    `pinnobs_gym.envs.actions` has the forms. What they make of an action is then the estimate.
+
+    Args:
+        system: name, ``module:Class`` or class of the system.
+        setup: ``benchmark`` or ``paper``.
+        condition: how episodes depart from the setup; see `pinnobs_gym.simulation.conditions`.
+        action_mode: ``estimate``, ``normalized``, ``gain`` or ``correction``.
+        reward: ``error``, as above, or ``improvement`` on the model's prediction, for training with
+            actions that are gains or corrections; see `pinnobs_gym.envs.actions.Gain.improvement`.
+        stack_outputs: how many of the last outputs an observation holds.
+        render_mode: ``rgb_array`` or ``human``.
+        changes: ``dt``, ``duration``, ``noise_std``, ``parameters``; see `Changes`.
+
+    Reset options: ``x0``, the true initial state (nx,), and ``xhat0``, the initial estimate (nx,),
+    which is only reported in ``info``. ``info`` holds ``state``, the true state behind the
+    observation, for scoring only, and after a reset ``xhat0`` and ``P0``, the prior.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+
+    def __init__(
+        self,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        *,
+        action_mode: str = "estimate",
+        reward: str = "error",
+        stack_outputs: int = 1,
+        render_mode: str | None = None,
+        **changes: Unpack[Changes],
+    ) -> None:
+        _check_render_mode(render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
+        self.source = EpisodeSource(system, setup, condition, **changes)
+        self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)
+        self.observation_space = self.agent.form.observation_space
+        self.action_space = self.agent.form.action_space
+        self._weights = _reward_weights(self.source.system)
+        self._num_steps = self.source.setup.num_steps
+        self._k = 0
+        self._over = True
+        self._stream: Stream | None = None
+        self._ahead = Ahead(self.source, 1)
+        self._picture: EpisodePicture | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        options = _check_options(options, ("x0", "xhat0"))
+        prior = Prior.of(self.source.system, self.source.setup, 1, options.get("xhat0"))
+        x0 = _given_x0(self.source, options, 1)
+        if seed is not None or self._stream is None:
+            self._stream = Stream(_seeds_of(self.np_random))
+            self._ahead.forget([0])
+        episode = self._ahead.take([0], [self._stream], x0)
+        self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]
+        self._k = 0
+        self._over = False
+        if self.render_mode is not None:
+            self._picture = self._picture or EpisodePicture(self.source.system, self.render_mode)
+            self._picture.begin(self.source.times, self._x, self._observations)
+        if self.render_mode == "human":
+            self.render()
+        info = {"state": self._x[0].copy(), "xhat0": prior.mean[0], "P0": prior.cov[0]}
+        if self.agent.plain:
+            return self._observations[0].copy(), info
+        first = self.agent.begin(prior.mean, self._observations[:1], np.zeros(1, dtype=int))
+        return first[0], info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        k = self._k
+        if self._over:
+            raise RuntimeError("the episode is over; call reset before step")
+        estimate = np.asarray(action, dtype=float)
+        x = self._x[k]
+        if not self.agent.plain:
+            estimate = self.agent.act(estimate[None])[0]
+        elif estimate.shape != x.shape:
+            raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = estimate - x
+            reward = -float((error * error).dot(self._weights))
+        if self.agent.improves:
+            reward = float(self.agent.improvement(estimate[None], x[None])[0])
+        terminated = False
+        if not math.isfinite(reward):
+            terminated = not np.isfinite(estimate).all()
+            reward = NOT_FINITE_REWARD if terminated else -sys.float_info.max
+        if self._picture is not None:
+            self._picture.add(k, estimate)
+        self._k = k + 1
+        truncated = self._k == self._num_steps
+        info = {"state": self._x[self._k].copy()}
+        observation = self._observations[self._k].copy()
+        if not self.agent.plain:
+            observation = self.agent.look(observation[None], np.array([self._k]))[0]
+        self._over = terminated or truncated
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The true states so far over their estimates: an image (height, width, 3), or a window."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: make the env with render_mode='rgb_array'")
+            return None
+        if self._picture is None:
+            raise RuntimeError("there is nothing to draw yet; call reset before render")
+        return self._picture.draw(self._k)
+
+    def close(self) -> None:
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None

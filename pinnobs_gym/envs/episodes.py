@@ -1,0 +1,262 @@
+"""Where episodes come from: what chance decides in them, and their simulation."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import chain, cycle, islice
+from typing import TypedDict, Unpack
+
+import numpy as np
+
+from pinnobs_gym.simulation.conditions import parse_condition
+from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.truth import disturbed_truth, truth
+from pinnobs_gym.systems import SYSTEMS
+
+_DRAWS = 64
+"""Initial states drawn at a time."""
+_ATTEMPTS = 1000
+"""Such draws without an admissible state before the initial set is taken to be empty."""
+
+_SAMPLES_AHEAD = 65536
+"""Samples simulated at a time where rows begin anew one by one."""
+
+
+class Changes(TypedDict, total=False):
+    """Values that replace those of a setup; None keeps the setup's."""
+
+    dt: float | None
+    """Time between samples in s."""
+    duration: float | None
+    """Length of an episode in s."""
+    noise_std: Sequence[float] | float | None
+    """Standard deviation of the output noise, in output units."""
+    parameters: Mapping[str, float] | None
+    """Physical parameters."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """All that chance decides in a batch of episodes."""
+
+    x0: np.ndarray
+    """Initial states, shape (batch, nx)."""
+    noise: np.ndarray
+    """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
+    seeds: tuple[int, ...]
+    """A seed per episode for what its condition draws; none if that draws nothing."""
+
+    def row(self, i: int) -> Draws:
+        """Those of one episode."""
+        return Draws(self.x0[i : i + 1], self.noise[i : i + 1], self.seeds[i : i + 1])
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Simulated episodes of a system on common sample times, (time, batch, dim)."""
+
+    x: np.ndarray
+    """True states, shape (num_steps + 1, batch, nx)."""
+    y: np.ndarray
+    """Outputs as measured, shape (num_steps + 1, batch, ny)."""
+    observations: np.ndarray
+    """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
+
+    def row(self, i: int) -> Episodes:
+        """One of them."""
+        return Episodes(*(getattr(self, f.name)[:, i : i + 1] for f in fields(self)))
+
+
+class EpisodeSource:
+    """Makes the episodes of an env: every seed names an endless sequence of them.
+
+    What chance decides in an episode (`Draws`) depends on the seed and on how many episodes of that
+    seed came before, and the rest on these draws alone: the same seed gives the same episodes in
+    any batch.
+
+    Args:
+        system: name, ``module:Class`` or class of the system.
+        setup: the setup's name.
+        condition: how episodes depart from the setup; see `pinnobs_gym.simulation.conditions`.
+        changes: values that replace the setup's.
+    """
+
+    def __init__(
+        self,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        **changes: Unpack[Changes],
+    ) -> None:
+        for name in changes:
+            if name not in Changes.__annotations__:
+                known = ", ".join(["setup", "condition", *Changes.__annotations__])
+                raise ValueError(f"unknown argument {name!r}; known are {known}")
+        self.system, chosen = SYSTEMS.resolve(system).configured(setup, **changes)
+        self.condition = parse_condition(condition)
+        self.condition.plant(self.system, ())  # a condition that does not fit says so now
+        self.setup = self.condition.setup(self.system, chosen)
+        self.fixed_x0 = self.setup.fixed_x0
+        self.process_noise = self.condition.process_noise(self.system)
+        self.trivial = type(self.condition) is Condition
+        self.deterministic = self.fixed_x0 and self.trivial and not np.any(self.setup.noise_std)
+        self.times = self.setup.times
+        self.inputs = np.asarray(self.system.input(self.times))
+        self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
+        self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
+        self._noise_std = vector(self.setup.noise_std, self.system.ny, "noise_std")
+
+    def contains(self, x0: np.ndarray) -> np.ndarray:
+        """Which initial states (..., nx) belong to the setup's set: bool (...)."""
+        inside = np.asarray(((x0 >= self.x0_low) & (x0 <= self.x0_high)).all(axis=-1))
+        return inside if self.fixed_x0 else inside & self.system.admissible(x0)
+
+    def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
+        """What chance decides in the next episode of each stream; a stream may stand there several
+        times. The array ``noise``, of the right size, is written anew if given."""
+        x0 = np.empty((len(streams), self.system.nx))
+        if noise is None:
+            noise = np.empty((len(streams), len(self.times), self.system.ny))
+        for i, stream in enumerate(streams):
+            x0[i] = stream.next_x0(self)
+            stream.noise.standard_normal(out=noise[i])
+        seeds = () if self.trivial else tuple(int(s.conditions.integers(2**63)) for s in streams)
+        return Draws(x0, noise, seeds)
+
+    def play(
+        self, draws: Draws, x0: np.ndarray | None = None, into: Episodes | None = None
+    ) -> Episodes:
+        """The episodes of these draws.
+
+        Args:
+            draws: what chance decided.
+            x0: initial states (batch, nx) that replace those drawn.
+            into: episodes of the same size that are over, whose arrays are written anew.
+        """
+        start = draws.x0 if x0 is None else x0
+        episodes = self._empty(len(start)) if into is None else into
+        x, y, observations = episodes.x, episodes.y, episodes.observations
+        rngs = [np.random.default_rng(seed) for seed in draws.seeds]
+        plant = self.condition.plant(self.system, rngs)
+        if self.process_noise is not None:
+            steps = (len(self.times) - 1, self.system.nx)
+            drawn = np.stack([rng.standard_normal(steps) for rng in rngs], axis=1)
+            noise = self.process_noise * drawn
+            disturbed_truth(plant, start, self.times, noise, self.setup.truth_step, out=x)
+        elif plant is self.system and len(start) > 1 and (start == start[0]).all():
+            x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
+        else:
+            truth(plant, start, self.times, self.setup.truth_step, out=x)
+        np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
+        y += plant.h(x)
+        if not self.trivial:
+            sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
+            y[:] = self.condition.outputs(sent, rngs)
+        ny = self.system.ny
+        observations[..., :ny] = y
+        observations[..., ny:-1] = self.inputs[:, None]
+        observations[..., -1] = (self.times / self.times[-1])[:, None]
+        return episodes
+
+    def _empty(self, batch: int) -> Episodes:
+        shape, system = (len(self.times), batch), self.system
+        return Episodes(
+            np.empty((*shape, system.nx)),
+            np.empty((*shape, system.ny)),
+            np.empty((*shape, system.ny + system.nu + 1), np.float32),
+        )
+
+    def record(self, episodes: Episodes, xhat0: object = None) -> Record:
+        """What an estimator may see of the episodes: their samples up to the last action's."""
+        batch, last = episodes.y.shape[1], self.setup.num_steps
+        u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
+        prior = Prior.of(self.system, self.setup, batch, xhat0)
+        return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
+
+
+class Ahead:
+    """The next episodes of an env's rows, simulated before they are played.
+
+    Many episodes take little longer than one: where rows begin anew one by one, a block is
+    simulated at a time, of the rows that have none waiting and then of those that ask.
+
+    Args:
+        source: of the episodes.
+        rows: how many rows there are.
+    """
+
+    def __init__(self, source: EpisodeSource, rows: int) -> None:
+        self._source = source
+        self._waiting: list[deque[tuple[Draws, Episodes]]] = [deque() for _ in range(rows)]
+
+    def forget(self, rows: Iterable[int]) -> None:
+        """Drop what waits for these rows, whose streams are others now."""
+        for row in rows:
+            self._waiting[row].clear()
+
+    def any(self, rows: Iterable[int]) -> bool:
+        """Whether an episode waits for one of these rows."""
+        return any(self._waiting[row] for row in rows)
+
+    def _draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
+        """What chance decides in the next episodes of these rows, waiting or not."""
+        waiting = [self._waiting[row].popleft()[0] if self._waiting[row] else None for row in rows]
+        drawn = [
+            self._source.draw([streams[row]]) if found is None else found
+            for row, found in zip(rows, waiting, strict=True)
+        ]
+        seeds = tuple(seed for draws in drawn for seed in draws.seeds)
+        x0 = np.concatenate([draws.x0 for draws in drawn])
+        return Draws(x0, np.concatenate([draws.noise for draws in drawn]), seeds)
+
+    def take(
+        self, rows: Sequence[int], streams: Sequence[Stream], x0: np.ndarray | None = None
+    ) -> Episodes:
+        """The next episodes of these rows, from initial states (len(rows), nx) if given."""
+        if x0 is not None:
+            return self._source.play(self._draw(rows, streams), x0)
+        missing = [row for row in rows if not self._waiting[row]]
+        if missing:
+            asked = set(missing)
+            others = (r for r, found in enumerate(self._waiting) if not found and r not in asked)
+            size = max(len(missing), _SAMPLES_AHEAD // len(self._source.times))
+            block = list(islice(chain(missing, others, cycle(missing)), size))
+            draws = self._source.draw([streams[row] for row in block])
+            played = self._source.play(draws)
+            for i, row in enumerate(block):
+                self._waiting[row].append((draws.row(i), played.row(i)))
+        taken = [self._waiting[row].popleft()[1] for row in rows]
+        parts = (np.concatenate([getattr(t, f.name) for t in taken], 1) for f in fields(Episodes))
+        return Episodes(*parts)
+
+
+class Stream:
+    """The random numbers that one seed stands for, and its queue of initial states."""
+
+    def __init__(self, seeds: np.random.SeedSequence) -> None:
+        states, noise, conditions = (np.random.default_rng(seed) for seed in seeds.spawn(3))
+        self._states = states
+        self._queue: list[np.ndarray] = []
+        self.noise = noise
+        self.conditions = conditions
+
+    def next_x0(self, source: EpisodeSource) -> np.ndarray:
+        """The next initial state (nx,): from the setup's set, as the condition changes it."""
+        for _ in range(1 if source.fixed_x0 else _ATTEMPTS):
+            if self._queue:
+                return self._queue.pop(0)
+            if source.fixed_x0:
+                drawn = source.x0_low[None]
+            else:
+                shape = (_DRAWS, source.system.nx)
+                drawn = self._states.uniform(source.x0_low, source.x0_high, shape)
+                drawn = drawn[source.system.admissible(drawn)]
+            self._queue = list(source.condition.starts(drawn, source.contains))
+        if self._queue:
+            return self._queue.pop(0)
+        name = type(source.system).__name__
+        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")

@@ -1,0 +1,175 @@
+"""Pictures: true states over their estimates, as env frames, TensorBoard figures and files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pinnobs_gym.simulation.system import System, vector
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
+"""Colours of true states, estimates and measured outputs."""
+
+
+def state_figure(
+    system: System,
+    t: np.ndarray,
+    xhat: np.ndarray,
+    *,
+    x: np.ndarray | None = None,
+    y: np.ndarray | None = None,
+    P: np.ndarray | None = None,
+    title: str = "",
+) -> Figure:
+    """A picture of estimates over time, a panel per state.
+
+    Args:
+        system: names and units.
+        t: times in s, shape (num_samples,).
+        xhat: estimates, shape (num_samples, nx).
+        x: true states (num_samples, nx), if known.
+        y: outputs (num_samples, ny); each is drawn as dots where it measures one state alone.
+        P: covariances (num_samples, nx, nx); drawn as a band of two standard deviations.
+        title: a line above.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 1.0 + 1.6 * system.nx), layout="constrained")
+    panels = figure.subplots(system.nx, 1, sharex=True, squeeze=False)[:, 0]
+    measured = measured_states(system)
+    for i, (panel, name) in enumerate(zip(panels, system.state_names, strict=True)):
+        unit = system.units.get(name)
+        panel.set_ylabel(f"{name} ({unit})" if unit else name)
+        if y is not None and i in measured:
+            dots = y[:, measured[i]]
+            panel.plot(t, dots, ".", ms=2, color=MEASURED, label="measured")
+        if x is not None:
+            panel.plot(t, x[:, i], color=TRUE, lw=1.5, label="true")
+        finite = np.isfinite(xhat[:, i])
+        panel.plot(t[finite], xhat[finite, i], "--", color=ESTIMATE, lw=1.3, label="estimate")
+        if P is not None:
+            band = 2 * np.sqrt(np.maximum(P[:, i, i], 0))
+            low, high = xhat[:, i] - band, xhat[:, i] + band
+            panel.fill_between(t, low, high, color=ESTIMATE, alpha=0.15, lw=0)
+        seen = x[:, i] if x is not None else xhat[finite, i]
+        if len(seen):
+            panel.set_ylim(*_limits(seen, float(system.scale[i])))
+        panel.grid(alpha=0.3)
+    panels[0].set_title(title, fontsize=10)
+    panels[0].legend(loc="upper right", fontsize=8, ncols=3)
+    panels[-1].set_xlabel("t (s)")
+    return figure
+
+
+def measured_states(system: System) -> dict[int, int]:
+    """The states that are measured alone, each with the index of the output that does so."""
+    H = system.h_jacobian(vector(system.setups["benchmark"].xhat0, system.nx, "xhat0"))
+    return {
+        int(np.argmax(row != 0)): output
+        for output, row in enumerate(H)
+        if np.count_nonzero(row) == 1 and row.sum() == 1
+    }
+
+
+def _limits(values: np.ndarray, scale: float) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    margin = 0.1 * (high - low) + 0.15 * scale
+    return low - margin, high + margin
+
+
+class EpisodePicture:
+    """The running picture of an episode that an env renders.
+
+    What stays the same in an episode is drawn once, and only the curves are drawn anew.
+    """
+
+    def __init__(self, system: System, mode: str) -> None:
+        self._system = system
+        self._mode = mode
+        self._canvas: Any = None
+        self._window: Any = None
+
+    def begin(self, times: np.ndarray, x: np.ndarray, observations: np.ndarray) -> None:
+        """Start an episode: sample times (num_samples,), true states and observations over it."""
+        self._times, self._x = times, x
+        self._y = observations[:, : self._system.ny]
+        self._xhat = np.full_like(x, np.nan)
+        self._background: Any = None
+
+    def add(self, k: int, estimate: np.ndarray) -> None:
+        """Keep the estimate (nx,) made at sample k."""
+        self._xhat[k] = estimate
+
+    def draw(self, k: int) -> np.ndarray | None:
+        """Draw the episode up to sample k: an image (height, width, 3) of bytes, or the window."""
+        if self._background is None:
+            self._prepare()
+        self._canvas.restore_region(self._background)
+        shown = slice(0, k + 1)
+        for panel, output, dots in self._dots:
+            dots.set_data(self._times[shown], self._y[shown, output])
+            panel.draw_artist(dots)
+        curves = {"true": self._x, "estimate": self._xhat}
+        for panel, state, label, line in self._lines:
+            line.set_data(self._times[shown], curves[label][shown, state])
+            panel.draw_artist(line)
+        image = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        if self._mode == "human":
+            self._show(image)
+            return None
+        return image
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._window[0])
+            self._window = None
+
+    def _prepare(self) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        empty = np.full_like(self._x, np.nan)
+        figure = state_figure(
+            self._system, self._times, empty, x=self._x, y=np.full_like(self._y, np.nan)
+        )
+        figure.set_dpi(80)
+        self._canvas = FigureCanvasAgg(figure)
+        self._lines, self._dots = [], []
+        measured = measured_states(self._system)
+        for state, panel in enumerate(figure.axes):
+            panel.set_xlim(self._times[0], self._times[-1])
+            for line in panel.lines:
+                label = str(line.get_label())
+                if label == "measured":
+                    self._dots.append((panel, measured[state], line))
+                else:
+                    self._lines.append((panel, state, label, line))
+                line.set_animated(True)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(figure.bbox)
+
+    def _show(self, image: np.ndarray) -> None:
+        from matplotlib import pyplot
+
+        if self._window is None:
+            if pyplot.get_backend().lower() == "agg":
+                raise RuntimeError(
+                    "render_mode='human' needs a display and a window toolkit for matplotlib, such"
+                    " as PySide6; use render_mode='rgb_array' without them"
+                )
+            height, width = image.shape[:2]
+            window = pyplot.figure(figsize=(width / 100, height / 100))
+            shown = window.figimage(image)
+            self._window = (window, shown)
+            pyplot.show(block=False)
+        window, shown = self._window
+        shown.set_data(image)
+        window.canvas.draw_idle()
+        # What pyplot.pause does but for raising the window: it would take the focus at each frame.
+        window.canvas.start_event_loop(1e-3)

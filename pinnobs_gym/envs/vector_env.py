@@ -1,0 +1,236 @@
+"""The vectorised environment: many episodes at a time."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import Any, Unpack
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from pinnobs_gym.envs.agent_side import AgentSide
+from pinnobs_gym.envs.arguments import (
+    NOT_FINITE_REWARD,
+    _check_options,
+    _check_render_mode,
+    _given_x0,
+    _reward_weights,
+)
+from pinnobs_gym.envs.episodes import Ahead, Changes, Episodes, EpisodeSource, Stream
+from pinnobs_gym.envs.figures import EpisodePicture
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import System
+
+
+class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many episodes at a time of what `EstimationEnv` plays one at a time.
+
+    Row i of an env seeded s is the single env seeded s + i. A row whose episode is over is reset by
+    the next step, whose action it ignores (Gymnasium's ``NEXT_STEP``). The arguments are those of
+    `EstimationEnv`; reset options ``x0`` and ``xhat0`` are (nx,) or (num_envs, nx), and
+    ``reset_mask`` (num_envs,) names the rows to reset.
+    """
+
+    metadata = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 30,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int,
+        system: str | type[System],
+        setup: str = "benchmark",
+        condition: str = "nominal",
+        *,
+        action_mode: str = "estimate",
+        reward: str = "error",
+        stack_outputs: int = 1,
+        render_mode: str | None = None,
+        **changes: Unpack[Changes],
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs}; expected at least 1")
+        _check_render_mode(render_mode, self.metadata["render_modes"])
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.source = EpisodeSource(system, setup, condition, **changes)
+        self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)
+        self.single_observation_space = self.agent.form.observation_space
+        self.single_action_space = self.agent.form.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._weights = _reward_weights(self.source.system)
+        self._num_steps = self.source.setup.num_steps
+        self._rows = np.arange(num_envs)
+        self._k = np.zeros(num_envs, dtype=int)
+        self._over = np.zeros(num_envs, dtype=bool)
+        self._any_over = False
+        self._together = True
+        self._streams: list[Stream] = []
+        self._ahead = Ahead(self.source, num_envs)
+        self._episodes: Episodes | None = None
+        self._noise: np.ndarray | None = None
+        self._prior = Prior.of(self.source.system, self.source.setup, num_envs)
+        self._pictures: list[EpisodePicture] = []
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,  # pyright: ignore
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        options = _check_options(options, ("x0", "xhat0", "reset_mask"))
+        rows = self._rows
+        if "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+            if mask.shape != (self.num_envs,) or mask.dtype != bool:
+                raise ValueError(f"reset_mask={mask.tolist()}; expected {self.num_envs} booleans")
+            rows = np.flatnonzero(mask) if self._episodes is not None else rows
+        xhat0 = options.get("xhat0")
+        prior = Prior.of(self.source.system, self.source.setup, self.num_envs, xhat0)
+        x0 = _given_x0(self.source, options, self.num_envs)
+        self._seed(seed, rows)
+        self._begin(rows, prior.mean[rows], None if x0 is None else x0[rows])
+        observations, infos = self._look()
+        if not self.agent.plain:
+            observations = self.agent.begin(self._prior.mean, observations, self._k, rows)
+        return observations, infos | self._begun(rows)
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        if self._episodes is None:
+            raise RuntimeError("no episode has begun; call reset before step")
+        estimates = np.asarray(actions, dtype=float)
+        shape = (self.num_envs, *self.agent.action_shape)
+        if estimates.shape != shape:
+            kind = f"as action_mode={self.agent.form.name!r} has them"
+            raise ValueError(f"actions have shape {estimates.shape}; expected {shape}, {kind}")
+        if not self.agent.plain:
+            estimates = self.agent.act(estimates)
+        over = self._over
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = estimates - self._state
+            rewards = -((error * error) @ self._weights)
+        if self.agent.improves:
+            rewards = self.agent.improvement(estimates, self._state)
+        terminated = np.zeros(self.num_envs, dtype=bool)
+        if not math.isfinite(rewards.sum()):
+            terminated = np.asarray(~np.isfinite(estimates).all(axis=1))
+            rewards = np.where(terminated, NOT_FINITE_REWARD, rewards)
+            np.maximum(rewards, -sys.float_info.max, out=rewards)
+        for row, picture in enumerate(self._pictures):
+            if not over[row]:
+                picture.add(int(self._k[row]), estimates[row])
+        self._k += 1
+        begun = None
+        if self._any_over:
+            over = over.copy()  # beginning anew clears the original
+            begun = np.flatnonzero(over)
+            default = Prior.of(self.source.system, self.source.setup, len(begun))
+            self._begin(begun, default.mean)
+            rewards[over] = 0.0
+            terminated &= ~over
+        truncated = np.asarray(self._k == self._num_steps)
+        self._over = terminated | truncated
+        self._any_over = bool(self._over.any())
+        observations, infos = self._look()
+        if not self.agent.plain:
+            if begun is not None:
+                self.agent.forget(self._prior.mean, begun)
+            observations = self.agent.look(observations, self._k)
+        if begun is not None:
+            infos |= self._begun(begun)
+        return observations, rewards, terminated, truncated, infos
+
+    def record(self) -> Record:
+        """What an estimator may see of the episodes now playing, from their first sample to that
+        of the last action."""
+        return self.source.record(self._playing, self._prior.mean)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """An image (height, width, 3) per row."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: make the env with render_mode='rgb_array'")
+            return None
+        drawn = [picture.draw(int(k)) for picture, k in zip(self._pictures, self._k, strict=True)]
+        return tuple(image for image in drawn if image is not None)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        for picture in self._pictures:
+            picture.close()
+        self._pictures = []
+
+    @property
+    def _playing(self) -> Episodes:
+        if self._episodes is None:
+            raise RuntimeError("no episode has begun; call reset first")
+        return self._episodes
+
+    def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
+        """Give these rows their streams, if there is a seed or no stream yet."""
+        seeds: list[int | None]
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        elif seed is None:
+            seeds = [None] * self.num_envs
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"{len(seeds)} seeds; expected {self.num_envs}, one per row")
+        if not self._streams:
+            self._streams = [Stream(np.random.SeedSequence(s)) for s in seeds]
+        elif seed is not None:
+            self._ahead.forget(rows.tolist())
+            for row in rows:
+                self._streams[row] = Stream(np.random.SeedSequence(seeds[row]))
+
+    def _begun(self, rows: np.ndarray) -> dict[str, Any]:
+        """The infos of rows whose episode has just begun: their prior."""
+        mask = np.zeros(self.num_envs, dtype=bool)
+        mask[rows] = True
+        mean, cov = self._prior.mean.copy(), self._prior.cov.copy()
+        return {"xhat0": mean, "_xhat0": mask, "P0": cov, "_P0": mask.copy()}
+
+    def _begin(self, rows: np.ndarray, xhat0: np.ndarray, x0: np.ndarray | None = None) -> None:
+        """Begin the next episode of these rows, from prior means (len(rows), nx)."""
+        self._prior.mean[rows] = xhat0
+        chosen = rows.tolist()
+        if len(rows) == self.num_envs and not self._ahead.any(chosen):
+            # Arrays of this size are slow to allocate: those of episodes that are over serve again.
+            draws = self.source.draw(self._streams, self._noise)
+            self._noise = draws.noise
+            self._episodes = self.source.play(draws, x0, self._episodes)
+        else:
+            new = self._ahead.take(chosen, self._streams, x0)
+            for name in ("x", "y", "observations"):
+                getattr(self._playing, name)[:, rows] = getattr(new, name)
+        self._k[rows] = 0
+        self._over[rows] = False
+        self._any_over = bool(self._over.any())
+        self._together = bool((self._k == self._k[0]).all())
+        if self.render_mode is not None:
+            if not self._pictures:
+                mode = self.render_mode
+                self._pictures = [EpisodePicture(self.source.system, mode) for _ in self._rows]
+            for row in rows:
+                x, observations = self._playing.x[:, row], self._playing.observations[:, row]
+                self._pictures[row].begin(self.source.times, x, observations)
+
+    def _look(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """The observations and infos of each row's present sample."""
+        episodes, k = self._playing, self._k
+        if self._together:
+            self._state, observations = episodes.x[k[0]], episodes.observations[k[0]].copy()
+        else:
+            self._state = episodes.x[k, self._rows]
+            observations = episodes.observations[k, self._rows]
+        everywhere = np.ones(self.num_envs, dtype=bool)
+        return observations, {"state": self._state.copy(), "_state": everywhere}

@@ -1,0 +1,1 @@
+"""What an estimator is, and the mathematics that estimators share."""

@@ -1,0 +1,315 @@
+"""Conformance: the named checks that every estimator passes, yours included.
+
+``check_estimator(MyObserver(system))`` runs them all; the table `ESTIMATOR_CHECKS` gives them by
+name, for a parametrised test.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.simulation.checks import initial_states
+from pinnobs_gym.simulation.conformance import (
+    Found,
+    into,
+    require,
+    require_close,
+    require_shape,
+    run_all,
+)
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import vector
+from pinnobs_gym.simulation.truth import truth
+
+ROUNDING = 1e-10
+"""Largest difference, over scale, between two ways to run the same estimator. Matrix products round
+differently in batches of another size, and a filter of ill-conditioned covariances enlarges that:
+the EKF of the induction motor to 3e-12."""
+NUM_SAMPLES = 40
+"""Length of the records on which estimators are checked."""
+
+ESTIMATOR_CHECKS: dict[str, Callable[[Estimator], None]] = {}
+"""The checks of an estimator, by name. Each raises `CheckFailed`.
+
+An offline estimator is only held to those that make sense for one: ``immutable``,
+``shapes``, ``rows_independent``, ``purity`` and ``save_load``.
+"""
+
+
+def check_estimator(estimator: Estimator) -> None:
+    """Run all of `ESTIMATOR_CHECKS` on an estimator, on short records of its own system.
+
+    Raises:
+        CheckFailed: if any fails, with a line for each: its name, what was found and expected.
+    """
+    run_all(ESTIMATOR_CHECKS, estimator)
+
+
+def _record(estimator: Estimator, batch: int = 3, *, irregular: bool = False) -> Record:
+    """A short record of the estimator's own system, with the benchmark's initial states and noise.
+
+    It is simulated here, and not taken from an env, which would register a system that is only
+    being checked.
+    """
+    system = estimator.system
+    setup = system.setups["benchmark"]
+    rng = np.random.default_rng(2)
+    steps = np.full(NUM_SAMPLES - 1, setup.dt)
+    if irregular:
+        steps *= rng.uniform(0.3, 2.0, len(steps))
+    t = np.append(0.0, np.cumsum(steps))
+    x = truth(system, initial_states(system, setup, batch), t).swapaxes(0, 1)
+    std = vector(setup.noise_std, system.ny, "noise_std")
+    y = system.h(x) + std * rng.standard_normal((batch, len(t), system.ny))
+    u = np.broadcast_to(system.input(t), (batch, len(t), system.nu)).copy()
+    return Record(t, y, u, Prior.of(system, setup, batch))
+
+
+def _updates(estimator: Estimator, record: Record) -> Iterator[State]:
+    """The states after reset and after each sample."""
+    state = estimator.reset(record.prior)
+    yield state
+    for k, t in enumerate(record.t):
+        with np.errstate(all="ignore"):  # as `Estimator.run` does
+            state = estimator.update(state, float(t), record.y[:, k].copy(), record.u[:, k].copy())
+        yield state
+
+
+def _require_same(
+    estimator: Estimator, a: Estimates, b: Estimates, tolerance: float, what: str
+) -> None:
+    """All that two runs return must agree."""
+    for field in fields(Estimates):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        both = (left is None) == (right is None)
+        require(both, f"{field.name} of {what}: one has it and one does not; expected the same")
+        if left is not None:
+            size = 0.0
+            if field.name == "xhat":
+                size = vector(estimator.system.scale, estimator.system.nx, "scale")
+            elif tolerance and np.isfinite(right).any():  # small entries beside large ones round
+                size = abs(right[np.isfinite(right)]).max()
+            require_close(left, right, tolerance, size, f"{field.name} of {what}")
+
+
+def _online(estimator: Estimator) -> bool:
+    return estimator.track == "online"
+
+
+@into(ESTIMATOR_CHECKS, "immutable")
+def _estimator_immutable(estimator: Estimator) -> None:
+    """The estimator is immutable."""
+    cls = type(estimator)
+    params = vars(cls).get("__dataclass_params__")
+    require(
+        params is not None and params.frozen,
+        f"{cls.__name__} is not decorated; expected @dataclass(frozen=True)",
+    )
+    require(estimator.track in ("online", "offline"), f"track={estimator.track!r} is unknown")
+
+
+@into(ESTIMATOR_CHECKS, "shapes")
+def _estimator_shapes(estimator: Estimator) -> None:
+    """Estimates, covariances and innovations have their shapes and are finite."""
+    record = _record(estimator)
+    batch, n, nx, ny = record.batch, record.num_samples, estimator.system.nx, estimator.system.ny
+    expected = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
+    for k, state in enumerate(_updates(estimator, record) if _online(estimator) else ()):
+        when = "after reset" if k == 0 else f"after sample {k - 1}"
+        _check_values(state, (batch,), expected, when)
+        t = None if k == 0 else record.t[k - 1]
+        require(state.t == t, f"t={state.t} {when}; expected {t}")
+    _check_values(estimator.run(record), (batch, n), expected, "from run")
+
+
+def _check_values(
+    holder: State | Estimates,
+    leading: tuple[int, ...],
+    expected: Mapping[str, tuple[int, ...]],
+    when: str,
+) -> None:
+    for name, shape in expected.items():
+        array = getattr(holder, name)
+        if array is not None:
+            require_shape(array, (*leading, *shape), f"{name} {when}")
+            require(np.isfinite(array).all(), f"{name} {when} is not finite on a benign record")
+    P = holder.P
+    if P is not None:
+        size = abs(P).max(axis=(-2, -1), keepdims=True)
+        off = (abs(P - np.swapaxes(P, -2, -1)) / size).max()
+        require(off < 1e-9, f"P {when} is asymmetric by {off:.1e}; expected a covariance")
+        least = (np.linalg.eigvalsh(P) / size[..., 0]).min()
+        require(least > -1e-9, f"P {when} has eigenvalue {least:.1e}; expected none below zero")
+
+
+@into(ESTIMATOR_CHECKS, "rows_independent")
+def _estimator_rows_independent(estimator: Estimator) -> None:
+    """A row of a batch gives the same as that row alone."""
+    record = _record(estimator)
+    together = estimator.run(record)
+    for i in range(record.batch):
+        row = slice(i, i + 1)
+        part = _rows(together, row)
+        alone = estimator.run(record.rows(row))
+        _require_same(estimator, part, alone, ROUNDING, f"row {i} in a batch and alone")
+
+
+def _rows(estimates: Estimates, rows: slice) -> Estimates:
+    """Those of some of the episodes only."""
+    given = {f.name: getattr(estimates, f.name) for f in fields(Estimates)}
+    taken: dict[str, Any] = {name: a if a is None else a[rows] for name, a in given.items()}
+    return Estimates(**taken)
+
+
+@into(ESTIMATOR_CHECKS, "purity")
+def _estimator_purity(estimator: Estimator) -> None:
+    """The same record gives the same estimates, and neither it nor earlier states are modified."""
+    record = _record(estimator)
+    before = _copy(record)
+    first = estimator.run(record)
+    given = {"t": record.t, "y": record.y, "u": record.u, **vars(record.prior)}
+    kept = {"t": before.t, "y": before.y, "u": before.u, **vars(before.prior)}
+    for name, array in given.items():
+        require(np.array_equal(array, kept[name]), f"run modifies {name} of the record")
+    again = estimator.run(record)
+    _require_same(estimator, again, first, 0.0, "a second run and the first")
+    if _online(estimator):
+        states = [(state, state.xhat.copy()) for state in _updates(estimator, _copy(record))]
+        for k, (state, xhat) in enumerate(states):
+            same = np.array_equal(state.xhat, xhat, equal_nan=True)
+            require(same, f"xhat of state {k} is modified by a later update; expected a new array")
+        _check_arguments(estimator, record)
+
+
+def _check_arguments(estimator: Estimator, record: Record) -> None:
+    """`update` must leave y and u as they are."""
+    state = estimator.reset(record.prior)
+    for k in range(3):
+        y, u = record.y[:, k].copy(), record.u[:, k].copy()
+        y[0] = np.nan
+        kept = y.copy(), u.copy()
+        state = estimator.update(state, float(record.t[k]), y, u)
+        for name, now, before in (("y", y, kept[0]), ("u", u, kept[1])):
+            same = np.array_equal(now, before, equal_nan=True)
+            require(same, f"update modifies its argument {name}")
+
+
+def _copy(record: Record) -> Record:
+    prior = Prior(record.prior.mean.copy(), record.prior.cov.copy())
+    return Record(record.t.copy(), record.y.copy(), record.u.copy(), prior)
+
+
+@into(ESTIMATOR_CHECKS, "causality")
+def _estimator_causality(estimator: Estimator) -> None:
+    """Changing later outputs changes no earlier estimate."""
+    if not _online(estimator):
+        return
+    record = _record(estimator)
+    xhat = estimator.run(record).xhat
+    for k in (1, record.num_samples // 2, record.num_samples - 1):
+        changed = _copy(record)
+        changed.y[:, k:] += 3 * abs(changed.y).max()
+        same = estimator.run(changed).xhat[:, :k] == xhat[:, :k]
+        if not same.all():
+            first = int(np.argwhere(~same.all(axis=(0, 2)))[0, 0])
+            raise Found(f"the estimate at sample {first} changes with outputs from sample {k} on")
+
+
+@into(ESTIMATOR_CHECKS, "missing_samples")
+def _estimator_missing_samples(estimator: Estimator) -> None:
+    """A NaN in y is a missing sample, and none sticks; all may be missing."""
+    if not _online(estimator):
+        return
+    record = _record(estimator)
+    rng = np.random.default_rng(3)
+    ny = estimator.system.ny
+    cases = {
+        "at random": rng.random(record.y.shape) < 0.3,
+        "at first": np.zeros(record.y.shape, dtype=bool),
+        "in a gap": np.zeros(record.y.shape, dtype=bool),
+        "in one output": np.zeros(record.y.shape, dtype=bool),
+        "altogether": np.ones(record.y.shape, dtype=bool),
+    }
+    cases["at first"][:, 0] = True
+    cases["in a gap"][0, 10:20] = True
+    cases["in one output"][:, 5:, ny - 1] = True
+    for where, missing in cases.items():
+        run = estimator.run(replace(record, y=np.where(missing, np.nan, record.y)))
+        bad = ~np.isfinite(run.xhat).all(axis=-1)
+        if bad.any():
+            row, k = np.argwhere(bad)[0]
+            raise Found(
+                f"samples missing {where} make the estimate at sample {k} of row {row} not finite; "
+                "expected a missing sample to be left out"
+            )
+
+
+@into(ESTIMATOR_CHECKS, "irregular_times")
+def _estimator_irregular_times(estimator: Estimator) -> None:
+    """Samples may come at irregular times."""
+    if not _online(estimator):
+        return
+    record = _record(estimator, irregular=True)
+    xhat = estimator.run(record).xhat
+    require_shape(xhat, (record.batch, record.num_samples, estimator.system.nx), "xhat")
+    require(np.isfinite(xhat).all(), "xhat is not finite on a record of irregular times")
+
+
+@into(ESTIMATOR_CHECKS, "run_equals_updates")
+def _estimator_run_equals_updates(estimator: Estimator) -> None:
+    """`run` gives what looping `update` does."""
+    if not _online(estimator):
+        return
+    for irregular in (False, True):
+        record = _record(estimator, irregular=irregular)
+        states = list(_updates(estimator, record))[1:]
+        columns = {
+            f.name: np.stack([getattr(state, f.name) for state in states], axis=1)
+            for f in fields(Estimates)
+            if getattr(states[0], f.name) is not None
+        }
+        looped = Estimates(**columns)
+        _require_same(
+            estimator, estimator.run(record), looped, ROUNDING, "run and of looped updates"
+        )
+
+
+@into(ESTIMATOR_CHECKS, "diverging_row")
+def _estimator_diverging_row(estimator: Estimator) -> None:
+    """A row that diverges is marked by what it holds; it neither raises nor touches the others."""
+    if not _online(estimator):
+        return
+    record = _record(estimator)
+    others = np.array([0, 2])
+    benign = estimator.run(record)
+    for value in (1e300, -1e300, np.inf):
+        wild = _copy(record)
+        wild.y[1, 5:] = value
+        found = estimator.run(wild)
+        for name in ("xhat", "P"):
+            if getattr(benign, name) is not None:
+                a, b = getattr(found, name)[others], getattr(benign, name)[others]
+                what = f"{name} of other rows with and without outputs of {value:g} in one row"
+                require_close(a, b, ROUNDING, abs(b).max(axis=(0, 1)), what)
+
+
+@into(ESTIMATOR_CHECKS, "save_load")
+def _estimator_save_load(estimator: Estimator) -> None:
+    """What can be saved is the same when loaded."""
+    cls: Any = type(estimator)
+    if not (hasattr(cls, "save") and hasattr(cls, "load")):
+        return
+    record = _record(estimator)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "saved"
+        cls.save(estimator, path)
+        loaded = cls.load(path, estimator.system)
+    found, expected = loaded.run(record), estimator.run(record)
+    _require_same(estimator, found, expected, ROUNDING, "a loaded estimator and the one saved")

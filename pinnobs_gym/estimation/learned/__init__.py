@@ -1,0 +1,1 @@
+"""What learned estimators share: networks, their files, the dynamics and maps of KKL observers."""

@@ -1,0 +1,191 @@
+"""The network of PINN-Obs: from a time to an estimate and an observer gain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+import torch
+from array_api_compat import array_namespace
+from torch import Tensor, nn
+
+from pinnobs_gym.simulation.system import Array
+
+Activation: TypeAlias = Literal["tanh", "sine", "sigmoid", "relu"]
+Precision: TypeAlias = Literal["float32", "float64"]
+
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def _tanh(z: Array) -> Array:
+    return array_namespace(z).tanh(z)
+
+
+def _sine(z: Array) -> Array:
+    return array_namespace(z).sin(z)
+
+
+def _sigmoid(z: Array) -> Array:
+    return 0.5 + 0.5 * array_namespace(z).tanh(0.5 * z)
+
+
+def _relu(z: Array) -> Array:
+    return z * (z > 0)
+
+
+_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": _tanh,
+    "sine": _sine,
+    "sigmoid": _sigmoid,
+    "relu": _relu,
+}
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The sizes of a `Network`."""
+
+    nx: int
+    """Number of states."""
+    ny: int
+    """Number of outputs."""
+    depth: int = 9
+    """Number of hidden layers."""
+    width: int = 20
+    """Neurons in each."""
+    activation: Activation = "tanh"
+    """Of the hidden layers; the last layer is linear."""
+    dtype: Precision = "float32"
+    """Precision of the weights and of everything computed with them."""
+    span: tuple[float, float] | None = None
+    """First and last time in s, which the network sees as −1 and 1; None feeds it the time in s as
+    it is, as in the paper."""
+    decays: tuple[float, ...] = ()
+    """Time constants τ in s of further inputs exp(−(t − t₀)/τ), t₀ the first time of the span."""
+    frequencies: tuple[float, ...] = ()
+    """Angular frequencies ω in rad/s of further inputs cos ω(t − t₀) and sin ω(t − t₀)."""
+    scale: tuple[float, ...] | None = None
+    """What the network's outputs are multiplied by, shape (nx + nx·ny,): x̂ in state units, then L
+    row by row; None for one."""
+
+    def __post_init__(self) -> None:
+        for name in ("span", "decays", "frequencies", "scale"):
+            value = getattr(self, name)
+            if value is not None:  # a file's lists
+                object.__setattr__(self, name, tuple(float(v) for v in value))
+        if self.span is None and (self.decays or self.frequencies):
+            raise ValueError("span=None; decays and frequencies need the times they begin at")
+        if self.scale is not None and len(self.scale) != self.nx * (1 + self.ny):
+            raise ValueError(f"scale={self.scale!r}; expected {self.nx * (1 + self.ny)} numbers")
+        for name in ("nx", "ny", "depth", "width"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name}={value!r}; expected a whole number of at least 1")
+        for name, choices in (("activation", Activation), ("dtype", Precision)):
+            value, known = getattr(self, name), get_args(choices)
+            if value not in known:
+                raise ValueError(f"{name}={value!r}; expected one of {', '.join(known)}")
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """``dtype`` as torch names it."""
+        return _DTYPES[self.dtype]
+
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
+        """Neurons and inputs of each layer, the last one included."""
+        inputs = 1 + len(self.decays) + 2 * len(self.frequencies)
+        sizes = [inputs] + [self.width] * self.depth + [self.nx * (1 + self.ny)]
+        return [(fan_out, fan_in) for fan_in, fan_out in pairwise(sizes)]
+
+    def features(self, t: Array) -> tuple[Array, Array]:
+        """What the first layer sees at times t (...) in s, and its derivative per s, both
+        (..., num_features), in t's own library."""
+        xp = array_namespace(t)
+        if self.span is None:
+            return t[..., None], xp.ones_like(t)[..., None]
+        start, end = self.span
+        since, rate = t - start, 2 / (end - start)
+        values, rates = [rate * since - 1], [rate * xp.ones_like(t)]
+        for tau in self.decays:
+            values.append(xp.exp(-since / tau))
+            rates.append(values[-1] / -tau)
+        for omega in self.frequencies:
+            cosine, sine = xp.cos(omega * since), xp.sin(omega * since)
+            values += [cosine, sine]
+            rates += [-omega * sine, omega * cosine]
+        return xp.stack(values, axis=-1), xp.stack(rates, axis=-1)
+
+
+class Network(nn.Module):
+    """A multilayer perceptron t ↦ (x̂(t), L(t)) (Farkane et al., PINN-Obs, "Proposed Adaptive
+    PINN-Based Model").
+
+    Its input is the time in s as it is, not scaled, as in the paper, unless the architecture says
+    otherwise. The weights are drawn as Glorot & Bengio (2010) propose for tanh ("Xavier", normal),
+    the biases begin at zero.
+
+    Args:
+        architecture: the sizes.
+        generator: where the weights are drawn from; one of seed 0 if None, never torch's own.
+    """
+
+    def __init__(
+        self, architecture: Architecture, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        generator = generator or torch.Generator().manual_seed(0)
+        self.architecture = architecture
+        dtype = architecture.torch_dtype
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for fan_out, fan_in in architecture.shapes:
+            weight = torch.empty(fan_out, fan_in, dtype=dtype)
+            self.weights.append(nn.init.xavier_normal_(weight, generator=generator))
+            self.biases.append(torch.zeros(fan_out, dtype=dtype))
+        self._activation = _ACTIVATIONS[architecture.activation]
+        self._scale = None
+        if architecture.scale is not None:
+            self._scale = torch.tensor(architecture.scale, dtype=dtype)
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Estimates x̂ (..., nx) in state units and gains L (..., nx, ny) at times t (...) in s."""
+        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        a, _ = self.architecture.features(t)
+        for W, b in hidden:
+            a = self._activation(nn.functional.linear(a, W, b))
+        return self._split(nn.functional.linear(a, weight, bias))
+
+    def _split(self, out: Tensor) -> tuple[Tensor, Tensor]:
+        nx, ny = self.architecture.nx, self.architecture.ny
+        if self._scale is not None:
+            out = out * self._scale
+        return out[..., :nx], out[..., nx:].unflatten(-1, (nx, ny))
+
+
+Layers: TypeAlias = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Weights (fan_out, fan_in) and biases (fan_out,) of each layer, in float64."""
+
+
+def layers_of(network: Network) -> Layers:
+    """A copy of the network's weights for `evaluate`."""
+    pairs = zip(network.weights, network.biases, strict=True)
+    return [(W.detach().double().numpy(), b.detach().double().numpy()) for W, b in pairs]
+
+
+def evaluate(
+    architecture: Architecture, layers: Layers, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `Network.forward` returns, in NumPy and float64: for few times far faster than torch."""
+    activation = _ACTIVATIONS[architecture.activation]
+    a, _ = architecture.features(np.asarray(t, dtype=float))
+    *hidden, (weight, bias) = layers
+    for W, b in hidden:
+        a = activation(a @ W.T + b)
+    out = a @ weight.T + bias
+    if architecture.scale is not None:
+        out *= architecture.scale
+    nx, ny = architecture.nx, architecture.ny
+    return out[..., :nx], out[..., nx:].reshape(*out.shape[:-1], nx, ny)

@@ -1,0 +1,87 @@
+"""How the outputs of a stretch of record depend on the state at its start, to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.estimation.kalman import observe
+from pinnobs_gym.simulation.matrices import product
+from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.system import System
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A trajectory of the model beside the outputs, and the normal equations about it.
+
+    With parameters θ that move its start by Xθ, the sum of squared errors over R is about
+    ``cost`` − 2·``right``ᵀθ + θᵀ·``information``·θ.
+    """
+
+    cost: np.ndarray
+    """Sum of squared output errors over R, shape (batch,)."""
+    information: np.ndarray
+    """ΣGᵀR⁻¹G, shape (n, n, batch), with G the outputs' derivatives by θ."""
+    right: np.ndarray
+    """ΣGᵀR⁻¹e, shape (n, batch)."""
+    x: np.ndarray
+    """States along the trajectory, shape (num_samples, batch, nx)."""
+    X: np.ndarray
+    """Their derivatives by θ, shape (num_samples, nx, n, batch)."""
+
+
+def linearised(
+    system: System,
+    t: Sequence[float] | np.ndarray,
+    y: Sequence[np.ndarray] | np.ndarray,
+    u: Sequence[np.ndarray] | np.ndarray,
+    x: np.ndarray,
+    X: np.ndarray,
+    R: np.ndarray,
+) -> Fit:
+    """The model's trajectory through x, and how the outputs depend on its start.
+
+    Args:
+        system: the model.
+        t: sample times in s, num_samples of them.
+        y: outputs (batch, ny) at each; NaN is a missing one.
+        u: inputs (batch, nu) at each.
+        x: states at the first, shape (batch, nx).
+        X: their derivatives by the parameters, shape (nx, n, batch).
+        R: variances of the output noise, shape (ny,).
+    """
+    n, batch = X.shape[1:]
+    cost, right = np.zeros(batch), np.zeros((n, batch))
+    information = np.zeros((n, n, batch))
+    states, derivatives = np.empty((len(t), *x.shape)), np.empty((len(t), *X.shape))
+    for k in range(len(t)):
+        if k:
+            times = float(t[k - 1]), float(t[k])
+            x, F = model_step_jacobian(system, *times, x, u[k - 1], u[k])
+            X = product(F.transpose(1, 2, 0), X)
+        states[k], derivatives[k] = x, X
+        error, H = observe(system, x, y[k])
+        G = product(H, X)
+        weighted = (G / R[:, None, None]).transpose(1, 0, 2)
+        cost += (error**2 / R).sum(axis=-1)
+        right += np.einsum("ipb,bp->ib", weighted, error)
+        information += product(weighted, G)
+    return Fit(cost, information, right, states, derivatives)
+
+
+def root(P: np.ndarray) -> np.ndarray:
+    """L with LLᵀ = P, both (nx, nx, batch), for P symmetric and positive semidefinite."""
+    values, vectors = np.linalg.eigh(P.transpose(2, 0, 1))
+    return (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]).transpose(1, 2, 0)
+
+
+def solved(information: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """θ (n, batch) with information·θ = right; not a number where the information is not finite."""
+    A = information.transpose(2, 0, 1)
+    finite = np.isfinite(A).all(axis=(1, 2))
+    theta = np.full(right.shape, np.nan)
+    theta[:, finite] = np.linalg.solve(A[finite], right.T[finite][..., None])[..., 0].T
+    return theta

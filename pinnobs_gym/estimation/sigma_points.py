@@ -1,0 +1,98 @@
+"""What the sigma-point filters share: all but where they put their points."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.estimation.estimator import State
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
+from pinnobs_gym.simulation.matrices import divide, factor, outer, product, sandwich
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What the filter keeps besides the state's own fields; the batch comes last."""
+
+    Q: np.ndarray
+    """Covariance of the process noise, shape (nx, nx, batch)."""
+    R: np.ndarray
+    """Covariance of the output noise, shape (ny, ny, batch)."""
+    points: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """What `SigmaPointFilter.points` returns."""
+    jitter: np.ndarray
+    """The largest part of a variance that had to be added so far, shape (batch,); zero if none."""
+
+
+@dataclass(frozen=True)
+class SigmaPointFilter(GaussianEstimator):
+    """A Kalman filter whose moments come from points sent through the model.
+
+    The points are drawn anew after the prediction, so that they know of Q. With the weighted
+    deviations X of the points, and Y of their outputs, K = XYᵀ(YYᵀ + R)⁻¹ and
+    P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ: Joseph's form, positive semidefinite whatever K is (Arasaratnam
+    & Haykin 2009, the square-root form of section VII). If a covariance has no Cholesky factor,
+    `kalman.JITTER` of each of its variances is added, and reported in the state's memory.
+    """
+
+    equations = r"""
+\chi_i^- &= \varphi(\hat x_{k-1} + \sqrt{P_{k-1}}\, \xi_i), \qquad
+\hat x_k^- = \sum_i w_i \chi_i^- \\
+P_k^- &= \sum_i v_i (\chi_i^- - \hat x_k^-)(\chi_i^- - \hat x_k^-)^\top + Q \\
+\chi_i &= \hat x_k^- + \sqrt{P_k^-}\, \xi_i, \qquad \hat y = \sum_i w_i h(\chi_i) \\
+X_i &= \sqrt{v_i} (\chi_i - \hat x_k^-), \qquad Y_i = \sqrt{v_i} (h(\chi_i) - \hat y) \\
+K &= X Y^\top (Y Y^\top + R)^{-1} \\
+\hat x_k &= \hat x_k^- + K\, (y_k - \hat y) \\
+P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
+"""
+
+    @abstractmethod
+    def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points of the standard normal distribution, (num_points, nx), and their weights in
+        means and in covariances, (num_points,), none negative."""
+
+    def reset(self, prior: Prior) -> State:
+        prior = checked(prior)
+        batch = len(prior.mean)
+        memory = Memory(*self.tuning(batch), self.points(), np.zeros(batch))
+        return State(prior.mean, P=prior.cov, memory=memory)
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: Memory = state.memory
+        xhat, P = state.xhat, covariances(state)
+        unit, mean_weights, cov_weights = memory.points
+        weights = np.sqrt(cov_weights)[:, None]
+        L, jitter = factor(P, memory.jitter)
+        if state.t is not None:
+            points = unit @ L  # (nx, num_points, batch)
+            points += xhat.T[:, None]
+            points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
+            points = np.ascontiguousarray(points.transpose(2, 0, 1))
+            mean = mean_weights @ points  # (nx, batch)
+            X = (points - mean[:, None]) * weights
+            xhat, P = mean.T, outer(X, X) + memory.Q
+            L, jitter = factor(P, jitter)
+        X = unit @ L  # (nx, num_points, batch)
+        points = X + xhat.T[:, None]
+        outputs = np.asarray(self.system.h(points.transpose(1, 2, 0))).transpose(2, 0, 1)
+        mean = mean_weights @ outputs
+        X, Y = X * weights, (outputs - mean[:, None]) * weights
+        innovation, missing = y - mean.T, np.isnan(y)
+        if np.count_nonzero(missing):
+            innovation = np.where(missing, 0.0, innovation)
+            Y = np.where(missing.T[:, None], 0.0, Y)
+        S = outer(Y, Y)
+        S += memory.R
+        K = divide(outer(X, Y), S)
+        X -= product(K, Y)
+        P = outer(X, X)
+        P += sandwich(K, memory.R)
+        xhat = (xhat.T + product(K, innovation.T[:, None])[:, 0]).T
+        if jitter is not memory.jitter:
+            memory = replace(memory, jitter=jitter)
+        P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
+        return State(xhat, t, u, P, innovation, S, memory)

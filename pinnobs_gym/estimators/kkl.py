@@ -1,0 +1,273 @@
+"""Learned KKL observers: what is trained, its file, and the three ways to train it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.estimation.learned.kkl_dynamics import Dynamics, Mode, Start, at_rest
+from pinnobs_gym.estimation.learned.kkl_maps import Activation, Layers, evaluate
+from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import Array, System
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """What T and T* are told beside x or z where they depend on time: e^(−rt), t the time since the
+    first sample, and the input over its size."""
+
+    rates: tuple[float, ...] = ()
+    """r in 1/s."""
+    amplitudes: tuple[float, ...] = ()
+    """Sizes of the inputs; none if the plant has none."""
+
+    @property
+    def size(self) -> int:
+        """How many numbers it tells."""
+        return len(self.rates) + len(self.amplitudes)
+
+    def __call__(self, t: Array, u: Array, xp: Any = np) -> Array:
+        """The numbers (..., size) at times t (...) since the first sample, inputs (..., nu)."""
+        told = [xp.exp(-rate * t) for rate in self.rates]
+        told += [u[..., i] / size for i, size in enumerate(self.amplitudes)]
+        return xp.stack(told, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedKKL:
+    """A KKL observer, and how its training went."""
+
+    trainer: str
+    """Name of the trainer."""
+    A: np.ndarray
+    """Shape (nz, nz), in 1/s."""
+    B: np.ndarray
+    """Shape (nz, ny)."""
+    mode: Mode
+    start: Start
+    clock: Clock
+    """What T* is told beside z; T, too, if the plant is driven."""
+    activation: Activation
+    encoder: Layers
+    """T: from x (and the clock, if the plant is driven) to z."""
+    decoder: Layers
+    """T*: from z and the clock to x."""
+    system: str
+    """Class name of the system."""
+    parameters: Mapping[str, Any]
+    """The system's physical parameters, as JSON holds them."""
+    noise_std: tuple[float, ...]
+    """Standard deviations of the output noise that it was trained with."""
+    config: Mapping[str, Any]
+    """The trainer's settings."""
+    seed: int
+    """What the weights and initial states were drawn from."""
+    loss: float
+    """Mean squared scaled error of x̂ on episodes held out, noise included."""
+    iterations: int
+    """Steps made for both networks."""
+    seconds: float
+    """CPU time in s that all took."""
+    facts: Mapping[str, Any]
+    """What else is known of the training: initial states dropped, the error of T, a sweep."""
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """The dynamics of z."""
+        return Dynamics(self.A, self.B, self.mode)
+
+    @cached_property
+    def rest(self) -> np.ndarray:
+        """What z begins at over a constant output, (nz, ny); zero unless it begins at rest."""
+        return at_rest(self.dynamics, self.start)
+
+    def T(self, x: np.ndarray, t: float = 0.0, u: np.ndarray | None = None) -> np.ndarray:
+        """What z is at states (..., nx), (..., nz); of a driven plant at time t, inputs u."""
+        if self.clock.amplitudes:
+            u = np.zeros(len(self.clock.amplitudes)) if u is None else u
+            told = self.clock(np.asarray(t), u)
+            x = np.concatenate([x, np.broadcast_to(told, (*x.shape[:-1], told.shape[-1]))], -1)
+        return evaluate(self.encoder, self.activation, x)
+
+    def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Estimates (..., nx) at z (..., nz), times t since the first sample, inputs (..., nu)."""
+        if self.clock.size:
+            shape = z.shape[:-1]
+            t = np.broadcast_to(np.asarray(t, dtype=float), shape)
+            u = np.broadcast_to(u, (*shape, u.shape[-1]))
+            z = np.concatenate([z, self.clock(t, u)], axis=-1)
+        return evaluate(self.decoder, self.activation, z)
+
+    def save(self, path: str | Path) -> None:
+        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
+
+        Raises:
+            ValueError: in one line, if the file cannot be written.
+        """
+        facts = {f.name: getattr(self, f.name) for f in fields(self)}
+        arrays = {name: torch.tensor(facts.pop(name)) for name in ("A", "B")}
+        maps = {
+            name: [[torch.tensor(a) for a in layer] for layer in facts.pop(name)]
+            for name in ("encoder", "decoder")
+        }
+        facts["clock"] = {"rates": self.clock.rates, "amplitudes": self.clock.amplitudes}
+        write(path, {"facts": json.dumps(facts), **arrays, **maps})
+
+    @classmethod
+    def load(cls, path: str | Path, system: System, trainer: str) -> Self:
+        """Read what `save` wrote, for the system and by the trainer it was trained with.
+
+        Raises:
+            ValueError: in one line, if there is no such file, if it is something else or damaged,
+                or if it belongs to another system, other parameters or another trainer.
+        """
+        saved = read(path)
+        try:
+            facts = json.loads(saved["facts"])
+            facts["noise_std"] = tuple(facts["noise_std"])
+            clock = Clock(**{name: tuple(v) for name, v in facts.pop("clock").items()})
+            arrays = {name: saved[name].numpy() for name in ("A", "B")}
+            maps = {
+                name: tuple((W.numpy(), b.numpy()) for W, b in saved[name])
+                for name in ("encoder", "decoder")
+            }
+            trained = cls(clock=clock, **arrays, **maps, **facts)
+            ny, nx = trained.B.shape[1], len(trained.decoder[-1][1])
+        except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path} is not a saved KKL observer: {reason}") from None
+        found = {"system": trained.system, "parameters": trained.parameters, "nx": nx, "ny": ny}
+        check_same(path, {**found, "trainer": trained.trainer}, identity(system))
+        check_same(path, {"trainer": trained.trainer}, {"trainer": trainer})
+        return trained
+
+
+@dataclass(frozen=True)
+class KKL(Estimator):
+    """What the learned KKL observers share: ż = A_z z + B_z y, exactly integrated for outputs that
+    are straight lines between samples, of any lengths, and x̂ = T*(z).
+
+    A missing output is replaced by h of the model's prediction from the last x̂.
+    """
+
+    trained: TrainedKKL = field(kw_only=True, repr=False)
+    """The trained observer."""
+
+    knows = ("model", "noise", "simulated true states")
+    equations = r"""
+\dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
+\hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial x}(x)\, f(x) = A_z T(x) + B_z h(x)
+"""
+
+    def reset(self, prior: Prior) -> State:
+        return State(np.array(prior.mean, dtype=float))
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        trained = self.trained
+        y = self._complete(state, t, y, u)
+        if state.t is None:
+            z, first = self._begin(state.xhat, y), t
+        else:
+            before, first, y0 = state.memory
+            flow, held, now = trained.dynamics.step(round(t - state.t, 12))
+            z = before @ flow.T
+            z += y0 @ held.T
+            z += y @ now.T
+        return State(trained.inverse(z, t - first, u), t, u, memory=(z, first, y))
+
+    def _begin(self, xhat: np.ndarray, y: np.ndarray) -> np.ndarray:
+        if self.trained.start == "prior":
+            return self.trained.T(xhat)
+        return y @ self.trained.rest.T
+
+    def _complete(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Outputs with what the model predicts where it is missing."""
+        missing = np.isnan(y)
+        if not missing.any():
+            return y
+        rows = missing.any(axis=1)
+        xhat = state.xhat[rows]
+        if state.t is not None:
+            before = None if state.u is None else state.u[rows]
+            xhat = model_step(self.system, state.t, t, xhat, before, u[rows])
+        y = y.copy()
+        y[rows] = np.where(missing[rows], self.system.h(xhat), y[rows])
+        return y
+
+    def save(self, path: str | Path) -> None:
+        """Write the trained observer to a file; see `TrainedKKL.save`."""
+        self.trained.save(path)
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Self:
+        """The estimator with the observer in a file; see `TrainedKKL.load`."""
+        trained = TrainedKKL.load(path, system, str(cls.needs_training))
+        return cls(system, trained.noise_std, trained=trained)
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How it was trained."""
+        names = ("trainer", "seed", "loss", "iterations", "seconds", "config")
+        dropped = {name: self.trained.facts[name] for name in ("dropped", "drawn")}
+        return {**{name: getattr(self.trained, name) for name in names}, **dropped}
+
+
+@dataclass(frozen=True)
+class KKLSupervised(KKL):
+    """A KKL observer, ż = A_z z + B_z y and x̂ = T*(z), whose T* is fitted to simulated pairs of
+    states and z (Ramos et al. 2020)."""
+
+    name = "kkl_supervised"
+    equations = (
+        KKL.equations.rstrip()
+        + r""" \\
+T &: \; \min \textstyle\sum_i \| T(x_i) - z_i \|^2, \qquad
+T^* : \; \min \textstyle\sum_i \| T^*(z_i) - x_i \|^2
+"""
+    )
+    needs_training = "kkl_supervised"
+
+
+@dataclass(frozen=True)
+class KKLPinn(KKL):
+    """A KKL observer, ż = A_z z + B_z y and x̂ = T*(z), whose T is fitted to simulated pairs and to
+    its partial differential equation at other points (Niazi et al. 2023)."""
+
+    name = "kkl_pinn"
+    equations = (
+        KKL.equations.rstrip()
+        + r""" \\
+T &: \; \min \sum_i \| T(x_i) - z_i \|^2 + \frac{w}{\lambda^2} \sum_j
+\Bigl\| \tfrac{\partial T}{\partial x}(x_j)\, f(x_j) - A_z T(x_j) - B_z h(x_j) \Bigr\|^2, \qquad
+\lambda = \min |\operatorname{Re} \lambda(A_z)| \\
+T^* &: \; \min \textstyle\sum_i \| T^*(z_i) - x_i \|^2
+"""
+    )
+    needs_training = "kkl_pinn"
+
+
+@dataclass(frozen=True)
+class KKLAutoencoder(KKL):
+    """A KKL observer, ż = A_z z + B_z y and x̂ = T*(z), whose T is fitted to its own equation over
+    several samples, and T* to T, without simulated z (Peralez & Nadri 2021)."""
+
+    name = "kkl_autoencoder"
+    equations = (
+        KKL.equations.rstrip()
+        + r""" \\
+T &: \; \min \sum_k \Bigl\| T(x_{k+m}) - \Phi^m T(x_k)
+- \sum_{j=k}^{k+m-1} \Phi^{k+m-1-j} (\Gamma_0 y_j + \Gamma_1 y_{j+1}) \Bigr\|^2 \\
+T^* &: \; \min \textstyle\sum_k \| T^*(z_k) - x_k \|^2, \qquad z_k \text{ as } T \text{ says}
+"""
+    )
+    needs_training = "kkl_autoencoder"

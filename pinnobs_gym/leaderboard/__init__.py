@@ -1,0 +1,1 @@
+"""What many stored scores say together: standings, ranks, suites of jobs, and the page."""

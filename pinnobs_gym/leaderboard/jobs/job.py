@@ -1,0 +1,149 @@
+"""The jobs of a leaderboard, each a pure function of what it says that appends its own rows."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+from pinnobs_gym.envs.registration import env_id, make_vector_env
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.scoring import rows as rows_module
+from pinnobs_gym.scoring.evaluation import Results, run_episodes
+from pinnobs_gym.scoring.provenance import canonical, now, versions
+from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder
+from pinnobs_gym.training.by_name import TRAINING_SEED, Played, load, train, trainer
+from pinnobs_gym.training.log import Log
+
+
+@dataclass(frozen=True)
+class Job:
+    """One evaluation, to be run in any process."""
+
+    system: str
+    """Name or ``module:Class`` of the system."""
+    estimator: str
+    """Name or ``module:Class`` of the estimator."""
+    setup: str
+    condition: str
+    episodes: int
+    seed: int
+    folder: Path
+    """Where rows, TensorBoard's log and trained files go."""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """Choices in the trainer's Config, for estimators that learn."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The estimator's own settings."""
+    label: str | None = None
+    """The estimator's name in rows, if not its own."""
+    known: frozenset[tuple[str, int | None, int]] | None = None
+    """What is stored already; see `Results`."""
+    failed: bool = False
+    """Whether it failed before, and is tried again."""
+
+    @property
+    def rows(self) -> Path:
+        """The rows file."""
+        return self.folder / "rows.jsonl"
+
+    @property
+    def name(self) -> str:
+        """What the job does, in a few words."""
+        many = f"{self.episodes} episodes" if self.episodes > 1 else f"episode {self.seed}"
+        return f"{self.label or self.estimator} on {self.system}, {self.condition}, {many}"
+
+    @property
+    def digest(self) -> str:
+        """A hash of all that is asked for."""
+        aside = {f.name: None for f in fields(self) if f.name in ("folder", "known", "failed")}
+        return _digest({f.name: getattr(self, f.name) for f in fields(self)} | aside)
+
+    def run(self) -> None:
+        """Append the rows that are missing; see `run_job`."""
+        run_job(self)
+        if self.failed:
+            rows_module.append(self.rows, [self._event("recovery")])
+
+    def anew(self) -> Self:
+        """The same job, when it is not known any more what is stored."""
+        return replace(self, known=None)
+
+    def fail(self, error: str) -> None:
+        """Append a row that says what went wrong.
+
+        Raises:
+            CannotWrite: if it cannot.
+        """
+        rows_module.append(self.rows, [self._event("failure") | {"error": error}])
+
+    def _event(self, kind: str) -> Row:
+        return {
+            "schema": rows_module.SCHEMA,
+            "kind": kind,
+            "env_id": env_id(self.system),
+            "setup": self.setup,
+            "condition": self.condition,
+            "estimator": self.label or ESTIMATORS.name_of(ESTIMATORS.resolve(self.estimator)),
+            "episode_seed": self.seed,
+            "episodes": self.episodes,
+            "job": self.digest,
+            "versions": versions(),
+            "date": now(),
+        }
+
+
+def run_job(job: Job) -> None:
+    """Train if the estimator needs it, evaluate, and append the rows that are missing."""
+    import torch
+
+    torch.set_num_threads(1)
+    name = env_id(job.system)
+    cls = ESTIMATORS.resolve(job.estimator)
+    options = dict(job.settings)
+    estimator: Estimator | type[Estimator] = cls
+    if cls.trains_on_record is not None:
+        recipe = trainer(cls.trains_on_record).Config(**job.training)
+        place = f"{_played(job)}-{cls.trains_on_record}-{_digest(recipe)}-episode{job.seed}"
+        options = {"config": recipe, "folder": job.folder / "trained" / place}
+    elif cls.needs_training is not None:
+        estimator = trained(cls, job)
+    seeds = range(job.seed, job.seed + job.episodes)
+    results = Results(job.rows, job.known)
+    found, made, example = run_episodes(
+        estimator, name, seeds, job.setup, job.condition, options, results, label=job.label
+    )
+    scored = [row for row in found if "nrmse" in row]
+    if example is not None:  # something was run, and not all of it was there already
+        with Log(log_folder(job.folder, scored[0])) as log:
+            log_episodes(log, scored, made, example)
+
+
+def trained(cls: type[Estimator], job: Job) -> Estimator:
+    """The estimator trained on episodes that are never scored, loaded if that was done before."""
+    name = str(cls.needs_training)
+    recipe = trainer(name).Config(**{**cls.recipe, **job.training})
+    played = Played(env_id(job.system), job.setup, job.condition, TRAINING_SEED)
+    label = f"{_played(job)}-{name}-{_digest(recipe)}"
+    path = job.folder / "trained" / f"{label}.pt"
+    if not path.exists():
+        with Log(job.folder / "tensorboard" / "training" / label) as log:
+            result = train(name, recipe, played, log=log)
+        if not path.exists():  # of two that trained at the same time, the first counts
+            result.save(path)
+    source = make_vector_env(played.env_id, 1, played.setup, played.condition).source
+    return load(cls, path, source.system, source.setup)
+
+
+def _played(job: Job) -> str:
+    return f"{env_id(job.system).removeprefix('pinnobs/')}-{job.setup}-{job.condition}"
+
+
+def _digest(recipe: Any) -> str:
+    """Tells recipes apart in the names of files."""
+    text = json.dumps(canonical(recipe), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

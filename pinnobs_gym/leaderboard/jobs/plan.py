@@ -1,0 +1,190 @@
+"""Which jobs a suite is, and which of them are left."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.leaderboard.jobs.job import Job
+from pinnobs_gym.leaderboard.suites import Entry, Suite
+from pinnobs_gym.scoring.rows import Stored
+from pinnobs_gym.simulation.conditions import canonical_name, fitting
+from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.training.by_name import trainer
+
+
+def default_estimators() -> tuple[str, ...]:
+    """All that can be scored on episodes they have not seen."""
+    return tuple(
+        name
+        for name, cls in ESTIMATORS.classes().items()
+        if cls.needs_training is None or cls.track == "online"
+    )
+
+
+def jobs_of(suite: Suite, folder: Path) -> list[Job]:
+    """The jobs of a suite, in a folder: those that train first, since they are the longest; the
+    others game by game, since what an episode's reference takes is kept from one to the next.
+
+    Estimators that train on each record get their own, smaller number of episodes, a job each.
+
+    Raises:
+        ValueError: in one line, naming what does not fit, before anything is run.
+    """
+    estimators = suite.estimators or tuple(map(Entry, default_estimators()))
+    chosen = [(entry, _class(suite, entry)) for entry in estimators]
+    called = [entry.label or ESTIMATORS.name_of(cls) for entry, cls in chosen]
+    for name in called:
+        if called.count(name) > 1:
+            told = f"{name!r} stands for two; give each a label of its own"
+            raise suite.wrong("estimators", told)
+    quick, long = [], []
+    for system in suite.systems or tuple(SYSTEMS.classes()):
+        for game, (entry, cls) in product(_games(suite, system), chosen):
+            if cls.needs_training or cls.trains_on_record:
+                if not game.untrained_only:
+                    long += _learning(suite, entry, cls, game, folder)
+            else:
+                _check_settings(suite, entry, cls, game.source, {})
+                quick.append(_job(suite, entry, game, folder, settings=entry.settings))
+    return long + quick
+
+
+@dataclass(frozen=True)
+class Game:
+    """What is played."""
+
+    system: str
+    condition: str
+    source: EpisodeSource
+    untrained_only: bool
+    """Whether estimators that need training leave it out."""
+
+
+def _job(suite: Suite, entry: Entry, game: Game, folder: Path, **more: Any) -> Job:
+    return Job(
+        system=game.system,
+        estimator=entry.name,
+        setup=suite.setup,
+        condition=game.condition,
+        episodes=1 if game.source.deterministic else suite.episodes,
+        seed=suite.seed,
+        folder=folder,
+        label=entry.label,
+        **more,
+    )
+
+
+def _learning(
+    suite: Suite, entry: Entry, cls: type[Estimator], game: Game, folder: Path
+) -> Iterator[Job]:
+    """The jobs of an estimator that learns: of each budget and seed one or, if it trains on each
+    record, one for each episode."""
+    seeds = [{"seed": seed} for seed in suite.training_seeds] or [{}]
+    for budget, seed in product(suite.budgets, seeds):
+        training = {"budget": budget, **seed, **entry.settings}
+        _check_settings(suite, entry, cls, game.source, training)
+        job = _job(suite, entry, game, folder, training=training)
+        if cls.trains_on_record is None:
+            yield job
+        else:
+            for i in range(min(job.episodes, suite.trained_episodes)):
+                yield replace(job, episodes=1, seed=suite.seed + i)
+
+
+def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[Job], list[Job]]:
+    """The jobs to run, each told what of it is stored already, and those that are left out since
+    they failed before; with ``retry_failed`` they are run again."""
+    there: dict[tuple[str, ...], list[tuple[str, int | None, int]]] = defaultdict(list)
+    for row in stored.rows:
+        game = (row["env_id"], row["setup"], row["condition"], row["estimator"])
+        there[game].append((row["config_hash"], row["training_seed"], row["episode_seed"]))
+    failed = {row["job"] for row in stored.failures}
+    to_run, left_out = [], []
+    for job in jobs:
+        again = job.digest in failed
+        if again and not retry_failed:
+            left_out.append(job)
+            continue
+        known = None  # if it may have another name in rows, the job looks for itself
+        cls = ESTIMATORS.resolve(job.estimator)
+        if job.label is not None or cls.label is Estimator.label:
+            name = job.label or ESTIMATORS.name_of(cls)
+            found = there[env_id(job.system), job.setup, job.condition, name]
+            seeds = range(job.seed, job.seed + job.episodes)
+            known = frozenset(entry for entry in found if entry[2] in seeds)
+        to_run.append(replace(job, known=known, failed=again))
+    return to_run, left_out
+
+
+def _class(suite: Suite, entry: Entry) -> type[Estimator]:
+    try:
+        cls = ESTIMATORS.resolve(entry.name)
+        if cls.needs_training is not None and cls.track == "offline":
+            raise ValueError(f"estimator {entry.name!r} knows one record; it cannot be ranked")
+    except ValueError as error:
+        raise suite.wrong("estimators", error) from error
+    return cls
+
+
+def _games(suite: Suite, system: str) -> list[Game]:
+    """What of a system is played."""
+    try:
+        cls = SYSTEMS.resolve(system)
+        env_id(system)  # registers it
+    except ValueError as error:
+        raise suite.wrong("systems", error) from error
+    try:
+        model, setup = cls.configured(suite.setup)
+    except ValueError as error:
+        raise suite.wrong("setup", error) from error
+    if "all" in suite.conditions and len(suite.conditions) > 1:
+        told = f"conditions {' '.join(suite.conditions)}: 'all' stands alone"
+        raise suite.wrong("conditions", told)
+    ranked = list(dict.fromkeys(["nominal", cls.ranked_condition]))
+    if suite.conditions == ("all",):
+        names = dict.fromkeys([*ranked, *fitting(model, setup)])
+    else:
+        names, ranked = suite.conditions or ranked, list(suite.conditions or ranked)
+    games = []
+    for name in names:
+        try:
+            source = EpisodeSource(cls, suite.setup, name)
+        except ValueError as error:
+            raise suite.wrong("conditions", f"{name!r} on {system}: {error}") from error
+        games.append(Game(system, canonical_name(name), source, name not in ranked))
+    return list({game.condition: game for game in games}.values())
+
+
+def _check_settings(
+    suite: Suite,
+    entry: Entry,
+    cls: type[Estimator],
+    source: EpisodeSource,
+    training: Mapping[str, Any],
+) -> None:
+    """Whether the estimator takes its settings, or its trainer its own."""
+    name = cls.needs_training or cls.trains_on_record
+    made: Any = cls if name is None else trainer(name).Config
+    aside = {f.name for f in fields(Estimator)}
+    known = sorted(f.name for f in fields(made) if f.init and f.repr and f.name not in aside)
+    for setting in (*entry.settings, *training):
+        if setting not in known:
+            told = f"setting {setting!r} of {entry.name!r}; expected one of {', '.join(known)}"
+            raise suite.wrong("estimators", told)
+    try:
+        if name is None:
+            cls.for_setup(source.system, source.setup, **entry.settings)
+        else:
+            made(**{**cls.recipe, **training})
+    except (ValueError, TypeError) as error:
+        told = f"settings of {entry.name!r}: {error}"
+        raise suite.wrong("estimators" if entry.settings else "budgets", told) from error

@@ -1,0 +1,119 @@
+"""Charts that compare estimators: with the EKF, with the reference, with what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import altair as alt
+
+from pinnobs_gym.leaderboard.site.charts import (
+    Spec,
+    Styled,
+    exact,
+    finished,
+    finite,
+    log_axis,
+    log_scale,
+    named,
+)
+
+STEP = 21
+"""Height of a line of a chart that has one per estimator."""
+PLAIN_NAMES = alt.Axis(
+    domain=False, ticks=False, grid=False, labelLimit=150, labelPadding=8, minExtent=0
+)
+
+
+def level(scale: alt.Scale, vertical: bool) -> alt.Chart:
+    """A line where the ratio is 1."""
+    rule = named("one").mark_rule(style="level")
+    if vertical:
+        return rule.encode(x=alt.XDatum(1, scale=scale))
+    return rule.encode(y=alt.YDatum(1, scale=scale))
+
+
+def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Spec:
+    """The factor to the peer with its interval, a line per estimator, on an axis from low to
+    high."""
+    scale = log_scale(low, high)
+    tips = ["estimator:N", "track:N", exact("ratio", "/ ekf"), exact("low"), exact("high")]
+    title = "NRMSE / EKF's, over all systems"
+    x = alt.X("ratio:Q", scale=scale, title=title, axis=log_axis(low, high))
+    base = (
+        named("standings")
+        .transform_calculate(upper=finite("high"))
+        .encode(
+            y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
+            color=styled.colour,
+            tooltip=tips,
+        )
+    )
+    return finished(
+        level(scale, vertical=True),
+        base.mark_rule(strokeWidth=2).encode(x=alt.X("low:Q", scale=scale), x2="upper:Q"),
+        base.mark_point(filled=True, size=70, opacity=1).encode(x=x, shape=styled.shape),
+        height=STEP * len(order),
+    )
+
+
+def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spec:
+    """Quantiles of the error over the Cramér-Rao reference, a line per estimator, on an axis from
+    low to high."""
+    scale, axis = log_scale(low, high), log_axis(low, high)
+    title = "NRMSE / reference, same episode"
+    base = (
+        named("ratios")
+        .transform_calculate(upper90=finite("q90"), upper75=finite("q75"))
+        .encode(
+            y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
+            tooltip=["estimator:N", *map(exact, ("q10", "q25", "median", "q75", "q90"))],
+        )
+    )
+    coloured = base.encode(color=styled.colour)
+    return finished(
+        level(scale, vertical=True),
+        coloured.mark_rule(strokeWidth=1.5).encode(
+            x=alt.X("q10:Q", scale=scale, axis=axis, title=title), x2="upper90:Q"
+        ),
+        coloured.mark_bar(size=9, opacity=0.6).encode(
+            x=alt.X("q25:Q", scale=scale, axis=axis, title=title), x2="upper75:Q"
+        ),
+        base.transform_filter("isValid(datum.median)")
+        .mark_tick(style="middle")
+        .encode(x=alt.X("median:Q", scale=scale, axis=axis, title=title)),
+        height=STEP * len(order),
+    )
+
+
+def cost(
+    styled: Styled,
+    field: str,
+    title: str,
+    across: tuple[float, float],
+    up: tuple[float, float],
+) -> Spec:
+    """The factor to the peer against a cost, both axes with their ranges; those for which
+    ``named_<field>`` is true have their name beside them."""
+    scale = log_scale(*up)
+    x = alt.X(f"{field}:Q", scale=log_scale(*across), title=title, axis=log_axis(*across))
+    y = alt.Y("ratio:Q", scale=scale, title="NRMSE / EKF's", axis=log_axis(*up))
+    tips = ["estimator:N", "track:N", exact(field, title), exact("ratio", "/ ekf")]
+    base = (
+        named("standings")
+        .transform_filter(f"isValid(datum.{field})")
+        .transform_calculate(upper=finite("high"))
+        .encode(x=x, y=y, tooltip=[*tips, exact("low"), exact("high")])
+    )
+    return finished(
+        level(scale, vertical=False),
+        base.mark_rule(opacity=0.5).encode(
+            y=alt.Y("low:Q", scale=scale), y2="upper:Q", color=styled.colour
+        ),
+        base.mark_point(filled=True, size=80, opacity=1).encode(
+            color=styled.colour, shape=styled.shape
+        ),
+        base.transform_filter(f"datum.named_{field}")
+        .mark_text(style="name", align="left", dx=8, dy=-7)
+        .encode(text="estimator:N"),
+        height=340,
+    )

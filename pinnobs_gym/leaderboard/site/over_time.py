@@ -1,0 +1,108 @@
+"""Charts over time: errors, settling, and the states of one episode."""
+
+from __future__ import annotations
+
+import altair as alt
+
+from pinnobs_gym.leaderboard.site.charts import (
+    SHOWN,
+    Spec,
+    Styled,
+    exact,
+    finished,
+    finite,
+    log_axis,
+    log_scale,
+    named,
+    time_of,
+)
+
+HEIGHT = 300
+
+
+def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
+    """Error over time up to ``end`` (s), on an axis from low to high: medians and bands of the
+    estimators chosen, over the medians of all others, and the Cramér-Rao reference."""
+    scale, axis = log_scale(low, high), log_axis(low, high)
+    y = alt.Y("shown_median:Q", scale=scale, title="NRMSE of a sample", axis=axis)
+    base = (
+        named("errors")
+        .transform_calculate(
+            shown_median="datum.median > 0 ? datum.median : null",
+            low="datum.q10 > 0 ? datum.q10 : null",
+            high=finite("q90"),
+        )
+        .encode(x=time_of(end), y=y)
+    )
+    chosen = base.transform_filter(SHOWN)
+    reference = (
+        named("reference")
+        .transform_calculate(shown_median="datum.median > 0 ? datum.median : null")
+        .encode(x=time_of(end), y=y)
+    )
+    tips = ["estimator:N", exact("t", "t (s)"), exact("median"), exact("q10", "10 %")]
+    return finished(
+        base.transform_filter(f"!({SHOWN})")
+        .mark_line(style="others", clip=True)
+        .encode(detail="estimator:N"),
+        chosen.mark_area(opacity=0.11, clip=True).encode(
+            y=alt.Y("low:Q", scale=scale), y2="high:Q", color=styled.colour
+        ),
+        chosen.mark_line(clip=True).encode(color=styled.colour, strokeDash=styled.dash),
+        reference.mark_line(style="reference", clip=True),
+        chosen.mark_point(opacity=0, size=90, filled=True, clip=True).encode(
+            color=styled.colour, tooltip=[*tips, exact("q90", "90 %")]
+        ),
+        height=HEIGHT,
+        shown=[],
+    )
+
+
+def settling(styled: Styled, end: float) -> Spec:
+    """Share of episodes settled against time up to ``end`` (s)."""
+    axis = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
+    y = alt.Y("share:Q", scale=alt.Scale(domain=[0, 1]), title="episodes settled", axis=axis)
+    base = named("settling").encode(x=time_of(end), y=y)
+    chosen = base.transform_filter(SHOWN).encode(color=styled.colour)
+    tips = ["estimator:N", exact("t", "t (s)"), alt.Tooltip("share:Q", format=".0%")]
+    return finished(
+        base.transform_filter(f"!({SHOWN})")
+        .mark_line(style="others", interpolate="step-after")
+        .encode(detail="estimator:N"),
+        chosen.mark_line(interpolate="step-after").encode(strokeDash=styled.dash),
+        chosen.mark_point(opacity=0, size=90, filled=True).encode(tooltip=tips),
+        height=HEIGHT,
+        shown=[],
+    )
+
+
+def state(
+    styled: Styled, index: int, title: str, end: float, limits: tuple[float, float], measured: bool
+) -> Spec:
+    """One state of the example episode within its limits, and what the selected estimator makes of
+    it; dots are an output that measures it alone. The page can set until when (s) it is drawn."""
+    scale = alt.Scale(domain=list(limits), nice=False, clamp=True)
+    until = alt.Scale(domainMin=0, domainMax=alt.ExprRef(expr="until"), nice=False)
+    x = alt.X("t:Q", scale=until, axis=alt.Axis(tickCount=6), title="t (s)")
+    truth = named("truth").encode(x=x)
+    mine = (
+        named("estimates")
+        .transform_filter("datum.estimator === selected")
+        .transform_calculate(
+            low=f"isValid(datum.s{index}) ? datum.m{index} - datum.s{index} : null",
+            high=f"isValid(datum.s{index}) ? datum.m{index} + datum.s{index} : null",
+        )
+        .encode(x=x, color=styled.colour)
+    )
+
+    def y(field: str) -> alt.Y:
+        return alt.Y(f"{field}:Q", scale=scale, title=title, axis=alt.Axis(tickCount=4))
+
+    layers = [
+        mine.mark_area(opacity=0.18, clip=True).encode(y=y("low"), y2="high:Q"),
+        truth.mark_line(style="truth", clip=True).encode(y=y(f"x{index}")),
+        mine.mark_line(strokeDash=[5, 3], clip=True).encode(y=y(f"m{index}")),
+    ]
+    if measured:
+        layers.insert(0, truth.mark_point(style="measured", clip=True).encode(y=y(f"y{index}")))
+    return finished(*layers, height=120, selected="", until=end)

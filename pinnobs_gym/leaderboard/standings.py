@@ -1,0 +1,119 @@
+"""Tables of stored scores. Nothing here runs an estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.leaderboard.intervals import Interval, median, rate
+from pinnobs_gym.scoring.consistency import band
+from pinnobs_gym.scoring.metrics import DIVERGED
+from pinnobs_gym.scoring.rows import Row
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How one estimator did on the episodes of one env, setup and condition."""
+
+    estimator: str
+    track: str
+    episodes: int
+    diverged: Interval
+    """Rate, with Wilson's interval."""
+    settling: Interval
+    """Median in s."""
+    nrmse: Interval
+    """Median over the whole episode."""
+    tail: Interval
+    """Median over the last quarter."""
+    tail_modulo: float | None
+    """Median of the same modulo indistinguishable states; None where that changes nothing."""
+    tail_90: float
+    """90th percentile over the last quarter."""
+    reference_ratio: float | None
+    """Median NRMSE over the Cramér-Rao reference of the same episode; None where there is none."""
+    reference_ratio_tail: float | None
+    """The same of the last quarter."""
+    anees: Interval | None
+    """Mean over episodes, with the band that it should be in; None without covariances."""
+    coverage: float | None
+    """Mean over episodes."""
+    nis: float | None
+    """Mean over episodes."""
+    innovation_correlation: float | None
+    """Mean over episodes."""
+    us_per_step: float
+    knows: str
+    budget: float | None
+    """CPU seconds that training was given, if it was limited so."""
+    training: str
+    """How it was trained, in a few words."""
+
+
+def standing(rows: Sequence[Row]) -> Standing:
+    """The summary of one estimator's rows; episodes that diverged score infinity."""
+    diverged = np.array([row["diverged"] for row in rows])
+
+    def values(name: str) -> np.ndarray:
+        return np.where(diverged, np.inf, [row[name] for row in rows])
+
+    first = rows[0]
+    return Standing(
+        estimator=first["estimator"],
+        track=first["track"],
+        episodes=len(rows),
+        diverged=rate(int(diverged.sum()), len(rows)),
+        settling=median(values("settling")),
+        nrmse=median(values("nrmse")),
+        tail=median(values("nrmse_tail")),
+        tail_modulo=_modulo(rows),
+        tail_90=float(np.quantile(values("nrmse_tail"), 0.9, method="higher")),
+        reference_ratio=_of(np.median, rows, "reference_ratio"),
+        reference_ratio_tail=_of(np.median, rows, "reference_ratio_tail"),
+        anees=_anees(rows),
+        coverage=_of(np.mean, rows, "coverage"),
+        nis=_of(np.mean, rows, "nis"),
+        innovation_correlation=_of(np.mean, rows, "innovation_correlation"),
+        us_per_step=float(np.median([row["us_per_step"] for row in rows])),
+        knows=", ".join(first["knows"]),
+        budget=first["training"].get("config", {}).get("budget"),
+        training=training_of(rows),
+    )
+
+
+def _modulo(rows: Sequence[Row]) -> float | None:
+    tail = np.array([row["nrmse_tail"] for row in rows])
+    modulo = np.array([row["nrmse_tail_modulo"] for row in rows])
+    if not (modulo < tail).any():
+        return None
+    return float(np.median(np.where(modulo <= DIVERGED, modulo, np.inf)))
+
+
+def _of(statistic: Callable[..., Any], rows: Sequence[Row], name: str) -> float | None:
+    """A statistic of an optional score, over the episodes that have it."""
+    values = [row[name] for row in rows if row[name] is not None]
+    return float(statistic(values)) if values else None
+
+
+def _anees(rows: Sequence[Row]) -> Interval | None:
+    mean = _of(np.mean, rows, "anees")
+    return None if mean is None else Interval(mean, *band(len(rows), rows[0]["nx"]))
+
+
+def training_of(rows: Sequence[Row]) -> str:
+    """How the estimator was trained, in a few words: budget or iterations, and CPU seconds."""
+    facts = [row["training"] for row in rows if row["training"]]
+    if not facts:
+        return ""
+    budget = facts[0].get("config", {}).get("budget")
+    parts = [] if budget is None else [f"budget {budget:g} s"]
+    for name, unit in (("iterations", "iterations"), ("seconds", "CPU s")):
+        known = [fact[name] for fact in facts if fact.get(name) is not None]
+        if known:
+            parts.append(f"{np.median(known):.4g} {unit}")
+    if facts[0].get("per_record"):
+        parts.append("on each record")
+    return ", ".join(parts)

@@ -1,0 +1,1 @@
+"""How an estimator is played and scored, episode by episode, and how scores are stored."""

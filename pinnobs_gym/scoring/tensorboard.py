@@ -1,0 +1,63 @@
+"""What TensorBoard is shown of scores."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.training.log import Log
+
+LOGGED = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
+"""The scores that TensorBoard shows."""
+
+
+def log_episodes(
+    log: Log, rows: list[Row], estimator: Estimator, example: dict[str, Any] | None
+) -> None:
+    """Log the scores of each episode over its seed, and a picture of one of them."""
+    for row in rows:
+        for name in LOGGED:
+            if np.isfinite(row[name]):
+                log.scalar(f"episode/{name}", row[name], row["episode_seed"])
+    first = rows[0]
+    if example is not None and log.active:
+        title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
+        drawn = {name: value for name, value in example.items() if name != "seed"}
+        log.figure("states", state_figure(estimator.system, title=title, **drawn), example["seed"])
+
+
+def log_summary(log: Log, rows: list[Row]) -> None:
+    """Log an estimator's settings and what came of them for the HPARAMS table: medians, in which
+    diverged episodes count as infinite, where they are finite."""
+    first = rows[0]
+    parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
+    parameters |= first["options"]
+    diverged = np.array([row["diverged"] for row in rows])
+    scores = {name: np.where(diverged, np.inf, [row[name] for row in rows]) for name in LOGGED}
+    medians = {f"median/{name}": float(np.median(values)) for name, values in scores.items()}
+    summary = {name: value for name, value in medians.items() if np.isfinite(value)}
+    summary["diverged"] = float(diverged.mean())
+    log.hparams(parameters, summary)
+
+
+def log_folder(folder: Path, row: Row) -> Path:
+    """Where TensorBoard's log of a row's estimator lies: other settings of it have their own."""
+    system = row["env_id"].removeprefix("pinnobs/")
+    played = folder / "tensorboard" / system / row["setup"] / row["condition"]
+    return played / row["estimator"] / row["config_hash"]
+
+
+def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
+    """Log what came of every estimator in these rows for TensorBoard's HPARAMS table."""
+    groups: dict[Path, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(log_folder(folder, row), []).append(row)
+    for place, group in groups.items():
+        with Log(place) as log:
+            log_summary(log, group)

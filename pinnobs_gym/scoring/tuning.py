@@ -1,0 +1,140 @@
+"""Searching an estimator's settings on episodes that are never scored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.scoring.playing import score_batch
+
+if TYPE_CHECKING:
+    import optuna
+
+TUNING_SEED = 2 * 10**6
+"""Seed of the first episode that settings are tried on; none of these is scored."""
+WORST = 10.0
+"""What an episode's NRMSE counts as at most, and one that diverged."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Settings of an estimator, and how it did with them."""
+
+    settings: Mapping[str, float]
+    error: float
+    """Geometric mean of NRMSE over the episodes; see `WORST`."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search for the settings that an estimator class declares in `Estimator.tunable`, by
+    Optuna's tree-structured Parzen estimator (Bergstra et al. 2011)."""
+
+    estimator: type[Estimator]
+    env_id: str
+    setup: str
+    condition: str
+    episodes: int
+    """How many episodes each trial is of, of the seeds from `TUNING_SEED` on."""
+    storage: Path
+    """File that every trial is written to as it ends; a search goes on with what it holds."""
+    seed: int = 0
+    """Of the search."""
+
+    def __post_init__(self) -> None:
+        name = ESTIMATORS.name_of(self.estimator)
+        if self.estimator.needs_training or self.estimator.trains_on_record:
+            raise ValueError(f"estimator {name!r} is trained; its settings are not searched")
+        if not self.estimator.tunable:
+            raise ValueError(f"estimator {name!r} declares no settings to search")
+        if self.episodes < 1:
+            raise ValueError(f"episodes={self.episodes}; expected at least 1")
+
+    def error(self, settings: Mapping[str, Any]) -> float:
+        """The geometric mean of NRMSE over the episodes with these settings.
+
+        Raises:
+            ValueError: in one line, if the estimator does not take them.
+        """
+        source = make_vector_env(self.env_id, 1, self.setup, self.condition).source
+        estimator = self.estimator.for_setup(source.system, source.setup, **settings)
+        seeds = [TUNING_SEED + i for i in range(self.episodes)]
+        scored, _ = score_batch(estimator, self.env_id, self.setup, self.condition, seeds)
+        nrmse = [WORST if row["diverged"] else min(row["nrmse"], WORST) for row in scored]
+        return float(np.exp(np.mean(np.log(nrmse))))
+
+    def run(self, trials: int, progress: Callable[[Tried | None], None]) -> None:
+        """Try settings until the storage holds so many trials; ``progress`` is told of each, and
+        of None for each that the estimator did not take.
+
+        Raises:
+            ValueError: in one line, without Optuna, or if the storage is not one.
+        """
+        study = self._study()
+        import optuna
+
+        while self.done() < trials:
+            trial = study.ask()
+            settings = {
+                name: (
+                    trial.suggest_int(name, int(bounds.low), int(bounds.high), log=bounds.log)
+                    if bounds.whole
+                    else trial.suggest_float(name, bounds.low, bounds.high, log=bounds.log)
+                )
+                for name, bounds in self.estimator.tunable.items()
+            }
+            try:
+                error = self.error(settings)
+            except ValueError:
+                study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+                progress(None)
+            except KeyboardInterrupt:
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
+                raise
+            else:
+                study.tell(trial, error)
+                progress(Tried(settings, error))
+
+    def done(self) -> int:
+        """How many trials the storage holds that came to an end."""
+        ended = ("COMPLETE", "PRUNED")
+        return sum(trial.state.name in ended for trial in self._study().trials)
+
+    def best(self) -> Tried | None:
+        """The best so far, if any settings worked."""
+        tried = [Tried(t.params, t.value) for t in self._study().trials if t.value is not None]
+        return min(tried, key=lambda one: one.error, default=None)
+
+    def _study(self) -> optuna.Study:
+        try:
+            import optuna
+            from optuna.storages import JournalStorage
+            from optuna.storages.journal import JournalFileBackend
+        except ImportError:
+            raise ValueError(
+                'tuning needs Optuna; install it with pip install "pinnobs-gym[tune]"'
+            ) from None
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.storage.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            storage = JournalStorage(JournalFileBackend(str(self.storage)))
+            study = optuna.create_study(
+                storage=storage, study_name=self._name(), load_if_exists=True
+            )
+        except Exception as error:  # whatever a file that is no journal makes it raise
+            raise ValueError(f"cannot read trials from {self.storage}: {error}") from None
+        # Another stream of random numbers where a search is taken up again.
+        study.sampler = optuna.samplers.TPESampler(seed=self.seed + len(study.trials))
+        return study
+
+    def _name(self) -> str:
+        """What trials of one storage must have in common."""
+        what = (self.env_id, self.setup, self.condition, ESTIMATORS.name_of(self.estimator))
+        return "-".join([*what, f"{self.episodes} episodes", str(dict(self.estimator.tunable))])

@@ -1,0 +1,288 @@
+"""The checks that every system passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.simulation.conformance import (
+    Found,
+    into,
+    require,
+    require_close,
+    require_shape,
+    run_all,
+)
+from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.truth import truth
+
+EXACT = 1e-12
+"""Largest difference, over scale, between two ways to evaluate the same equations."""
+JACOBIAN_TOLERANCE = 1e-6
+"""Largest error of a Jacobian, over scale; central differences err by less than 1e-9."""
+TRUTH_TOLERANCE = 1e-8
+"""Largest relative error of what must stay the same along the truth."""
+
+SYSTEM_CHECKS: dict[str, Callable[[type[System]], None]] = {}
+"""The checks of a system, by name. Each raises `CheckFailed`."""
+
+
+def check_system(cls: type[System]) -> None:
+    """Run all of `SYSTEM_CHECKS` on a system.
+
+    Raises:
+        CheckFailed: if any fails, with a line for each: its name, what was found and expected.
+    """
+    run_all(SYSTEM_CHECKS, cls)
+
+
+def _setups(cls: type[System]) -> Iterator[tuple[str, System, Setup]]:
+    for name in cls.setups:
+        yield (name, *cls.configured(name))
+
+
+def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
+    """Initial states (count, nx) of a setup."""
+    low, high = vector(setup.x0_low, system.nx, "x0_low"), vector(setup.x0_high, system.nx, "")
+    if setup.fixed_x0:
+        return np.repeat(low[None], count, axis=0)
+    drawn = np.random.default_rng(0).uniform(low, high, (1000 * count, system.nx))
+    x0 = drawn[np.asarray(system.admissible(drawn))][:count]
+    require(len(x0) == count, f"{len(x0)} of {len(drawn)} states of the box are admissible")
+    return x0
+
+
+def _points(system: System, *batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (*batch,), states (*batch, nx) about the benchmark's initial ones, and inputs."""
+    count = int(np.prod(batch))
+    setup = system.setups["benchmark"]
+    rng = np.random.default_rng(1)
+    spread = 0.01 * vector(system.scale, system.nx, "scale")
+    x = initial_states(system, setup, count) + spread * rng.standard_normal((count, system.nx))
+    t = rng.uniform(0, setup.duration, batch)
+    return t, x.reshape(*batch, system.nx), np.asarray(system.input(t))
+
+
+def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> np.ndarray:
+    """The truth (num_samples, batch, nx) at no more samples than checks need."""
+    times = setup.times
+    samples = np.unique(np.linspace(0, len(times) - 1, 200).astype(int))
+    return truth(system, x0, times[samples], setup.truth_step)
+
+
+@into(SYSTEM_CHECKS, "attributes")
+def _system_attributes(cls: type[System]) -> None:
+    """The class attributes are complete and make sense."""
+    cls.validate()
+    frozen = is_dataclass(cls) and getattr(cls, "__dataclass_params__").frozen  # noqa: B009
+    own = "__dataclass_params__" in vars(cls) or not vars(cls).get("__annotations__")
+    require(
+        frozen and own, f"{cls.__name__} has parameters; expected @dataclass(frozen=True) above it"
+    )
+    system = cls()
+    for kind in ("state_names", "output_names", "input_names"):
+        names = getattr(system, kind)
+        require(len(set(names)) == len(names), f"{kind}={names} has a name twice")
+    for name in ("scale", "state_bound"):
+        values = getattr(system, name)
+        if values is not None:
+            numbers = vector(values, system.nx, name)
+            ok = np.isfinite(numbers).all() and (numbers > 0).all()
+            require(ok, f"{name}={values}; expected positive numbers")
+    require(
+        cls.model_step is None or cls.model_step > 0,
+        f"model_step={cls.model_step}; expected a positive number of seconds",
+    )
+    for name, setup in cls.setups.items():
+        std = np.asarray(setup.P0_std, dtype=float)
+        require((std > 0).all(), f"P0_std={setup.P0_std} of setup {name!r}; expected positive")
+
+
+@into(SYSTEM_CHECKS, "shapes")
+def _system_shapes(cls: type[System]) -> None:
+    """All functions act on the last axis and take any leading ones."""
+    system = cls()
+    nx, ny, nu = system.nx, system.ny, system.nu
+    for batch in ((), (1,), (5,), (2, 3)):
+        t, x, u = _points(system, *batch)
+        t = np.asarray(t)
+        require_shape(system.input(t), (*batch, nu), f"input(t) at t {batch}")
+        _check_rate_shapes(system, t, x, u)
+        require_shape(system.h(x), (*batch, ny), f"h at x {x.shape}")
+        require_shape(system.h_jacobian(x), (*batch, ny, nx), f"h_jacobian at x {x.shape}")
+        for name, shape in (("admissible", batch), ("observable", x.shape)):
+            marks = np.asarray(getattr(system, name)(x))
+            require_shape(marks, shape, f"{name} at x {x.shape}")
+            require(marks.dtype == bool, f"{name} returns {marks.dtype}; expected bool")
+        invariants = system.invariants(x)
+        if invariants is not None:
+            require_shape(invariants, (*batch, invariants.shape[-1]), f"invariants at x {x.shape}")
+        for other in system.indistinguishable(x):
+            require_shape(other, x.shape, f"indistinguishable at x {x.shape}")
+
+
+def _check_rate_shapes(system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray) -> None:
+    """F and its Jacobian with a time per state, with one for all, and with one per leading row."""
+    now = np.asarray(0.1)
+    times = [(t, u), (now, np.asarray(system.input(now)))]
+    if t.ndim == 2:
+        column = t[:, :1]
+        times.append((column, np.asarray(system.input(column))))
+    for t, u in times:
+        where = f"at t {t.shape}, x {x.shape}, u {u.shape}"
+        require_shape(system.f(t, x, u), x.shape, f"f {where}")
+        expected = (*x.shape, system.nx)
+        require_shape(system.f_jacobian(t, x, u), expected, f"f_jacobian {where}")
+
+
+@into(SYSTEM_CHECKS, "rows_independent")
+def _system_rows_independent(cls: type[System]) -> None:
+    """A row of a batch gives the same as that row alone."""
+    system = cls()
+    t, x, u = _points(system, 4)
+    for name, function in _functions(system).items():
+        together = np.asarray(function(t, x, u))
+        for i in range(len(x)):
+            alone = np.asarray(function(t[i : i + 1], x[i : i + 1], u[i : i + 1]))[0]
+            size = abs(alone).max(initial=0.0)
+            require_close(together[i], alone, EXACT, size, f"{name}: a row of a batch and alone")
+
+
+def _functions(system: System) -> dict[str, Callable[[Any, Any, Any], Any]]:
+    """What a system computes, as functions of (t, x, u)."""
+    return {
+        "f": system.f,
+        "h": lambda t, x, u: system.h(x),
+        "input": lambda t, x, u: system.input(t),
+        "f_jacobian": system.f_jacobian,
+        "h_jacobian": lambda t, x, u: system.h_jacobian(x),
+    }
+
+
+@into(SYSTEM_CHECKS, "purity")
+def _system_purity(cls: type[System]) -> None:
+    """The same call gives the same result, and arguments are not modified."""
+    system = cls()
+    given = _points(system, 4)
+    for name, function in _functions(system).items():
+        kept = tuple(array.copy() for array in given)
+        first = np.array(function(*given))
+        for argument, before, after in zip("txu", kept, given, strict=True):
+            require(np.array_equal(before, after), f"{name} modifies its argument {argument}")
+        again = np.array(function(*given))
+        require(np.array_equal(first, again), f"{name} gives another result when called again")
+
+
+@into(SYSTEM_CHECKS, "array_api")
+def _system_array_api(cls: type[System]) -> None:
+    """f, h and input give the same in NumPy and in torch, and torch can differentiate them."""
+    import torch
+
+    system = cls()
+    t, x, u = _points(system, 4)
+    functions = _functions(system)
+    for name in ("f", "h", "input"):
+        expected = np.asarray(functions[name](t, x, u))
+        advice = f"{name} is written in the array API, xp = array_namespace(x), not with np.*"
+        for dtype in (torch.float64, torch.float32):
+            tensors = [torch.tensor(a, dtype=dtype, requires_grad=True) for a in (t, x, u)]
+            try:
+                result = functions[name](*tensors)
+            except Exception as error:
+                why = f"{type(error).__name__}: {error}"
+                raise Found(
+                    f"{name} of torch tensors raises {why}; expected that {advice}"
+                ) from error
+            is_tensor = isinstance(result, torch.Tensor)
+            found = f"{dtype} tensors gives {result.dtype if is_tensor else type(result).__name__}"
+            require(
+                is_tensor and result.dtype == dtype, f"{name} of {found}; expected that {advice}"
+            )
+            if dtype == torch.float64:
+                size = abs(expected).max(initial=0.0)
+                values = result.detach().numpy()
+                require_close(values, expected, EXACT, size, f"{name} in torch and in NumPy")
+
+
+@into(SYSTEM_CHECKS, "f_jacobian")
+def _system_f_jacobian(cls: type[System]) -> None:
+    """f_jacobian is ∂f/∂x, by central differences."""
+    system = cls()
+    t, x, u = _points(system, 20)
+    found = system.f_jacobian(t, x, u)
+    _check_jacobian(system, lambda x: system.f(t, x, u), found, x, "f_jacobian")
+
+
+@into(SYSTEM_CHECKS, "h_jacobian")
+def _system_h_jacobian(cls: type[System]) -> None:
+    """h_jacobian is ∂h/∂x, by central differences."""
+    system = cls()
+    _, x, _ = _points(system, 20)
+    _check_jacobian(system, system.h, system.h_jacobian(x), x, "h_jacobian")
+
+
+def _check_jacobian(
+    system: System, function: Callable[[Any], Any], found: Any, x: np.ndarray, name: str
+) -> None:
+    """Compare ∂f_i/∂x_j·scale_j, over the largest such number of row i."""
+    scale = vector(system.scale, system.nx, "scale")
+    step = 6e-6 * scale  # the cube root of the rounding error, where central differences are best
+    columns = []
+    for j in range(system.nx):
+        shift = np.zeros(system.nx)
+        shift[j] = step[j]
+        ahead, behind = np.asarray(function(x + shift)), np.asarray(function(x - shift))
+        columns.append((ahead - behind) / (2 * step[j]) * scale[j])
+    expected = np.stack(columns, axis=-1)
+    given = np.asarray(found) * scale
+    require_shape(given, expected.shape, name)
+    size = np.maximum(abs(expected).max(axis=-1), abs(np.asarray(function(x))))
+    size = np.maximum(size, size.max(axis=0))[..., None]
+    with np.errstate(all="ignore"):
+        off = np.where(given == expected, 0.0, abs(given - expected) / size).max(axis=0)
+    i, j = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
+    require(
+        off[i, j] <= JACOBIAN_TOLERANCE,
+        f"entry [{i}, {j}] differs from central differences by {off[i, j]:.1e} of its row's size; "
+        f"expected at most {JACOBIAN_TOLERANCE:.0e}",
+    )
+
+
+@into(SYSTEM_CHECKS, "initial_states")
+def _system_initial_states(cls: type[System]) -> None:
+    """Every setup has admissible initial states, from which the plant stays finite."""
+    for name, system, setup in _setups(cls):
+        x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
+        require(np.isfinite(x0).all(), f"setup {name!r} starts from {x0}; expected finite states")
+        x = _trajectories(system, setup, x0)
+        require_shape(x, (len(x), *x0.shape), f"the truth of setup {name!r}")
+        require(np.isfinite(system.h(x)).all(), f"outputs of setup {name!r} leave the finite ones")
+
+
+@into(SYSTEM_CHECKS, "invariants")
+def _system_invariants(cls: type[System]) -> None:
+    """What `System.invariants` names stays the same along the truth."""
+    for name, system, setup in _setups(cls):
+        x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
+        values = system.invariants(x0)
+        if values is not None:
+            along: Any = system.invariants(_trajectories(system, setup, x0))
+            size = abs(np.asarray(values)).max(axis=0)
+            expected = np.broadcast_to(values, np.shape(along))
+            what = f"invariants at the start and along the truth of setup {name!r}"
+            require_close(along, expected, TRUTH_TOLERANCE, size, what)
+
+
+@into(SYSTEM_CHECKS, "indistinguishable")
+def _system_indistinguishable(cls: type[System]) -> None:
+    """What `System.indistinguishable` names gives the same output for ever."""
+    for name, system, setup in _setups(cls):
+        x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
+        for other in system.indistinguishable(x0):
+            y = np.asarray(system.h(_trajectories(system, setup, x0)))
+            like = system.h(_trajectories(system, setup, np.asarray(other)))
+            what = f"outputs of indistinguishable states of setup {name!r}"
+            require_close(like, y, TRUTH_TOLERANCE, abs(y).max(), what)

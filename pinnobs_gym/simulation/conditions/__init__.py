@@ -1,0 +1,128 @@
+"""Conditions: ways in which an episode departs from what its setup says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from pinnobs_gym.simulation.conditions.base import Condition, Outputs
+from pinnobs_gym.simulation.conditions.measurement import (
+    Delay,
+    Dropouts,
+    Gap,
+    Noise,
+    Outliers,
+    SampleTime,
+)
+from pinnobs_gym.simulation.conditions.plant import LoadStep, Mismatch, ProcessNoise
+from pinnobs_gym.simulation.conditions.start import FarGuess, OutsideSet
+from pinnobs_gym.simulation.system import Setup, System
+
+
+@dataclass(frozen=True)
+class Combined(Condition):
+    """Several conditions at once, applied in order."""
+
+    parts: tuple[Condition, ...]
+
+    @property
+    def told(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What is told of the parts."""
+        return ", ".join(dict.fromkeys(part.told for part in self.parts if part.told != "nothing"))
+
+    @property
+    def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """If it is with all parts."""
+        return all(part.reference for part in self.parts)
+
+    @property
+    def summary(self) -> str:
+        return "; ".join(part.summary for part in self.parts)
+
+    def setup(self, system: System, setup: Setup) -> Setup:
+        for part in self.parts:
+            setup = part.setup(system, setup)
+        return setup
+
+    def starts(self, x0: np.ndarray, inside: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        for part in self.parts:
+            x0 = part.starts(x0, inside)
+        return x0
+
+    def plant(self, system: System, rngs: Sequence[np.random.Generator]) -> System:
+        for part in self.parts:
+            system = part.plant(system, rngs)
+        return system
+
+    def process_noise(self, system: System) -> np.ndarray | None:
+        stds = [part.process_noise(system) for part in self.parts]
+        return next((std for std in stds if std is not None), None)
+
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        for part in self.parts:
+            sent = replace(sent, y=part.outputs(sent, rngs))
+        return sent.y
+
+
+CONDITIONS: dict[str, Condition] = {
+    "nominal": Condition(),
+    **{f"noise{factor:g}": Noise(factor) for factor in (0, 0.1, 0.5, 5, 15)},
+    **{f"dt{factor:g}": SampleTime(factor) for factor in (0.5, 2, 5)},
+    "xhat0_far": FarGuess(),
+    "x0_outside": OutsideSet(),
+    **{f"mismatch{percent}": Mismatch(percent / 100) for percent in (10, 30)},
+    "load_step": LoadStep(),
+    "process_noise1e-3": ProcessNoise(1e-3),
+    "process_noise1e-2": ProcessNoise(1e-2),
+    "outliers": Outliers(probability=0.05, strength=50.0),
+    **{f"delay{samples}": Delay(samples) for samples in (1, 2, 3, 4, 5)},
+    **{f"dropout{percent}": Dropouts(percent / 100) for percent in (10, 30, 50)},
+    "gap": Gap(),
+}
+"""The conditions by name, in the order in which they act; ``a+b`` is both."""
+
+
+def canonical_name(name: str) -> str:
+    """The one name of a condition: its parts in the order in which they act, whichever order they
+    are named in, and ``nominal`` only alone.
+
+    Raises:
+        ValueError: listing the known ones, if one is unknown; naming two of one kind.
+    """
+    named = name.split("+")
+    for part in named:
+        if part not in CONDITIONS:
+            raise ValueError(f"unknown condition {part!r}; known are {', '.join(CONDITIONS)}")
+    named.sort(key=list(CONDITIONS).index)
+    for first, second in pairwise(named):
+        if type(CONDITIONS[first]) is type(CONDITIONS[second]):
+            raise ValueError(
+                f"condition {name!r}: {first!r} and {second!r} change the same; name one"
+            )
+    return "+".join(part for part in named if part != "nominal") or "nominal"
+
+
+def parse_condition(name: str) -> Condition:
+    """The condition of that name, or several joined by ``+``, in whichever order they are named.
+
+    Raises:
+        ValueError: as `canonical_name` does.
+    """
+    parts = tuple(CONDITIONS[part] for part in canonical_name(name).split("+"))
+    return parts[0] if len(parts) == 1 else Combined(parts)
+
+
+def fitting(system: System, setup: Setup) -> list[str]:
+    """The names of all conditions that a system can be played under in a setup."""
+    names = []
+    for name, condition in CONDITIONS.items():
+        try:
+            condition.setup(system, setup)
+            condition.plant(system, ())
+        except ValueError:
+            continue
+        names.append(name)
+    return names

@@ -1,0 +1,132 @@
+"""Conditions of the outputs: other noise, other times, lost or late samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.system import Setup, System
+
+
+@dataclass(frozen=True)
+class Noise(Condition):
+    """Output noise of another strength, times that of `noise_scale`."""
+
+    factor: float
+    told = "its strength"
+
+    @property
+    def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Not without noise, where it is zero."""
+        return self.factor > 0
+
+    @property
+    def summary(self) -> str:
+        return f"output noise × {self.factor:g}"
+
+    def setup(self, system: System, setup: Setup) -> Setup:
+        std = self.factor * noise_scale(system, setup)
+        return replace(setup, noise_std=tuple(std.tolist()))
+
+
+@dataclass(frozen=True)
+class SampleTime(Condition):
+    """Another time between samples, in episodes as long as before."""
+
+    factor: float
+    told = "the sample times"
+
+    @property
+    def summary(self) -> str:
+        return f"time between samples × {self.factor:g}"
+
+    def setup(self, system: System, setup: Setup) -> Setup:
+        return replace(setup, dt=self.factor * setup.dt)
+
+
+@dataclass(frozen=True)
+class Outliers(Condition):
+    """Some samples off by a Gaussian error many times the noise of `noise_scale`."""
+
+    probability: float
+    strength: float
+    reference = False
+
+    @property
+    def summary(self) -> str:
+        return f"{100 * self.probability:g} % of the outputs off by {self.strength:g} σ"
+
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        shape = (len(sent.y), sent.y.shape[-1])
+        errors = [
+            (rng.random(shape) < self.probability) * rng.standard_normal(shape) for rng in rngs
+        ]
+        return sent.y + np.stack(errors, axis=1) * (self.strength * sent.noise_std)
+
+
+@dataclass(frozen=True)
+class Delay(Condition):
+    """Outputs that arrive some samples late: at sample k stands y of k − d, and nothing in the
+    first d. Nothing else is late."""
+
+    samples: int
+    reference = False
+
+    @property
+    def summary(self) -> str:
+        return f"outputs {self.samples} sample{'s' * (self.samples > 1)} late"
+
+    def setup(self, system: System, setup: Setup) -> Setup:
+        if setup.num_steps <= self.samples:
+            raise ValueError(
+                f"condition 'delay{self.samples}' leaves no output in {setup.num_steps} sample(s)"
+            )
+        return setup
+
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        late = np.full_like(sent.y, np.nan)
+        late[self.samples :] = sent.y[: -self.samples]
+        return late
+
+
+@dataclass(frozen=True)
+class Dropouts(Condition):
+    """Samples missing at random, each with the same probability."""
+
+    probability: float
+    told = "which are missing"
+
+    @property
+    def summary(self) -> str:
+        return f"{100 * self.probability:g} % of the outputs missing"
+
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        shape = (len(sent.y), sent.y.shape[-1])
+        lost = [rng.random(shape) < self.probability for rng in rngs]
+        return np.where(np.stack(lost, axis=1), np.nan, sent.y)
+
+
+@dataclass(frozen=True)
+class Gap(Condition):
+    """A time without outputs, anywhere in the episode: 1 s, or a fifth of episodes that are shorter
+    than 5 s."""
+
+    seconds: float = 1.0
+    largest_part: float = 0.2
+    told = "which are missing"
+
+    @property
+    def summary(self) -> str:
+        return (
+            f"no output for {self.seconds:g} s, at most {100 * self.largest_part:g} % of the time"
+        )
+
+    def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        t = sent.t
+        length = min(self.seconds, self.largest_part * float(t[-1] - t[0]))
+        first = np.array([rng.uniform(t[0], t[-1] - length) for rng in rngs])
+        lost = (t[:, None] >= first) & (t[:, None] < first + length)
+        return np.where(lost[..., None], np.nan, sent.y)

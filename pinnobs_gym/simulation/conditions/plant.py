@@ -1,0 +1,111 @@
+"""Conditions of the plant: it is not the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from pinnobs_gym.simulation.conditions.base import Condition
+from pinnobs_gym.simulation.system import Array, System, vector
+
+
+@dataclass(frozen=True)
+class Mismatch(Condition):
+    """A plant that is not the model: each of its parameters off by the same part, its sign drawn
+    per parameter and episode.
+
+    Which parameters, `System.uncertain` says. Of a plant without any the rates of change are off:
+    ẋᵢ = (1 ± part)·fᵢ.
+    """
+
+    part: float
+    reference = False
+
+    @property
+    def summary(self) -> str:
+        return f"parameters of the plant off by ±{100 * self.part:g} %, the model's nominal"
+
+    def plant(self, system: System, rngs: Sequence[np.random.Generator]) -> System:
+        parameters = system.parameters
+        names = system.uncertain
+        if names is None:
+            names = [n for n, v in parameters.items() if not isinstance(v, bool | np.bool_)]
+        count = len(names) or system.nx
+        signs = np.array([2.0 * rng.integers(0, 2, count) - 1 for rng in rngs]).reshape(-1, count)
+        factors = 1 + self.part * signs
+        if not names:
+            return OtherRates(system, factors)
+        changed = {n: parameters[n] * f for n, f in zip(names, factors.T, strict=True)}
+        return replace(system, **changed)
+
+
+@dataclass(frozen=True)
+class OtherRates(System):
+    """A plant that moves as another one does, each state at a rate of its own."""
+
+    plant: System
+    """The other."""
+    factors: np.ndarray
+    """What its rates of change are multiplied with, shape (batch, nx)."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the other's."""
+        return self.plant.state_names
+
+    @property
+    def scale(self) -> tuple[float, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the other's."""
+        return self.plant.scale
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        return self.factors * self.plant.f(t, x, u)
+
+    def h(self, x: Array) -> Array:
+        return self.plant.h(x)
+
+    def input(self, t: Array) -> Array:
+        return self.plant.input(t)
+
+    def breakpoints(self) -> tuple[float, ...]:
+        return self.plant.breakpoints()
+
+
+@dataclass(frozen=True)
+class LoadStep(Condition):
+    """The load torque of a motor steps at 0.6 s to a value uniform in 0 to 40 N·m."""
+
+    time: float = 0.6
+    highest: float = 40.0
+    reference = False
+
+    @property
+    def summary(self) -> str:
+        return f"the motor's load torque steps at {self.time:g} s to 0 to {self.highest:g} N·m"
+
+    def plant(self, system: System, rngs: Sequence[np.random.Generator]) -> System:
+        if "load_step_torque" not in {f.name for f in fields(system)}:
+            raise ValueError(
+                f"condition 'load_step' needs a plant with a load torque; "
+                f"{type(system).__name__} has none"
+            )
+        torque = np.array([rng.uniform(0.0, self.highest) for rng in rngs])
+        changes = {"load_step_time": self.time, "load_step_torque": torque}
+        return replace(system, **changes)
+
+
+@dataclass(frozen=True)
+class ProcessNoise(Condition):
+    """White Gaussian noise added to the state at every sample after the first, of the same part of
+    each state's scale."""
+
+    part: float
+
+    @property
+    def summary(self) -> str:
+        return f"process noise of {self.part:g} of the scale per sample"
+
+    def process_noise(self, system: System) -> np.ndarray:
+        return self.part * vector(system.scale, system.nx, "scale")

@@ -1,0 +1,153 @@
+"""What an estimator may see of an episode: the sampled outputs and inputs, and the prior."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pinnobs_gym.simulation.system import Setup, System, vector
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the state before the first output, for a batch of episodes."""
+
+    mean: np.ndarray
+    """Initial estimates x̂₀, shape (batch, nx), in state units."""
+    cov: np.ndarray
+    """Their covariances P₀, shape (batch, nx, nx)."""
+
+    @staticmethod
+    def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
+        """The prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
+        own = vector(setup.xhat0, system.nx, "xhat0")
+        mean = own if xhat0 is None else np.asarray(xhat0, dtype=float)
+        if mean.shape not in ((system.nx,), (batch, system.nx)):
+            raise ValueError(f"xhat0 has shape {mean.shape}; expected ({system.nx},)")
+        if not np.isfinite(mean).all():
+            raise ValueError(f"xhat0={mean.tolist()} is not finite")
+        variance = vector(setup.P0_std, system.nx, "P0_std") ** 2
+        mean = np.broadcast_to(mean, (batch, system.nx)).copy()
+        return Prior(mean, np.broadcast_to(np.diag(variance), (batch, system.nx, system.nx)).copy())
+
+
+@dataclass(frozen=True)
+class Record:
+    """The samples of a batch of episodes on common sample times."""
+
+    t: np.ndarray
+    """Sample times in s, ascending, shape (num_samples,)."""
+    y: np.ndarray
+    """Outputs, shape (batch, num_samples, ny); NaN is a missing sample."""
+    u: np.ndarray
+    """Inputs at the samples, shape (batch, num_samples, nu)."""
+    prior: Prior
+    """What is known before the first sample."""
+
+    def __post_init__(self) -> None:
+        steps = np.diff(self.t)
+        if self.t.ndim != 1 or not len(self.t):
+            raise ValueError(f"t has shape {self.t.shape}; expected (num_samples,)")
+        if not np.isfinite(self.t).all():
+            row = int(np.flatnonzero(~np.isfinite(self.t))[0])
+            raise ValueError(f"t must be finite; sample {row} has t={self.t[row]}")
+        if (steps <= 0).any():
+            row = int(np.flatnonzero(~(steps > 0))[0]) + 1
+            raise ValueError(
+                f"t must increase; sample {row} has t={self.t[row]} after {self.t[row - 1]}"
+            )
+        batch = len(self.prior.mean)
+        for name in ("y", "u"):
+            array = getattr(self, name)
+            if array.ndim != 3 or array.shape[:2] != (batch, len(self.t)):
+                raise ValueError(
+                    f"{name} has shape {array.shape}; expected ({batch}, {len(self.t)}, n{name})"
+                )
+
+    @property
+    def batch(self) -> int:
+        """Number of episodes."""
+        return len(self.y)
+
+    @property
+    def num_samples(self) -> int:
+        """Number of samples of each episode."""
+        return len(self.t)
+
+    def rows(self, rows: np.ndarray | slice) -> Record:
+        """The same of some of the episodes only."""
+        prior = Prior(self.prior.mean[rows], self.prior.cov[rows])
+        return Record(self.t, self.y[rows], self.u[rows], prior)
+
+
+def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:
+    """The record in a CSV file with columns t (s), y1, y2, ... and, if its system has inputs,
+    u1, u2, ...; sample times may be irregular, and an empty cell or ``nan`` is a missing output.
+    Columns of other names are ignored.
+
+    Also returns the system, which takes its input from the record if that has columns u. A record
+    without them is of the input that the system's own class defines, if it does.
+
+    Raises:
+        ValueError: in one line that names the file, the row and what was expected.
+    """
+    path = Path(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read log {path}: {error}") from None
+    rows = [(number, row) for number, row in enumerate(rows, 1) if any(c.strip() for c in row)]
+    if not rows:
+        raise ValueError(f"log {path} is empty; expected a header and rows of numbers")
+    header = [name.strip() for name in rows[0][1]]
+    outputs = [f"y{i + 1}" for i in range(system.ny)]
+    inputs = [f"u{i + 1}" for i in range(system.nu)]
+    if type(system).input is not System.input and not set(inputs) & set(header):
+        inputs = []
+    missing = [name for name in ["t", *outputs, *inputs] if name not in header]
+    if missing:
+        raise ValueError(
+            f"log {path} has no column {', '.join(missing)}; {type(system).__name__} needs "
+            f"{', '.join(['t', *outputs, *inputs])}, and the header has {', '.join(header)}"
+        )
+    twice = [name for name in ["t", *outputs, *inputs] if header.count(name) > 1]
+    if twice:
+        raise ValueError(f"log {path} has column {twice[0]} twice")
+    columns = {name: header.index(name) for name in ["t", *outputs, *inputs]}
+    table = {name: np.empty(len(rows) - 1) for name in columns}
+    for i, (number, row) in enumerate(rows[1:]):
+        if len(row) != len(header):
+            raise ValueError(f"log {path}, line {number}: {len(row)} cells; expected {len(header)}")
+        for name, column in columns.items():
+            table[name][i] = _number(row[column], name, f"log {path}, line {number}")
+    t = table["t"]
+    if not len(t):
+        raise ValueError(f"log {path} has a header but no rows")
+    wrong = np.flatnonzero(~(np.diff(t) > 0))
+    if len(wrong):
+        number, later, earlier = rows[wrong[0] + 2][0], t[wrong[0] + 1], t[wrong[0]]
+        raise ValueError(f"log {path}, line {number}: t={later} after {earlier}; t must increase")
+    y = np.stack([table[name] for name in outputs], axis=-1)[None]
+    if np.isnan(y).all():
+        raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
+    u = np.stack([table[n] for n in inputs], axis=-1) if inputs else system.input(t)
+    return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior)
+
+
+def _number(cell: str, name: str, where: str) -> float:
+    text = cell.strip()
+    missing = text == "" or text.lower() == "nan"
+    if missing and name.startswith("y"):
+        return math.nan
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{where}: {name}={cell!r} is not a finite number")
+    return value

@@ -1,0 +1,325 @@
+"""The truth of an episode, from a high-order solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.integrate import DOP853, solve_ivp
+
+from pinnobs_gym.simulation.system import System, vector
+
+TOLERANCE = 3e-11
+"""Largest local error accepted in the truth, over the larger of a state and its scale."""
+
+_Weights = Callable[[np.ndarray], np.ndarray]
+_NODES = 6
+"""Solver steps that one interpolating polynomial passes through, with value and slope."""
+_HALVINGS = 7
+"""How often the step is halved before an episode is given to an adaptive solver."""
+_FAR = 1e9
+"""Size of a state, over its scale, from which on it is taken to have run away."""
+
+
+def truth(
+    system: System,
+    x0: np.ndarray,
+    times: np.ndarray,
+    max_step: float | None = None,
+    out: np.ndarray | None = None,
+) -> np.ndarray:
+    """The trajectories x(t) of the plant from given initial states.
+
+    Dormand and Prince's method of order 8 with a step common to all episodes (Hairer, Nørsett &
+    Wanner, "Solving Ordinary Differential Equations I", II.5), and between its steps the Hermite
+    polynomial of degree 11 through the nearest six. The defect x' − f(t, x) of that polynomial,
+    taken midway between steps, controls the error: episodes whose local error is over `TOLERANCE`
+    are redone with half the step, and those that no step satisfies (stiff, or not smooth) by an
+    adaptive implicit method. An episode's result does not depend on those simulated with it.
+
+    Args:
+        system: the plant; its parameters may be arrays (batch,), one value per episode.
+        x0: initial states, shape (batch, nx), in state units.
+        times: sample times in s, ascending, shape (num_samples,); x0 is the state at the first.
+        max_step: the solver's step in s to begin with; a hundredth of the time if None.
+        out: an array to write the result into.
+
+    Returns:
+        States, shape (num_samples, batch, nx).
+
+    Raises:
+        FloatingPointError: if a state leaves the finite numbers.
+    """
+    x = np.empty((len(times), *x0.shape)) if out is None else out
+    x[0] = x0
+    ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
+    start, state = float(times[0]), np.asarray(x0, dtype=float)
+    longest = max_step or float(times[-1] - times[0]) / 100
+    done = 1
+    for end in ends:
+        stop = int(np.searchsorted(times, end, side="right"))
+        last = _smooth(system, state, start, float(end), times[done:stop], longest, x[done:stop])
+        done, start, state = stop, float(end), last
+    _check_finite(system, x0, x)
+    return x
+
+
+def disturbed_truth(
+    system: System,
+    x0: np.ndarray,
+    times: np.ndarray,
+    noise: np.ndarray,
+    max_step: float | None = None,
+    out: np.ndarray | None = None,
+) -> np.ndarray:
+    """The trajectories of a plant that is disturbed at every sample: x(t) solves its equations
+    between samples, and to the state at each but the first the noise is added.
+
+    By `truth`'s method in equal steps of at most ``max_step`` between samples, without control of
+    its error, which is far below any noise worth the name.
+
+    Args:
+        system: as in `truth`, and so are ``x0``, ``times`` and ``max_step``.
+        x0: initial states, shape (batch, nx).
+        times: sample times in s, ascending.
+        noise: what is added, in state units, shape (num_samples - 1, batch, nx).
+        max_step: the solver's longest step in s; a hundredth of the time if None.
+        out: an array to write the result into.
+
+    Returns:
+        States, shape (num_samples, batch, nx).
+
+    Raises:
+        FloatingPointError: if a state leaves the finite numbers.
+    """
+    x = np.empty((len(times), *x0.shape)) if out is None else out
+    x[0] = x0
+    longest = max_step or float(times[-1] - times[0]) / 100
+    stages = np.empty((1 + len(DOP853.B), *x0.shape))
+    with np.errstate(all="ignore"):
+        for k in range(len(times) - 1):
+            start, end = float(times[k]), float(times[k + 1])
+            stages[0] = x[k]
+            ends = [b for b in system.breakpoints() if start < b < end] + [end]
+            for part in ends:
+                steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
+                step = round((part - start) / steps, 15)
+                last = np.nextafter(part, start)
+                for i in range(steps):
+                    _take_step(system, start + i * step, step, last, stages)
+                start = part
+            np.add(stages[0], noise[k], out=x[k + 1])
+    _check_finite(system, x0, x)
+    return x
+
+
+def _take_step(system: System, start: float, step: float, last: float, stages: np.ndarray) -> None:
+    """One step of Dormand and Prince's method of order 8, which evaluates f no later than at
+    ``last``; ``stages`` holds the state (batch, nx), and then room for the slopes of the stages.
+    The state in it becomes the next one; the first slope stays that of the state before."""
+    flat = stages.reshape(len(stages), -1)
+    t = np.minimum(start + step * DOP853.C, last)
+    u = system.input(t)
+    weights = _tableau(step)
+    for i, row in enumerate(weights[:-1]):
+        stage = np.dot(row, flat[: i + 1]).reshape(stages.shape[1:])
+        stages[i + 1] = system.f(t[i], stage, u[i])
+    np.dot(weights[-1], flat, out=flat[0])
+
+
+def _check_finite(system: System, x0: np.ndarray, x: np.ndarray) -> None:
+    if not np.isfinite(x.sum()):
+        row = int(np.flatnonzero(~np.isfinite(x).all(axis=(0, 2)))[0])
+        raise FloatingPointError(
+            f"{type(system).__name__} leaves the finite numbers from x0={x0[row].tolist()}"
+        )
+
+
+def _smooth(
+    system: System,
+    x0: np.ndarray,
+    start: float,
+    end: float,
+    times: np.ndarray,
+    max_step: float,
+    out: np.ndarray,
+) -> np.ndarray:
+    """`truth` over an interval on which f is smooth, written to ``out``; returns the last state."""
+    steps = max(_NODES, int(np.ceil((end - start) / max_step - 1e-9)))
+    last = np.empty_like(x0)
+    rows = np.arange(len(x0))
+    with np.errstate(all="ignore"):
+        for _ in range(_HALVINGS):
+            plant = rows_of(system, rows)
+            everything = len(rows) == len(x0)
+            part = out if everything else np.empty((len(times), len(rows), x0.shape[1]))
+            last[rows], error = _fixed_step(plant, x0[rows], start, end, steps, times, part)
+            if not everything:
+                out[:, rows] = part
+            rows = rows[~(error <= TOLERANCE)]
+            if not len(rows):
+                return last
+            steps *= 2
+        for row in rows:
+            plant = rows_of(system, np.array([row]))
+            x = _adaptive(plant, x0[row], start, end, np.unique(np.append(times, end)))
+            out[:, row], last[row] = x[: len(times)], x[-1]
+    return last
+
+
+def _fixed_step(
+    system: System,
+    x0: np.ndarray,
+    start: float,
+    end: float,
+    steps: int,
+    times: np.ndarray,
+    out: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Write the states at the times to ``out`` (num_samples, batch, nx); return those at the end,
+    and each episode's local error (batch,)."""
+    mesh = _mesh(start, end, steps, times.tobytes())
+    last = np.nextafter(end, start)  # f may jump at the end; it is wanted from the left
+    batch, nx = x0.shape
+    path = np.empty((len(mesh.nodes), 2, batch, nx))  # the states and their slopes at the nodes
+    stages = np.empty((1 + len(DOP853.B), batch, nx))  # the state, then the slopes of the stages
+    stages[0] = x0
+    for k, step in enumerate(mesh.steps):
+        path[k, 0] = stages[0]
+        _take_step(system, mesh.nodes[k], step, last, stages)
+        path[k, 1] = stages[1]
+    path[-1, 0] = stages[0]
+    path[-1, 1] = system.f(last, stages[0], system.input(last))
+    flat = path.reshape(2 * len(path), -1)
+    for k, (window, weights) in enumerate(mesh.intervals):
+        if len(weights):
+            inside = slice(mesh.bounds[k], mesh.bounds[k + 1])
+            np.dot(weights, flat[window], out=out.reshape(len(times), -1)[inside])
+    return path[-1, 0], _local_error(system, mesh, flat, path[0, 0].shape)
+
+
+def _local_error(
+    system: System, mesh: _Mesh, flat: np.ndarray, shape: tuple[int, int]
+) -> np.ndarray:
+    """The defect of the polynomials midway between nodes, times the step, over the larger of state
+    and scale: the largest of each episode, (batch,)."""
+    middle, rate = np.empty((2, len(mesh.checked), *shape))
+    for i, (window, weights) in enumerate(mesh.checks):
+        middle[i], rate[i] = np.dot(weights, flat[window]).reshape(2, *shape)
+    k = mesh.checked
+    t = (mesh.nodes[k] + mesh.steps[k] / 2)[:, None]
+    rate -= system.f(t, middle, system.input(t))
+    size = np.maximum(abs(middle), vector(system.scale, system.nx, "scale"))
+    return (abs(rate) / size * mesh.steps[k, None, None]).max(axis=0).max(axis=-1)
+
+
+@lru_cache(maxsize=64)
+def _tableau(step: float) -> list[np.ndarray]:
+    """Weights of (state, slopes of the stages so far) in each stage, and last in the next state."""
+    rows = [np.append(1.0, step * row[:i]) for i, row in enumerate(DOP853.A[:12])]
+    return [*rows, np.append(1.0, step * DOP853.B)]
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """The solver's nodes over an interval, and the polynomials between them."""
+
+    nodes: np.ndarray
+    steps: np.ndarray
+    bounds: np.ndarray
+    """Where the samples of each interval begin."""
+    intervals: list[tuple[slice, np.ndarray]]
+    """For each interval the rows of (state, slope, state, slope, ...) at the nodes that its
+    polynomial passes through, and their weights in the state at the interval's samples."""
+    checked: np.ndarray
+    """The intervals whose defect is looked at: the outermost, and every third."""
+    checks: list[tuple[slice, np.ndarray]]
+    """For each of these the same rows, and their weights in the state and the slope midway."""
+
+
+@lru_cache(maxsize=64)
+def _mesh(start: float, end: float, steps: int, times: bytes) -> _Mesh:
+    samples = np.frombuffer(times)
+    step = (end - start) / steps
+    # The polynomials of the outermost intervals are one-sided: shorter steps make up for it.
+    short = np.arange(6) / 2
+    nodes = start + step * np.concatenate([short, np.arange(3, steps - 2), steps - short[::-1]])
+    nodes[-1] = end
+    interval = np.clip(np.searchsorted(nodes, samples, side="right") - 1, 0, len(nodes) - 2)
+    bounds = np.searchsorted(interval, np.arange(len(nodes)))
+    checked = np.unique(np.append(np.arange(0, len(nodes) - 1, 3), len(nodes) - 2))
+    intervals, checks = [], []
+    for k in range(len(nodes) - 1):
+        first = min(max(k - _NODES // 2 + 1, 0), len(nodes) - _NODES)
+        rows = slice(2 * first, 2 * (first + _NODES))
+        window = (nodes[first : first + _NODES] - nodes[first]) / step
+        inside = (samples[bounds[k] : bounds[k + 1]] - nodes[first]) / step
+        value, slope = _hermite(tuple(np.round(window, 6)))
+        units = np.tile([1.0, step], _NODES)  # the polynomials' time is in steps
+        intervals.append((rows, value(inside) * units))
+        if k in checked:
+            middle = window[k - first : k - first + 2].mean(keepdims=True)
+            checks.append((rows, np.concatenate([value(middle), slope(middle) / step]) * units))
+    return _Mesh(nodes, np.round(np.diff(nodes), 15), bounds, intervals, checked, checks)
+
+
+@lru_cache(maxsize=64)
+def _hermite(nodes: tuple[float, ...]) -> tuple[_Weights, _Weights]:
+    """Functions of times (num_times,) that return the weights (num_times, 2·num_nodes) of
+    (value, slope, value, slope, ...) at the nodes in the value, and in the slope, of the polynomial
+    of least degree through them."""
+    size = 2 * len(nodes)
+    centre, half = (nodes[0] + nodes[-1]) / 2, (nodes[-1] - nodes[0]) / 2
+    derivative = chebyshev.chebder(np.eye(size)) / half
+
+    def values(t: np.ndarray) -> np.ndarray:
+        return chebyshev.chebvander((t - centre) / half, size - 1)
+
+    def slopes(t: np.ndarray) -> np.ndarray:
+        return chebyshev.chebvander((t - centre) / half, size - 2) @ derivative
+
+    at = np.asarray(nodes)
+    conditions = np.stack([values(at), slopes(at)], axis=1).reshape(size, size)
+    inverse = np.linalg.inv(conditions)
+    return lambda t: values(t) @ inverse, lambda t: slopes(t) @ inverse
+
+
+def _adaptive(
+    system: System, x0: np.ndarray, start: float, end: float, times: np.ndarray
+) -> np.ndarray:
+    """One episode by an adaptive method that also takes stiff and kinked plants; not a number if
+    the state runs away, before whose singularity such a method would stand still for ever."""
+    last = np.nextafter(end, start)
+    scale = vector(system.scale, system.nx, "scale")
+
+    def rate(t: float, x: np.ndarray) -> np.ndarray:
+        now = np.asarray(min(t, last))
+        return system.f(now, x[None], system.input(now))[0]
+
+    def far(t: float, x: np.ndarray) -> float:
+        return _FAR - float((abs(x) / scale).max())
+
+    far.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
+    solution = solve_ivp(
+        rate, (start, end), x0, "LSODA", times, events=far, rtol=1e-11, atol=1e-12 * scale
+    )
+    x = np.full((len(times), len(x0)), np.nan)
+    if solution.status == 0:
+        x[:] = solution.y.T
+    return x
+
+
+def rows_of(system: System, rows: np.ndarray) -> System:
+    """The system with those of its parameters that are arrays (batch,) reduced to some rows."""
+    changes = {
+        f.name: getattr(system, f.name)[rows]
+        for f in fields(system)
+        if getattr(getattr(system, f.name), "ndim", 0)
+    }
+    return replace(system, **changes) if changes else system
+
+
+# The two below work in place where they can: small arrays cost by the call, not by the number.

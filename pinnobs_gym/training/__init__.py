@@ -1,0 +1,1 @@
+"""What trainers share: finding them, the training loop, the log."""

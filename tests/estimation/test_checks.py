@@ -1,0 +1,450 @@
+"""Everything discovered conforms, and the checks catch what does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from array_api_compat import array_namespace
+
+from pinnobs_gym.estimation.adapters import OfflineEstimator, PerEpisode
+from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator
+from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.open_loop import OpenLoop
+from pinnobs_gym.simulation.checks import SYSTEM_CHECKS, check_system
+from pinnobs_gym.simulation.conformance import CheckFailed
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import Setup, System, matrix, stack
+from pinnobs_gym.systems import SYSTEMS
+
+ON = ("ReverseDuffing", "HarmonicOscillator", "InductionMotor")
+"""Two and three states, and five with inputs and two outputs."""
+
+
+def untrained() -> dict[str, type[Estimator]]:
+    """The estimators that need no trainer, neither beforehand nor on every record."""
+    return {
+        name: cls
+        for name, cls in ESTIMATORS.classes().items()
+        if getattr(cls, "needs_training", None) is None and cls.trains_on_record is None
+    }
+
+
+@pytest.mark.parametrize("check", SYSTEM_CHECKS)
+@pytest.mark.parametrize("system", SYSTEMS.classes())
+def test_system_conforms(system: str, check: str) -> None:
+    SYSTEM_CHECKS[check](SYSTEMS.resolve(system))
+
+
+@pytest.mark.parametrize("check", ESTIMATOR_CHECKS)
+@pytest.mark.parametrize("system", ON)
+@pytest.mark.parametrize("estimator", untrained())
+def test_estimator_conforms(estimator: str, system: str, check: str) -> None:
+    plant = SYSTEMS.resolve(system)
+    made = ESTIMATORS.resolve(estimator).for_setup(plant(), plant.setups["benchmark"])
+    ESTIMATOR_CHECKS[check](made)
+
+
+@dataclass(frozen=True)
+class Pendulum(System):
+    """A sound system, which the broken ones below change in one thing."""
+
+    damping: float = 0.1
+
+    state_names = ("angle", "rate")
+    output_names = ("y1",)
+    scale = (1.0, 2.0)
+    setups: ClassVar = {
+        "benchmark": Setup(
+            x0_low=(-1.0, -1.0),
+            x0_high=(1.0, 1.0),
+            xhat0=(0.5, 0.0),
+            P0_std=(1.0, 1.0),
+            duration=2.0,
+            dt=0.02,
+            noise_std=0.01,
+        )
+    }
+
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        angle, rate = x[..., 0], x[..., 1]
+        return stack(x, rate, -array_namespace(x).sin(angle) - self.damping * rate)
+
+    def h(self, x: Any) -> Any:
+        return array_namespace(x).sin(x[..., :1])
+
+
+@dataclass(frozen=True)
+class QuickPendulum(Pendulum):
+    """The same, with its Jacobians written out."""
+
+    def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -self.damping]])
+
+    def h_jacobian(self, x: Any) -> Any:
+        return matrix(x, [[np.cos(x[..., 0]), 0.0]])
+
+
+@dataclass(frozen=True)
+class WrongJacobian(Pendulum):
+    def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -1.001 * self.damping]])
+
+
+@dataclass(frozen=True)
+class WrongOutputJacobian(Pendulum):
+    def h_jacobian(self, x: Any) -> Any:
+        return matrix(x, [[1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Impure(Pendulum):
+    calls: ClassVar[list[int]] = []
+
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        self.calls.append(1)
+        return super().f(t, x, u) + 1e-9 * len(self.calls)
+
+
+@dataclass(frozen=True)
+class Overwriting(Pendulum):
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        rate = super().f(t, x, u)
+        x[..., 0] = 0.0
+        return rate
+
+
+@dataclass(frozen=True)
+class NumPyOnly(Pendulum):
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        return np.stack([x[..., 1], -np.sin(x[..., 0]) - self.damping * x[..., 1]], axis=-1)
+
+    def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -self.damping]])
+
+
+@dataclass(frozen=True)
+class NumPyFunction(Pendulum):
+    """np.sin takes a torch tensor without a word, and returns one, unless it needs a gradient."""
+
+    def h(self, x: Any) -> Any:
+        return np.sin(x[..., :1])
+
+    def h_jacobian(self, x: Any) -> Any:
+        return matrix(x, [[np.cos(x[..., 0]), 0.0]])
+
+
+@dataclass(frozen=True)
+class OneRowOnly(Pendulum):
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        rate = super().f(t, x, u)
+        return rate if x.ndim < 3 else rate[0]
+
+    def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -self.damping]])
+
+
+@dataclass(frozen=True)
+class NoLastAxis(Pendulum):
+    def h(self, x: Any) -> Any:
+        return array_namespace(x).sin(x[..., 0])
+
+
+@dataclass(frozen=True)
+class CoupledRows(Pendulum):
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        rate = super().f(t, x, u)
+        return rate - 1e-9 * x.mean(0) if x.ndim == 2 else rate
+
+
+@dataclass(frozen=True)
+class WrongInvariant(Pendulum):
+    def invariants(self, x: Any) -> Any:  # that of the undamped one
+        return 1.0 + x[..., 1:] ** 2 / 2 - array_namespace(x).cos(x[..., :1])
+
+
+@dataclass(frozen=True)
+class WrongTwin(Pendulum):
+    def indistinguishable(self, x: Any) -> tuple[Any, ...]:
+        return (-x,)
+
+
+@dataclass(frozen=True)
+class EmptySet(Pendulum):
+    def admissible(self, x0: Any) -> Any:
+        return x0[..., 0] > 5.0
+
+
+@dataclass(frozen=True)
+class Explosive(Pendulum):
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        return stack(x, 30 * (1 + x[..., 0] ** 2), -x[..., 1])
+
+
+@dataclass(frozen=True)
+class NoScale(Pendulum):
+    scale = (1.0, 0.0)
+
+
+class NotDecorated(Pendulum):
+    length: float = 1.0
+
+
+class WithoutParameters(Pendulum):
+    pass
+
+
+@pytest.mark.parametrize("cls", [Pendulum, QuickPendulum, WithoutParameters])
+def test_sound_system_passes(cls: type[System]) -> None:
+    check_system(cls)
+
+
+@pytest.mark.parametrize(
+    ("cls", "check", "says"),
+    [
+        (WrongJacobian, "f_jacobian", r"entry \[1, 1\] .* central differences"),
+        (WrongOutputJacobian, "h_jacobian", r"entry \[0, 0\]"),
+        (Impure, "purity", "f gives another result when called again"),
+        (Overwriting, "purity", "f modifies its argument x"),
+        (NumPyOnly, "array_api", "f of torch tensors .*array_namespace"),
+        (NumPyFunction, "array_api", "h of torch tensors .*array_namespace"),
+        (OneRowOnly, "shapes", r"f .* has shape \(3, 2\); expected \(2, 3, 2\)"),
+        (NoLastAxis, "shapes", r"h at x .* has shape \(\); expected \(1,\)"),
+        (CoupledRows, "rows_independent", "f: a row of a batch and alone differ"),
+        (WrongInvariant, "invariants", "invariants .* 'benchmark' differ by"),
+        (WrongTwin, "indistinguishable", "outputs of indistinguishable states"),
+        (EmptySet, "initial_states", "0 of .* states of the box are admissible"),
+        (Explosive, "initial_states", "leaves the finite numbers"),
+        (NoScale, "attributes", r"scale=\(1.0, 0.0\); expected positive"),
+        (NotDecorated, "attributes", "expected @dataclass"),
+    ],
+)
+def test_broken_system_fails(cls: type[System], check: str, says: str) -> None:
+    with pytest.raises(CheckFailed, match=f"^{check}: .*{says}") as failure:
+        SYSTEM_CHECKS[check](cls)
+    assert "\n" not in str(failure.value)
+    with pytest.raises(CheckFailed, match=rf"(?m)^{check}: "):
+        check_system(cls)
+
+
+def test_failures_are_collected() -> None:
+    with pytest.raises(CheckFailed) as failure:
+        check_system(NoLastAxis)
+    names = [line.split(":")[0] for line in str(failure.value).splitlines()]
+    assert "shapes" in names
+    assert len(names) > 1
+    assert set(names) <= set(SYSTEM_CHECKS)
+
+
+@dataclass(frozen=True)
+class LooksAhead(EKF):
+    def run(self, record: Record) -> Estimates:
+        ahead = np.concatenate([record.y[:, 1:], record.y[:, -1:]], axis=1)
+        return super().run(replace(record, y=ahead))
+
+
+@dataclass(frozen=True)
+class WholeRecordMean(EKF):
+    def run(self, record: Record) -> Estimates:
+        found = super().run(record)
+        return replace(found, xhat=found.xhat + 1e-9 * record.y.mean())
+
+
+@dataclass(frozen=True)
+class Sticky(EKF):
+    """Takes a missing sample into its estimate."""
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        return replace(new, xhat=new.xhat + 0.0 * y.sum(axis=-1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class Coupled(EKF):
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        return replace(new, xhat=new.xhat + 1e-6 * new.xhat.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class ResetsAll(EKF):
+    """One row that diverges takes all others with it."""
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        far = abs(y).max(initial=0.0, where=np.isfinite(y)) > 1e100 or np.isinf(y).any()
+        return replace(new, xhat=np.zeros_like(new.xhat)) if far else new
+
+
+@dataclass(frozen=True)
+class Raises(EKF):
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        if not np.isfinite(new.xhat).all():
+            raise FloatingPointError("diverged")
+        return new
+
+
+@dataclass(frozen=True)
+class Random(EKF):
+    def reset(self, prior: Prior) -> State:
+        state = super().reset(prior)
+        return replace(state, xhat=state.xhat + 1e-9 * np.random.default_rng().random())
+
+
+@dataclass(frozen=True)
+class OverwritesOutputs(EKF):
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        y[np.isnan(y)] = 0.0
+        return super().update(state, t, y, u)
+
+
+@dataclass(frozen=True)
+class OverwritesPrior(OpenLoop):
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        state.xhat[...] = new.xhat
+        return replace(new, xhat=state.xhat)
+
+
+@dataclass(frozen=True)
+class OverwritesState(OpenLoop):
+    def reset(self, prior: Prior) -> State:
+        return State(prior.mean.copy())
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        state.xhat[...] = new.xhat
+        return replace(new, xhat=state.xhat)
+
+
+@dataclass(frozen=True)
+class WrongShape(EKF):
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().update(state, t, y, u)
+        return replace(new, S=np.zeros((len(y), 2 * y.shape[-1])))
+
+
+@dataclass(frozen=True)
+class RegularOnly(EKF):
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        dt = self.system.setups["benchmark"].dt
+        if state.t is not None and abs(t - state.t - dt) > 1e-9:
+            raise ValueError("irregular")
+        return super().update(state, t, y, u)
+
+
+@dataclass(frozen=True)
+class AnotherRun(EKF):
+    def run(self, record: Record) -> Estimates:
+        found = super().run(record)
+        return replace(found, xhat=found.xhat * (1 + 1e-6))
+
+
+@dataclass(frozen=True)
+class Forgetful(EKF):
+    def save(self, path: Any) -> None:
+        path.write_text("")
+
+    @classmethod
+    def load(cls, path: Any, system: System) -> Forgetful:
+        return cls(system)
+
+
+class Mutable(EKF):
+    pass
+
+
+@dataclass(frozen=True)
+class Offline(OfflineEstimator):
+    """A sound one: the first output as the estimate of all states."""
+
+    def run(self, record: Record) -> Estimates:
+        nx = self.system.nx
+        return Estimates(np.repeat(np.nan_to_num(record.y[..., :1]), nx, axis=-1))
+
+
+@dataclass(frozen=True)
+class OfflineCoupled(Offline):
+    def run(self, record: Record) -> Estimates:
+        return Estimates(super().run(record).xhat - record.y.mean())
+
+
+class CopiesOutput:
+    """A sound single-episode object."""
+
+    def __init__(self) -> None:
+        self._xhat = np.zeros(2)
+
+    def reset(self, xhat0: np.ndarray, P0: np.ndarray) -> None:
+        self._xhat = xhat0
+
+    def update(self, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if np.isfinite(y[0]):
+            self._xhat = np.array([y[0], self._xhat[1]])
+        return self._xhat
+
+
+class Remembers(CopiesOutput):
+    """One whose episodes share what should be its own."""
+
+    shared = np.zeros(2)
+
+    def update(self, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        self.shared[:] += np.nan_to_num(y[0])
+        return super().update(t, y, u) + 1e-6 * self.shared
+
+
+@pytest.mark.parametrize(
+    "make",
+    [EKF, OpenLoop, Offline, lambda system: PerEpisode(system, make=CopiesOutput)],
+    ids=["ekf", "open_loop", "offline", "per_episode"],
+)
+def test_sound_estimator_passes(make: Callable[[System], Estimator]) -> None:
+    check_estimator(make(QuickPendulum()))
+
+
+@pytest.mark.parametrize(
+    ("make", "check", "says"),
+    [
+        (LooksAhead, "causality", "the estimate at sample 0 changes with outputs from sample 1 on"),
+        (WholeRecordMean, "causality", "the estimate at sample 0 changes"),
+        (Sticky, "missing_samples", "at sample 0 of row 0 not finite"),
+        (Coupled, "rows_independent", "row 0 in a batch and alone differ"),
+        (ResetsAll, "diverging_row", "other rows with and without outputs of 1e\\+300"),
+        (Raises, "diverging_row", "FloatingPointError: diverged"),
+        (Random, "purity", "a second run and the first differ"),
+        (OverwritesOutputs, "purity", "update modifies its argument y"),
+        (OverwritesPrior, "purity", "run modifies mean of the record"),
+        (OverwritesState, "purity", "xhat of state 0 is modified"),
+        (WrongShape, "shapes", r"S after sample 0 has shape \(3, 2\); expected \(3, 1, 1\)"),
+        (RegularOnly, "irregular_times", "ValueError: irregular"),
+        (AnotherRun, "run_equals_updates", "xhat of run and of looped updates differ"),
+        (
+            lambda system: Forgetful(system, noise_std=3.0),
+            "save_load",
+            "a loaded estimator and the one saved",
+        ),
+        (Mutable, "immutable", "expected @dataclass"),
+        (OfflineCoupled, "rows_independent", "row 0 in a batch and alone"),
+        (lambda system: PerEpisode(system, make=Remembers), "purity", "a second run and the first"),
+    ],
+)
+def test_broken_estimator_fails(make: Callable[[System], Estimator], check: str, says: str) -> None:
+    estimator = make(QuickPendulum())
+    with pytest.raises(CheckFailed, match=f"^{check}: .*{says}") as failure:
+        ESTIMATOR_CHECKS[check](estimator)
+    assert "\n" not in str(failure.value)
+    with pytest.raises(CheckFailed, match=rf"(?m)^{check}: "):
+        check_estimator(estimator)
+
+
+def test_checking_registers_nothing() -> None:
+    check_system(QuickPendulum)
+    check_estimator(EKF(QuickPendulum()))
+    assert not {"Pendulum", "QuickPendulum"} & set(SYSTEMS.classes())

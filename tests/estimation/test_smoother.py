@@ -1,0 +1,55 @@
+"""The smoother that all share; against closed forms it stands in test_horizon_estimators."""
+
+import numpy as np
+import pytest
+from linear import record_of
+
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.smoother import backward, flows, forward
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.simulation.record import Record
+
+
+def short_record(name, batch, samples=30):
+    source = EpisodeSource(name)
+    record = record_of(source, batch)
+    y = record.y[:, :samples].copy()
+    y[-1, 4:7] = np.nan
+    ekf = EKF.for_setup(source.system, source.setup)
+    return ekf, Record(record.t[:samples], y, record.u[:, :samples], record.prior)
+
+
+@pytest.mark.parametrize("name", ["ReverseDuffing", "InductionMotor"])
+def test_blocks_and_other_rows_change_nothing(name, monkeypatch):
+    ekf, record = short_record(name, 3)
+    about = ekf.run(record).xhat.swapaxes(0, 1)
+    whole = [
+        backward(forward(ekf.system, record, *ekf.tuning(), points)) for points in (None, about)
+    ]
+    monkeypatch.setattr("pinnobs_gym.estimation.smoother._ROWS", 7)
+    for path, points in zip(whole, (None, about), strict=True):
+        for row in range(3):
+            at = None if points is None else points[:, row : row + 1]
+            few = forward(ekf.system, record.rows(np.array([row])), *ekf.tuning(), at)
+            alone = backward(few)
+            size = abs(path.P[..., row]).max(axis=0)
+            np.testing.assert_allclose(alone.xhat[:, 0], path.xhat[:, row], rtol=1e-9, atol=1e-9)
+            assert (abs(alone.P[..., 0] - path.P[..., row]) <= 1e-9 * size).all()
+
+
+def test_unless_told_states_it_is_the_extended_filter():
+    ekf, record = short_record("ReverseDuffing", 2)
+    own = ekf.run(record)
+    filtered = forward(ekf.system, record, *ekf.tuning())
+    np.testing.assert_allclose(filtered.xhat.swapaxes(0, 1), own.xhat, rtol=1e-12)
+    np.testing.assert_allclose(filtered.P.transpose(3, 0, 1, 2), own.P, rtol=1e-12, atol=1e-18)
+    _, F = flows(ekf.system, record.t, filtered.xhat, record.u.swapaxes(0, 1))
+    np.testing.assert_allclose(F, filtered.F, rtol=1e-11, atol=1e-13)
+
+
+def test_caution_takes_smaller_steps():
+    ekf, record = short_record("ReverseDuffing", 2)
+    bold, careful = (forward(ekf.system, record, *ekf.tuning(), caution=c) for c in (0.0, 0.5))
+    taken = [np.einsum("pib,ipb->b", f.H[0], f.K[0]) for f in (bold, careful)]
+    # 1 / HK = 1 + R / HPHᵀ, and caution adds itself to R / HPHᵀ
+    np.testing.assert_allclose(1 / taken[1], 1 / taken[0] + 0.5, rtol=1e-12)

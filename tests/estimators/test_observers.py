@@ -1,0 +1,286 @@
+"""Ensembles, particles, strong tracking and constant-gain observers."""
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from linear import A, H, Linear, linear_record, record_of, runge_kutta_matrix
+
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.observer_gains import (
+    default_rate,
+    injection,
+    lmi_gain,
+    operating_point,
+    placed_gain,
+    settling_gain,
+)
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.enkf import EnKF
+from pinnobs_gym.estimators.high_gain import HighGain
+from pinnobs_gym.estimators.luenberger import Luenberger
+from pinnobs_gym.estimators.particle import ParticleFilter
+from pinnobs_gym.estimators.sliding_mode import SlidingMode
+from pinnobs_gym.estimators.strong_tracking_ekf import StrongTrackingEKF
+from pinnobs_gym.scoring.cramer_rao import exact_bayes
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import Setup, System, stack
+from pinnobs_gym.simulation.truth import truth
+from pinnobs_gym.systems import SYSTEMS
+
+
+def test_strong_tracking_is_the_kalman_filter_of_its_own_process_noise():
+    record = linear_record(1)
+    own = StrongTrackingEKF(Linear(), noise_std=(0.1, 0.2), gamma=1e-3, output_factor=0.5)
+    found = own.run(record)
+    x, P, F = record.prior.mean[0], record.prior.cov[0], runge_kutta_matrix(0.1)
+    R, e = np.diag([0.01, 0.04]), np.zeros(2)
+    for k in range(record.num_samples):
+        if k:
+            q = 1e-3 * (e @ np.linalg.solve(R, e)) / 2 + 1e-8
+            x, P = F @ x, F @ P @ F.T + q * np.eye(2)
+        e, S = record.y[0, k] - H @ x, H @ P @ H.T * 1.5 + R
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = (
+            x + K @ e,
+            (np.eye(2) - K @ H) @ P @ (np.eye(2) - K @ H).T + K @ (R + 0.5 * H @ P @ H.T) @ K.T,
+        )
+        np.testing.assert_allclose(found.xhat[0, k], x, atol=1e-10)
+        np.testing.assert_allclose(found.P[0, k], P, atol=1e-10)
+
+
+def test_a_large_ensemble_is_the_kalman_filter_on_a_linear_system():
+    record = linear_record()
+    options = {"noise_std": (0.1, 0.2), "process_noise": 0.05}
+    own = EnKF(Linear(), members=20_000, inflation=1.0, **options).run(record)
+    exact = EKF(Linear(), **options).run(record)
+    std = np.sqrt(np.einsum("bkii->bki", exact.P))
+    assert (abs(own.xhat - exact.xhat) < 0.05 * std).all()
+    assert (abs(np.einsum("bkii->bki", own.P) / std**2 - 1) < 0.05).all()
+
+
+def test_inflation_enlarges_covariances():
+    record = linear_record(1)
+    tight = EnKF(Linear(), inflation=1.0).run(record).P
+    loose = EnKF(Linear(), inflation=1.1).run(record).P
+    assert (np.linalg.det(loose[0, 10:]) > np.linalg.det(tight[0, 10:])).all()
+
+
+def test_many_particles_are_the_kalman_filter_on_a_linear_system():
+    record = linear_record()
+    own = ParticleFilter(Linear(), noise_std=0.1, particles=20_000, discount=0.995).run(record)
+    exact = EKF(Linear(), noise_std=0.1, process_noise=0.0).run(record)
+    std = np.sqrt(np.einsum("bkii->bki", exact.P))
+    assert (abs(own.xhat - exact.xhat) < 0.4 * std).all()
+    ratio = np.einsum("bkii->bki", own.P) / std**2
+    assert ((ratio > 0.6) & (ratio < 1.6)).all()
+
+
+@dataclass(frozen=True)
+class Cubed(System):
+    """x at rest, its cube measured: a posterior that is not Gaussian."""
+
+    state_names = ("x1",)
+    output_names = ("y1",)
+    scale = (1.0,)
+    setups = {
+        "benchmark": Setup((-1.0,), (1.0,), (0.0,), (0.6,), duration=0.4, dt=0.1, noise_std=0.3)
+    }
+
+    def f(self, t, x, u):
+        return stack(x, 0.0)
+
+    def h(self, x):
+        return x**3
+
+
+def test_particles_find_a_posterior_that_is_not_gaussian():
+    record = Record(
+        np.arange(3) * 0.1,
+        np.array([[[0.4], [np.nan], [0.1]]]),
+        np.zeros((1, 3, 0)),
+        Prior(np.zeros((1, 1)), np.full((1, 1, 1), 0.36)),
+    )
+    own = ParticleFilter(Cubed(), particles=50_000, discount=0.999).run(record)
+    x = np.linspace(-4, 4, 20_001)
+    log_density = -(x**2) / 0.72 - (0.4 - x**3) ** 2 / 0.18
+    for k, y in enumerate((None, None, 0.1)):
+        if y is not None:
+            log_density = log_density - (y - x**3) ** 2 / 0.18
+        density = np.exp(log_density - log_density.max())
+        density /= density.sum()
+        mean = (density * x).sum()
+        assert own.xhat[0, k, 0] == pytest.approx(mean, abs=0.02)
+        assert own.P[0, k, 0, 0] == pytest.approx((density * (x - mean) ** 2).sum(), rel=0.05)
+
+
+def test_exact_bayes_of_the_same():
+    record = Record(
+        np.arange(1) * 0.1,
+        np.array([[[0.4]]]),
+        np.zeros((1, 1, 0)),
+        Prior(np.zeros((1, 1)), np.full((1, 1, 1), 0.36)),
+    )
+    posterior = exact_bayes(
+        Cubed(), Cubed.setups["benchmark"], record, np.array([0.09]), draws=50_000
+    )
+    x = np.linspace(-1, 1, 20_001)
+    density = np.exp(-((0.4 - x**3) ** 2) / 0.18)
+    assert posterior.mean[0, 0, 0] == pytest.approx((density * x).sum() / density.sum(), abs=0.01)
+
+
+@pytest.mark.parametrize("kind", [EnKF, ParticleFilter])
+def test_random_numbers_are_those_of_the_seed(kind):
+    record = linear_record(2)
+    runs = [kind(Linear(), seed=seed).run(record).xhat for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert abs(runs[0] - runs[2]).max() > 1e-6
+
+
+def test_high_gain_is_the_kalman_filter_of_weighted_outputs():
+    """Without process noise: each output counts exp(−θ·age), the prior too."""
+    record = linear_record(1)
+    found = HighGain(Linear(), noise_std=0.1, theta=1.5).run(record)
+    F, Phi = runge_kutta_matrix(0.1), np.eye(2)
+    information, right = np.linalg.inv(record.prior.cov[0]), np.zeros(2)
+    right = information @ record.prior.mean[0]
+    for k in range(record.num_samples):
+        if k:
+            Phi = F @ Phi
+            information, right = information * np.exp(-0.15), right * np.exp(-0.15)
+        G = H @ Phi
+        information = information + G.T @ G / 0.01
+        right = right + G.T @ record.y[0, k] / 0.01
+        np.testing.assert_allclose(
+            found.xhat[0, k], Phi @ np.linalg.solve(information, right), atol=1e-10
+        )
+        expected = Phi @ np.linalg.inv(information) @ Phi.T
+        np.testing.assert_allclose(found.P[0, k], expected, atol=1e-10)
+
+
+def test_high_gain_forgets_no_more_than_there_was():
+    record = linear_record(1)
+    y = np.full(record.y.shape, np.nan)
+    P = HighGain(Linear(), theta=20.0).run(Record(record.t, y, record.u, record.prior)).P
+    assert np.trace(P[0], axis1=1, axis2=2).max() < 2 * (np.trace(record.prior.cov[0]) + 2)
+
+
+def poles(system, L):
+    t, x = operating_point(system)
+    u = system.input(np.asarray(t))
+    return np.linalg.eigvals(system.f_jacobian(np.asarray(t), x, u) - L @ system.h_jacobian(x))
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_the_default_gain_places_poles_to_the_left_of_the_rate(name):
+    system = SYSTEMS.resolve(name)()
+    rate = default_rate(system)
+    assert poles(system, placed_gain(system, rate)).real.max() <= -0.999 * rate
+
+
+def test_poles_that_are_asked_for_are_placed():
+    system = SYSTEMS.resolve("ReverseDuffing")()
+    gain = placed_gain(system, 1.0, (-2.0, -3.0))
+    np.testing.assert_allclose(np.sort(poles(system, gain).real), [-3, -2], rtol=1e-9)
+    with pytest.raises(ValueError, match=r"poles=\(-1.0,\); ReverseDuffing has nx=2"):
+        placed_gain(system, 1.0, (-1.0,))
+
+
+def test_the_motor_cannot_be_observed_at_rest_and_says_so():
+    motor = SYSTEMS.resolve("InductionMotor")(u1_amplitude=0.0, u2_amplitude=0.0, T_L=0.0)
+    with pytest.raises(ValueError, match="is not observable, so its poles cannot be placed"):
+        placed_gain(motor, 1.0)
+
+
+def test_luenbergers_error_decays_as_its_poles_say():
+    """On a linear system with fine samples, against the matrix exponential."""
+    L = np.array([[2.0, 0.1], [-1.0, 1.5]])
+    t = np.arange(0, 1.0001, 1e-3)
+    x0 = np.array([[1.0, -0.5]])
+    y = Linear().h(truth(Linear(), x0, t)).swapaxes(0, 1)
+    prior = Prior(np.zeros((1, 2)), np.eye(2)[None])
+    record = Record(t, y, np.zeros((1, len(t), 0)), prior)
+    xhat = Luenberger(Linear(), gain=L).run(record).xhat[0]
+    values, vectors = np.linalg.eig(A - L @ H)
+    flow = (vectors * np.exp(values)) @ np.linalg.inv(vectors)
+    x_end = truth(Linear(), x0, t)[-1, 0]
+    np.testing.assert_allclose(x_end - xhat[-1], (flow @ x0[0]).real, atol=2e-3)
+
+
+def test_a_known_gain_of_reverse_duffing_settles():
+    """L = (3, 3) is known to settle within a few seconds from everywhere in the set."""
+    record = record_of(EpisodeSource("ReverseDuffing"), 20)
+    system = SYSTEMS.resolve("ReverseDuffing")()
+    own = Luenberger(system, gain=[[3.0], [3.0]]).run(record).xhat[:, -1]
+    reference = EKF(system).run(record).xhat[:, -1]
+    assert abs(own - reference).max() < 0.1
+
+
+def test_large_gains_are_stable_and_missing_outputs_correct_nothing():
+    H1 = np.array([[[1.0, 0.0]]] * 2)
+    K = injection(np.array([[1e9], [1.0]]), H1, np.array([[1.0], [0.0]]), 0.1)
+    np.testing.assert_allclose(K[0, :, 0], [1.0, 1e-9], rtol=1e-6)
+    assert (K[1] == 0).all()
+
+
+def test_within_its_layer_sliding_mode_is_a_luenberger_observer_of_higher_gain():
+    record = linear_record()
+    own = SlidingMode(Linear(), noise_std=0.1, switching=4.0, layer=1e6)
+    gain = 5.0 * settling_gain(Linear(), default_rate(Linear()), 5.0)
+    peer = Luenberger(Linear(), gain=gain)
+    np.testing.assert_allclose(own.run(record).xhat, peer.run(record).xhat, atol=1e-12)
+
+
+def test_beyond_its_layer_sliding_mode_heeds_an_outlier_less():
+    record = linear_record(1)
+    y = record.y.copy()
+    y[0, 10] += 100.0
+    moved = []
+    for kind in (
+        SlidingMode(Linear(), noise_std=0.1, switching=4.0, layer=5.0),
+        Luenberger(Linear(), gain=5.0 * settling_gain(Linear(), default_rate(Linear()), 5.0)),
+    ):
+        with_it = kind.run(Record(record.t, y, record.u, record.prior)).xhat[0, 10]
+        moved.append(abs(with_it - kind.run(record).xhat[0, 10]).max())
+    assert moved[0] < 0.75 * moved[1]
+
+
+def test_an_lmi_finds_the_gain_of_a_linear_system():
+    pytest.importorskip("cvxpy")
+    L = lmi_gain(Linear(), 1.0)
+    assert np.linalg.eigvals(A - L @ H).real.max() < -0.99
+
+
+@pytest.mark.parametrize("name", ["ReverseDuffing", "HarmonicOscillator", "Satellite"])
+def test_an_lmi_without_a_solution_is_said_to_have_none(name):
+    pytest.importorskip("cvxpy")
+    system = SYSTEMS.resolve(name)()
+    with pytest.raises(ValueError, match=f"{name} has no constant gain and metric"):
+        Luenberger(system, design="lmi").designed()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (StrongTrackingEKF, {"gamma": -1.0}, "gamma=-1"),
+        (EnKF, {"members": 2}, "members=2; expected more than nx=2"),
+        (EnKF, {"inflation": 0.9}, "inflation=0.9; expected"),
+        (ParticleFilter, {"particles": 1}, "particles=1; expected at least 2"),
+        (ParticleFilter, {"discount": 0.3}, "discount=0.3; expected"),
+        (Luenberger, {"design": "magic"}, "design='magic'; expected 'poles' or 'lmi'"),
+        (Luenberger, {"gain": [[1.0, 2.0]]}, "gain has shape"),
+        (Luenberger, {"rate": 0.0}, "rate=0.0; expected a positive number"),
+        (SlidingMode, {"layer": 0.0}, "layer=0.0; expected a positive number"),
+        (HighGain, {"theta": -1.0}, "theta=-1.0; expected a number of at least 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(kind, options, message):
+    with pytest.raises(ValueError, match=message):
+        kind(Linear(), **options)
+
+
+def test_without_cvxpy_the_lmi_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    with pytest.raises(ImportError, match=r"pip install \"pinnobs-gym\[lmi\]\""):
+        lmi_gain(Linear(), 1.0)

@@ -1,0 +1,31 @@
+"""Rows that no estimator was run for."""
+
+from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+
+
+def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
+    diverged = [False] * len(nrmse) if diverged is None else diverged
+    return [
+        {
+            **dict.fromkeys(SCORES, value),
+            **dict.fromkeys(OPTIONAL_SCORES),
+            "ranked": True,
+            "nx": 2,
+            "options": {},
+            "training_seed": None,
+            "nrmse_tail_modulo": value,
+            "env_id": "pinnobs/X-v0",
+            "setup": "benchmark",
+            "condition": "nominal",
+            "estimator": estimator,
+            "config_hash": estimator,
+            "track": track,
+            "knows": ["model"],
+            "training": {},
+            "us_per_step": 1.0,
+            "diverged": bad,
+            "episode_seed": i,
+            **changes,
+        }
+        for i, (value, bad) in enumerate(zip(nrmse, diverged, strict=True))
+    ]

@@ -1,0 +1,51 @@
+"""Code blocks of Markdown files, and how tests run them."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def blocks(path, *kinds):
+    """The blocks of these kinds in a file, in order: (kind, text)."""
+    found = re.findall(r"^```(\w+)\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
+    return [(kind, text) for kind, text in found if kind in kinds]
+
+
+def run_python(text, folder, timeout=120):
+    """Run a block by itself. Returns what it printed."""
+    (folder / "snippet.py").write_text(text, encoding="utf-8")
+    return _run([sys.executable, "-W", "error::UserWarning", "snippet.py"], folder, timeout)
+
+
+def run_page(path, folder, timeout=240):
+    """Run a file's blocks of Python and lines of ``pinnobs``, in order, in one process. A block
+    that begins with a comment ``# name.py`` is a module that later ones may import."""
+    parts = []
+    for kind, text in blocks(path, "python", "sh"):
+        if kind == "sh":
+            for line in text.splitlines():
+                assert line.startswith("pinnobs "), line
+                parts.append(f"assert main({line.split()[1:]!r}) == 0, {line!r}\n")
+            continue
+        named = re.match(r"# (\w+)\.py\n", text)
+        name = named.group(1) if named else f"part{len(parts)}"
+        (folder / f"{name}.py").write_text(text, encoding="utf-8")
+        parts.append(f"import {name}\n")
+    whole = "from pinnobs_gym.cli import main\n" + "".join(parts)
+    return run_python(whole, folder, timeout) if parts else ""
+
+
+def run_command(line, folder, timeout=120):
+    """Run a line that begins with ``pinnobs``. Returns what it printed."""
+    name, *arguments = line.split()
+    assert name == "pinnobs", line
+    return _run([sys.executable, "-m", "pinnobs_gym.cli", *arguments], folder, timeout)
+
+
+def _run(command, folder, timeout):
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return done.stdout

@@ -1,0 +1,280 @@
+"""`pinnobs report`: what it refuses, what it writes, and the page in a browser."""
+
+import json
+import shutil
+import sys
+
+import altair as alt
+import pytest
+
+from pinnobs_gym import evaluate
+from pinnobs_gym.cli import main
+from pinnobs_gym.leaderboard.site.charts import Styled
+from pinnobs_gym.leaderboard.site.comparisons import cost, factors, ratios
+from pinnobs_gym.leaderboard.site.over_time import errors, settling, state
+from pinnobs_gym.leaderboard.site.palette import styles
+from pinnobs_gym.scoring import rows
+
+CHROMIUM = shutil.which("chromium")
+ARGUMENTS = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
+ARGUMENTS += ["--disable-background-networking", "--disable-component-update"]
+DUFFING, MOTOR = "pinnobs/ReverseDuffing-v0", "pinnobs/InductionMotor-v0"
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory):
+    """A rows file with curves: two systems, one of them ranked under a condition of its own."""
+    path = tmp_path_factory.mktemp("scored") / "rows.jsonl"
+    for name in ("ekf", "open_loop", "rts_smoother"):
+        evaluate(name, DUFFING, episodes=4, results=path)
+    evaluate("strong_tracking_ekf", DUFFING, episodes=4, results=path, condition="noise5")
+    evaluate("ekf", DUFFING, episodes=4, results=path, condition="noise5")
+    for condition in ("nominal", "load_step"):
+        evaluate("ekf", MOTOR, episodes=2, results=path, condition=condition)
+    failed = {"schema": rows.SCHEMA, "kind": "failure", "env_id": DUFFING, "setup": "benchmark"}
+    failed |= {"condition": "nominal", "estimator": "broken", "episode_seed": 0, "episodes": 4}
+    failed |= {"job": "x", "error": "ZeroDivisionError: <by zero>", "date": "2030-01-01"}
+    rows.append(path, [failed])
+    return path
+
+
+@pytest.fixture(scope="module")
+def site(scored, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    assert main(["report", str(scored), "-o", str(folder)]) == 0
+    return folder / "index.html"
+
+
+def test_the_page_is_one_file_that_fetches_nothing(site):
+    text = site.read_text(encoding="utf-8")
+    assert [path.name for path in site.parent.iterdir()] == ["index.html"]
+    assert len(text) < 5e6
+    assert "src=" not in text.split("<script")[0]
+    assert "default-src 'none'" in text
+    assert "<link" not in text
+
+
+def test_the_page_tells_how_scores_were_made(site):
+    text = site.read_text(encoding="utf-8")
+    assert "<b>broken</b>" in text
+    assert "&lt;by zero&gt;" in text
+    assert (
+        "--systems ReverseDuffing --estimators ekf strong_tracking_ekf --condition noise5" in text
+    )
+    assert f"python {sys.version.split()[0]}" in text
+    assert "process_noise=0.0001" in text
+    assert "A conservative oscillator" in text
+
+
+def refused(capsys, *arguments):
+    assert main(["report", *map(str, arguments)]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("pinnobs: error: ")
+    assert told.count("\n") == 1
+    return told
+
+
+def test_without_rows_it_says_so(capsys, tmp_path):
+    assert "no rows file" in refused(capsys, "-o", tmp_path)
+    assert "there is no rows file" in refused(capsys, tmp_path / "none.jsonl")
+    (tmp_path / "empty.jsonl").write_text("")
+    assert "no scored episodes in" in refused(capsys, tmp_path / "empty.jsonl")
+    assert list(tmp_path.iterdir()) == [tmp_path / "empty.jsonl"]
+
+
+def changed(scored, path, **changes):
+    first = {**json.loads(scored.read_text().splitlines()[0]), **changes}
+    path.write_text(json.dumps(first) + "\n")
+    return path
+
+
+def test_another_schema_and_contradictions_are_refused(capsys, scored, tmp_path):
+    old = changed(scored, tmp_path / "old.jsonl", schema=1)
+    assert "schema 1" in refused(capsys, old)
+    other = changed(scored, tmp_path / "other.jsonl", nrmse=0.123)
+    told = refused(capsys, scored, other)
+    assert f"{scored} and {other} give different scores of the same episode" in told
+
+
+def test_an_unwritable_folder_is_refused(capsys, scored, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "cannot write to folder" in refused(capsys, scored, "-o", tmp_path / "file")
+
+
+def test_a_missing_extra_is_named(capsys, scored, monkeypatch):
+    monkeypatch.setitem(sys.modules, "altair", None)
+    for name in [name for name in sys.modules if name.startswith("pinnobs_gym.leaderboard.site")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr("pinnobs_gym.leaderboard.site.page", raising=False)
+    monkeypatch.delattr("pinnobs_gym.leaderboard.site.charts", raising=False)
+    assert "pip install 'pinnobs-gym[report]'" in refused(capsys, scored)
+
+
+def test_several_files_make_one_page_and_curves_may_be_missing(capsys, scored, tmp_path):
+    lines = scored.read_text().splitlines(keepends=True)
+    half, rest = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    half.write_text("".join(lines[:6]))
+    rest.write_text("".join(lines[4:]))  # two are in both
+    assert main(["report", str(half), str(rest), "-o", str(tmp_path / "site")]) == 0
+    text = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert "No curves are stored" in text
+    assert f"<b>{len(lines) - 1}</b> scored episodes" in text  # all but the failure, each once
+
+
+def test_charts_are_valid():
+    styled = Styled(styles(["ekf", "ukf"]))
+    for spec in (
+        errors(styled, 20.0, 1e-3, 1.0),
+        settling(styled, 20.0),
+        state(styled, 0, "x1", 20.0, (0.0, 1.0), True),
+        factors(styled, ["ekf"], 0.5, 20.0),
+        ratios(styled, ["ekf"], 0.5, 20.0),
+        cost(styled, "us", "µs", (0.1, 10.0), (0.5, 20.0)),
+    ):
+        alt.LayerChart.from_dict(spec)  # validates
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no chromium here")
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(browser, site):
+    """Opens the page without network; its console has to stay silent, and nothing is asked for."""
+    contexts, said, asked = [], [], []
+
+    def opened(**options):
+        context = browser.new_context(offline=True, **options)
+        contexts.append(context)
+        context.set_default_timeout(120_000)  # machines may be busy
+        page = context.new_page()
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(site.as_uri())
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert said == []
+    assert {url.split(":")[0] for url in asked} <= {"file", "data"}
+
+
+def draw_all(page):
+    """Open what is folded and scroll until every chart is drawn."""
+    page.eval_on_selector_all("details", "all => all.forEach(each => { each.open = true })")
+    page.evaluate(
+        """async () => {
+            for (const chart of document.querySelectorAll("[data-chart]")) {
+                chart.scrollIntoView();
+                await new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+            }
+        }"""
+    )
+    page.wait_for_function(
+        "[...document.querySelectorAll('[data-chart]')].every(chart => chart.dataset.drawn)"
+    )
+
+
+def test_all_charts_are_drawn_and_filled(opened):
+    page = opened(viewport={"width": 1280, "height": 900})
+    draw_all(page)
+    charts = page.evaluate(
+        """() => [...document.querySelectorAll("[data-chart]")].map((chart) => {
+            const marks = ".mark-line path, .mark-symbol path, .mark-rect path";
+            const paths = [...chart.querySelectorAll(marks)].map((path) => path.getAttribute("d"));
+            const { width, height } = chart.querySelector("svg").getBoundingClientRect();
+            const full = paths.some((path) => path && path !== "M0,0");
+            return [chart.dataset.chart, full, width, height];
+        })"""
+    )
+    # Two across systems; each game's errors and settling; 2 and 5 states; one with a reference.
+    names = {name for name, *_ in charts}
+    assert {"factors", "us", "errors0", "settling0", "ratios2", "state0-4"} <= names
+    for name, full, width, height in charts:
+        assert full, name
+        assert width > 300, name
+        assert height > 60, name
+
+
+def column(page, table, i):
+    cells = page.locator(f"{table} tbody tr > :nth-child({i})").all()
+    return [cell.inner_text().strip() for cell in cells]
+
+
+def test_columns_sort_both_ways(opened):
+    page = opened(viewport={"width": 1280, "height": 900})
+    table = "#ReverseDuffing-v0 table"
+    before = column(page, table, 7)
+    head = page.locator(f"{table} thead th").nth(6)  # NRMSE
+    assert head.inner_text() == "NRMSE"
+    head.locator("button").click()
+    values = [float(text.split()[0].replace("∞", "inf")) for text in column(page, table, 7)]
+    assert values == sorted(values)
+    assert head.get_attribute("aria-sort") == "ascending"
+    head.locator("button").click()
+    assert [
+        float(text.split()[0].replace("∞", "inf")) for text in column(page, table, 7)
+    ] == sorted(values, reverse=True)
+    page.locator(f"{table} thead button").nth(1).click()
+    names = column(page, table, 2)
+    assert names == ["ekf", "open_loop", "rts_smoother"]
+    assert sorted(before) == sorted(column(page, table, 7))
+
+
+def test_nothing_is_wider_than_a_phone(opened):
+    page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+    draw_all(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    wide = page.evaluate(
+        "[...document.querySelectorAll('main *, header *')].filter(each => !each.closest("
+        "'.box, #picker') && each.getBoundingClientRect().right > 391).map(each => each.tagName)"
+    )
+    assert wide == []
+    # A table that is wider scrolls in its own box.
+    box = page.locator("#overview .box")
+    assert box.evaluate("box => box.scrollWidth > box.clientWidth")
+
+
+def test_the_dark_changes_page_and_charts(opened):
+    page = opened(viewport={"width": 1280, "height": 900}, color_scheme="light")
+    look = """() => {
+        const line = document.querySelector('[data-chart=errors2] .mark-line path[stroke]');
+        return [getComputedStyle(document.body).backgroundColor, line.getAttribute('stroke')];
+    }"""
+    draw_all(page)
+    light = page.evaluate(look)
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_function(
+        "[...document.querySelectorAll('[data-chart]')].every(c => c.dataset.drawn === 'dark')"
+    )
+    dark = page.evaluate(look)
+    assert light[0] == "rgb(255, 255, 255)"
+    assert dark[0] != light[0]
+    assert dark[1] != light[1]
+
+
+def test_choices_change_what_is_drawn(opened):
+    page = opened(viewport={"width": 1280, "height": 900})
+    draw_all(page)
+    bands = page.locator("[data-chart=errors2] .mark-area path")
+    before = bands.count()
+    chip = page.locator(".chip[data-estimator=rts_smoother]")
+    assert chip.get_attribute("aria-pressed") == "false"
+    chip.click()
+    assert chip.get_attribute("aria-pressed") == "true"
+    page.wait_for_function(
+        f"document.querySelectorAll('[data-chart=errors2] .mark-area path').length === {before + 1}"
+    )
+    estimate = "document.querySelector('[data-chart=state2-1] .mark-area').innerHTML"
+    first = page.evaluate(estimate)
+    page.locator("#ReverseDuffing-v0 select[data-param=selected]").select_option("rts_smoother")
+    page.wait_for_function(f"{estimate} !== {json.dumps(first)}")

@@ -1,0 +1,137 @@
+"""The Cramér–Rao reference against its closed form, and exact Bayes against least squares."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from linear import A, H, Linear, linear_record, record_of, runge_kutta_matrix
+from scipy.linalg import expm
+
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.scoring.cramer_rao import cramer_rao, exact_bayes, expected_scores, step_error
+from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.system import Setup
+from pinnobs_gym.systems import SYSTEMS
+
+
+def played(name, batch, **changes):
+    """True states (batch, num_samples, nx), and the record."""
+    source = EpisodeSource(name, **changes)
+    episodes = source.play(source.draw([Stream(np.random.SeedSequence(i)) for i in range(batch)]))
+    return source, episodes.x[:-1].swapaxes(0, 1), source.record(episodes)
+
+
+@pytest.mark.parametrize("name", ["ReverseDuffing", "Satellite", "InductionMotor"])
+def test_it_is_the_information_of_all_outputs(name):
+    """Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ at sample 40."""
+    source, x, record = played(name, 2)
+    system, t, u = source.system, record.t, record.u
+    P0, R = record.prior.cov[0], np.diag(EKF(system).output_variance)
+    found = cramer_rao(system, t[:41], x[:, :41], P0, R)
+    for row in range(2):
+        Phi, information = np.eye(system.nx), np.linalg.inv(P0)
+        for k in range(41):
+            if k:
+                step = (float(t[k - 1]), float(t[k]), x[row : row + 1, k - 1])
+                F = model_step_jacobian(system, *step, u[:1, k - 1], u[:1, k])[1][0]
+                Phi = F @ Phi
+            G = system.h_jacobian(x[row, k][None])[0] @ Phi
+            information = information + G.T @ np.linalg.solve(R, G)
+        expected = Phi @ np.linalg.inv(information) @ Phi.T
+        size = np.sqrt(np.diag(expected))
+        off = abs(found[row, 40] - expected) / np.outer(size, size)
+        condition = np.linalg.cond(
+            information * np.outer(np.sqrt(np.diag(P0)), np.sqrt(np.diag(P0)))
+        )
+        assert off.max() < max(1e-12, 1e-15 * condition)
+
+
+def test_missing_outputs_tell_nothing_and_process_noise_is_added():
+    t = np.arange(3) * 0.1
+    x = np.zeros((1, 3, 2))
+    P0, R, Q = np.diag([2.0, 3.0]), np.diag([0.1, 0.2]), np.diag([0.3, 0.4])
+    missing = np.zeros((1, 3, 2), dtype=bool)
+    missing[0, 0], missing[0, 1, 1] = True, True
+    found = cramer_rao(Linear(), t, x, P0, R, Q, missing)[0]
+    F = runge_kutta_matrix(0.1)
+    np.testing.assert_allclose(found[0], P0, rtol=1e-14)
+    P = F @ P0 @ F.T + Q
+    P = np.linalg.inv(np.linalg.inv(P) + H[:1].T @ H[:1] / 0.1)
+    np.testing.assert_allclose(found[1], P, rtol=1e-12)
+    P = F @ P @ F.T + Q
+    P = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
+    np.testing.assert_allclose(found[2], P, rtol=1e-12)
+
+
+def test_on_a_linear_system_the_kalman_filters_covariance_is_the_reference():
+    record = linear_record(1)
+    P = EKF(Linear(), noise_std=0.1, process_noise=0.05).run(record).P
+    x = np.random.default_rng(0).standard_normal((1, record.num_samples, 2))  # any trajectory
+    R, Q = np.eye(2) * 0.01, np.eye(2) * 0.05**2
+    found = cramer_rao(Linear(), record.t, x, record.prior.cov[0], R, Q)
+    np.testing.assert_allclose(found, P, rtol=1e-10)
+
+
+def test_expected_scores_are_those_of_errors_of_these_covariances():
+    rng = np.random.default_rng(0)
+    P = np.stack([np.diag([0.04, 0.09]) * (1 + k) for k in range(20)])
+    error = rng.standard_normal((4000, 20, 2)) * np.sqrt(np.einsum("kii->ki", P))
+    x, scale = np.zeros_like(error), (2.0, 5.0)
+    scored = np.ones(x.shape, dtype=bool)
+    scored[:, ::2, 0] = False
+    scores = score(np.arange(20.0), x, error, scale, scored=scored)
+    expected = expected_scores(np.repeat(P[None], 4000, axis=0), scale, scored)
+    for name, values in expected.items():
+        assert np.sqrt(np.mean(scores[name] ** 2)) == pytest.approx(values[0], rel=0.01)
+
+
+@dataclass(frozen=True)
+class WideLinear(Linear):
+    setups = {"benchmark": replace(Linear.setups["benchmark"], x0_low=(-5, -5), x0_high=(5, 5))}
+
+
+def test_the_error_of_a_step_is_the_runge_kutta_methods():
+    x = np.random.default_rng(0).standard_normal((3, 5, 2))
+    dt = 0.1
+    for k in range(1, 5):
+        x[:, k] = x[:, k - 1] @ expm(dt * A).T
+    found = step_error(Linear(), dt * np.arange(5), x)
+    expected = x[:, :-1] @ (runge_kutta_matrix(dt) - expm(dt * A)).T
+    np.testing.assert_allclose(found[:, 1:], expected, atol=1e-14)
+    assert abs(found[:, 1:]).max() > 1e-8
+    assert not found[:, 0].any()
+
+
+def test_on_a_linear_system_exact_bayes_is_least_squares():
+    """With a uniform prior much wider than what one output leaves open."""
+    record = record_of(EpisodeSource(WideLinear), 3)
+    setup: Setup = WideLinear.setups["benchmark"]
+    posterior = exact_bayes(WideLinear(), setup, record, np.full(2, 0.01), draws=4000)
+    assert posterior.ess[:, 2:].min() > 400
+    F, Phi = runge_kutta_matrix(0.1), np.eye(2)
+    information, right = np.zeros((2, 2)), np.zeros((2, 3))
+    for k in range(record.num_samples):
+        G = H @ Phi
+        information += G.T @ G / 0.01
+        right += G.T @ record.y[:, k].T / 0.01
+        if k >= 2:
+            cov = Phi @ np.linalg.inv(information) @ Phi.T
+            off = posterior.mean[:, k] - (Phi @ np.linalg.solve(information, right)).T
+            assert (abs(off) < 0.25 * np.sqrt(np.diag(cov))).all()
+            np.testing.assert_allclose(
+                posterior.cov[:, k], np.repeat(cov[None], 3, axis=0), atol=0.25 * abs(cov).max()
+            )
+        Phi = F @ Phi
+
+
+def test_no_filter_is_better_than_exact_bayes():
+    source, x, record = played("ReverseDuffing", 12, duration=4.0)
+    duffing = SYSTEMS.resolve("ReverseDuffing")()
+    posterior = exact_bayes(duffing, source.setup, record, np.array([0.02**2]), draws=1500)
+    assert np.median(posterior.ess) > 300
+    errors = {}
+    for name, xhat in (("bayes", posterior.mean), ("ekf", EKF(duffing).run(record).xhat)):
+        errors[name] = np.sqrt(np.mean(((xhat - x) / duffing.scale) ** 2, axis=(1, 2)))
+    assert np.mean(errors["bayes"]) < np.mean(errors["ekf"])

@@ -1,0 +1,188 @@
+import json
+import multiprocessing
+import resource
+import signal
+
+import pytest
+from stored_rows import row, write_fifty
+
+from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES
+
+
+def test_round_trip_keeps_infinity_as_valid_json(tmp_path):
+    path = tmp_path / "deep" / "rows.jsonl"
+    rows.append(path, [row(0, nrmse=float("inf"), diverged=True), row(1)])
+    rows.append(path, [row(2)])
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    for line in path.read_text().splitlines():
+        json.loads(line, parse_constant=refuse)
+    back = rows.read(path)
+    assert [r["episode_seed"] for r in back] == [0, 1, 2]
+    assert back[0]["nrmse"] == float("inf")
+    assert back[1]["nrmse"] == 0.5
+
+
+def test_optional_scores_are_absent_infinite_or_a_number(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    optional = dict.fromkeys(OPTIONAL_SCORES)
+    rows.append(path, [row(0, **{**optional, "anees": float("inf"), "nis": 1.5})])
+    assert '"anees": null' in path.read_text()
+    assert "coverage" not in path.read_text()
+    (back,) = rows.read(path)
+    assert back["anees"] == float("inf")
+    assert back["nis"] == 1.5
+    assert back["coverage"] is None
+
+
+def test_no_file_is_no_rows(tmp_path):
+    assert rows.read(tmp_path / "none.jsonl") == []
+
+
+@pytest.mark.parametrize("cut", [1, 2, 30, 300])
+def test_a_half_line_at_the_end_is_left_out_and_cut_off_by_the_next_rows(tmp_path, cut):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(1)])
+    whole = path.read_bytes()
+    assert len(whole) > 600  # the longest cut leaves the first line alone
+    path.write_bytes(whole[:-cut])
+    stored = rows.load(path)
+    kept = [0, 1] if cut == 1 else [0]  # only the line's end was missing
+    assert [r["episode_seed"] for r in stored.rows] == kept
+    assert path.read_bytes() == whole[:-cut]
+    assert ("line 2, is cut off" in stored.warning) == (cut > 1)
+    assert "\n" not in stored.warning
+    rows.append(path, [row(2), row(3)])
+    stored = rows.load(path)
+    assert [r["episode_seed"] for r in stored.rows] == [*kept, 2, 3]
+    assert stored.warning == ""
+
+
+def test_every_beginning_of_a_line_is_a_half_line(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    line = path.read_bytes()[:-1]
+    for length in (*range(1, 16), *range(16, len(line), 25), len(line) - 1):
+        path.write_bytes(line[:length])
+        assert rows.load(path) == ([], [], rows.load(path).warning)
+        rows.append(path, [row(1)])
+        assert [r["episode_seed"] for r in rows.read(path)] == [1]
+
+
+@pytest.mark.parametrize("content", ["notes of mine", "\0\0\0", "[1, 2]"])
+def test_what_is_no_row_is_named_and_never_deleted(tmp_path, content):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(content)
+    with pytest.raises(ValueError, match="line 1, is cut off or is not a row") as caught:
+        rows.read(path)
+    assert "\n" not in str(caught.value)
+    rows.append(path, [row(0)])
+    assert path.read_text().startswith(content + "\n")
+
+
+def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(1), row(2)])
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], lines[1][:-30], lines[2]]) + "\n")
+    with pytest.raises(ValueError, match="line 2, is cut off"):
+        rows.read(path)
+    path.write_text("\n".join([lines[0], lines[2]]) + "\n")  # as the error advises
+    assert [r["episode_seed"] for r in rows.read(path)] == [0, 2]
+
+
+def event(kind="failure", day=1, job="a", **changes):
+    names = dict.fromkeys(rows.JOB, "x") | {"job": job, "date": f"2026-01-{day:02d}"}
+    error = {"error": "out of luck"} if kind == "failure" else {}
+    return {"schema": rows.SCHEMA, "kind": kind, **names, **error, **changes}
+
+
+def test_failures_are_kept_apart_until_the_job_goes_well(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [event(job="a"), row(0), event(job="b"), event(job="a", error="again")])
+    stored = rows.load(path)
+    assert [r["episode_seed"] for r in stored.rows] == [0]
+    assert {r["job"]: r["error"] for r in stored.failures} == {"a": "again", "b": "out of luck"}
+    rows.append(path, [event("recovery", day=2)])
+    assert [r["job"] for r in rows.load(path).failures] == ["b"]
+    rows.append(path, [event(day=3)])
+    assert [r["job"] for r in rows.load(path).failures] == ["a", "b"]
+    rows.append(path, [event("dance")])
+    with pytest.raises(ValueError, match="line 7: a row of kind 'dance'; expected score"):
+        rows.load(path)
+
+
+def test_files_are_merged_by_concatenation_in_any_order(tmp_path):
+    here, there, both = (tmp_path / name for name in ("here", "there", "both"))
+    rows.append(here, [row(0), event(day=1)])
+    rows.append(there, [row(1), row(0), event("recovery", day=2)])
+    for parts in ((here, there), (there, here)):
+        both.write_bytes(b"".join(part.read_bytes() for part in parts))
+        stored = rows.load(both)
+        assert sorted(r["episode_seed"] for r in stored.rows) == [0, 1]
+        assert stored.failures == []
+
+
+def test_another_schema_and_missing_fields_are_refused(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(schema=99)])
+    with pytest.raises(ValueError, match="schema 99; expected 3: move the file"):
+        rows.read(path)
+    path.unlink()
+    incomplete = row()
+    del incomplete["nrmse"]
+    rows.append(path, [incomplete])
+    with pytest.raises(ValueError, match="a row without nrmse"):
+        rows.read(path)
+
+
+def test_equal_duplicates_count_once_and_contradictory_ones_are_an_error(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(0), row(0, nrmse=0.5 * (1 + 1e-9), date="later")])
+    assert len(rows.read(path)) == 1
+    lost = {"diverged": True}
+    rows.append(path, [row(1, **lost, nrmse=1e30), row(1, **lost, nrmse=float("inf"))])
+    assert len(rows.read(path)) == 2
+    rows.append(path, [row(0, nrmse=0.5001)])
+    with pytest.raises(ValueError, match="lines 1 and 6, give different scores"):
+        rows.read(path)
+
+
+def test_an_unwritable_place_is_one_clear_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot write rows to"):
+        rows.append(tmp_path / "file" / "rows.jsonl", [row()])
+
+
+def test_a_full_disk_leaves_no_half_line(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 100, hard))
+    try:
+        with pytest.raises(rows.CannotWrite, match="only 100 of") as caught:
+            rows.append(path, [row(1)])
+        with pytest.raises(rows.CannotWrite, match="only 100 of"):
+            rows.append(path, [row(1)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+    assert "\n" not in str(caught.value)
+    assert path.read_bytes() == before
+
+
+def test_processes_may_share_a_file(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    context = multiprocessing.get_context("spawn")
+    workers = [context.Process(target=write_fifty, args=(path, 100 * i)) for i in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    seeds = sorted(r["episode_seed"] for r in rows.read(path))
+    assert seeds == sorted(100 * i + j for i in range(3) for j in range(50))

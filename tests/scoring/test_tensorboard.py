@@ -1,0 +1,142 @@
+"""What TensorBoard shows of a leaderboard and of evaluations, read back by TensorBoard itself."""
+
+import io
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.hparams import backend_context
+from tensorboard.plugins.hparams.metadata import (
+    SESSION_START_INFO_TAG,
+    parse_session_start_info_plugin_data,
+)
+
+from pinnobs_gym.cli import main
+from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.tensorboard import log_folder
+
+DRAWN = {"ReverseDuffing": (800, 420), "HarmonicOscillator": (800, 580)}
+"""Width and height of the pictures, a panel per state."""
+
+
+class Shown:
+    """What TensorBoard reads from a folder."""
+
+    def __init__(self, folder):
+        events = EventMultiplexer()
+        events.AddRunsFromDirectory(str(folder))
+        events.Reload()
+        self.runs = {run: EventAccumulator(str(folder / run)) for run in events.Runs()}
+        for run in self.runs.values():
+            run.Reload()
+        provider = MultiplexerDataProvider(events, str(folder))
+        self._hparams = backend_context.Context(TBContext(data_provider=provider))
+        self._metadata = self._hparams.hparams_metadata(RequestContext(), "")
+
+    def columns(self):
+        """The columns of the HPARAMS table: settings, metrics."""
+        table = self._hparams.experiment_from_metadata(
+            RequestContext(), "", True, self._metadata, []
+        )
+        return {one.name for one in table.hparam_infos}, {m.name.tag for m in table.metric_infos}
+
+    def settings(self, run):
+        """The line of a run in the HPARAMS table."""
+        found = parse_session_start_info_plugin_data(self._metadata[run][SESSION_START_INFO_TAG])
+        kinds = {name: value.WhichOneof("kind") for name, value in found.hparams.items()}
+        return {name: getattr(found.hparams[name], kind) for name, kind in kinds.items()}
+
+    def scalars(self, run, tag):
+        """Values by step."""
+        return {event.step: event.value for event in self.runs[run].Scalars(tag)}
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """A folder, its rows by run, and what TensorBoard shows of it."""
+    folder = tmp_path_factory.mktemp("leaderboard")
+    chosen = ["--systems", *DRAWN, "--estimators", "ekf", "luenberger", "--condition", "dt5"]
+    assert (
+        main(["leaderboard", *chosen, "--episodes", "3", "--jobs", "1", "--out", f"{folder}"]) == 0
+    )
+    runs = defaultdict(list)
+    for row in rows.read(folder / "rows.jsonl"):
+        runs[str(log_folder(folder, row).relative_to(folder / "tensorboard"))].append(row)
+    return runs, Shown(folder / "tensorboard")
+
+
+def test_the_runs_are_the_estimators_on_the_systems(played):
+    runs, shown = played
+    assert len(runs) == 4
+    assert set(shown.runs) == set(runs)
+    for run, group in runs.items():
+        names = (group[0]["env_id"].removeprefix("pinnobs/"), "benchmark", "dt5")
+        assert run.startswith("/".join([*names, group[0]["estimator"]]))
+
+
+def test_scalars_are_the_scores_of_the_rows(played):
+    runs, shown = played
+    for run, group in runs.items():
+        for name in ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak"):
+            expected = {r["episode_seed"]: r[name] for r in group if np.isfinite(r[name])}
+            if expected:
+                assert shown.scalars(run, f"episode/{name}") == pytest.approx(expected, rel=1e-6)
+    assert shown.scalars(run, "episode/nrmse").keys() == {0, 1, 2}
+
+
+def test_a_picture_of_the_first_episode_has_a_panel_per_state(played):
+    runs, shown = played
+    for run, group in runs.items():
+        (image,) = shown.runs[run].Images("states")
+        assert image.step == 0
+        with Image.open(io.BytesIO(image.encoded_image_string)) as picture:
+            name = group[0]["env_id"].removeprefix("pinnobs/").removesuffix("-v0")
+            assert picture.size == DRAWN[name]
+            assert len(picture.convert("RGB").getcolors(10**6)) > 50
+
+
+def test_the_table_has_every_estimators_settings_and_medians(played):
+    runs, shown = played
+    settings, metrics = shown.columns()
+    for run, group in runs.items():
+        first = group[0]
+        told = shown.settings(run)
+        for name in ("env_id", "setup", "condition", "estimator", "track"):
+            assert told[name] == first[name]
+        for name, value in first["options"].items():
+            assert told[name] == (value if isinstance(value, bool | int | float) else str(value))
+        assert set(told) <= settings  # also what the first run of all has not
+        diverged = np.array([r["diverged"] for r in group])
+        assert shown.scalars(run, "diverged") == {0: pytest.approx(diverged.mean())}
+        for name in ("nrmse", "rmse", "settling"):
+            median = sorted(np.where(diverged, np.inf, [r[name] for r in group]))[1]
+            if np.isfinite(median):
+                assert shown.scalars(run, f"median/{name}") == {0: pytest.approx(median, rel=1e-6)}
+            else:
+                assert f"median/{name}" not in shown.runs[run].Tags()["scalars"]
+    assert {"median/nrmse", "diverged"} <= metrics
+
+
+def test_other_settings_of_one_estimator_are_other_lines(tmp_path):
+    where = ["--system", "ReverseDuffing", "--condition", "dt5", "--out", str(tmp_path)]
+    for noise, seed in ((0.01, 4), (0.1, 6)):
+        chosen = ["--set", f"process_noise={noise}", "--seed", f"{seed}"]
+        assert main(["evaluate", *where, *chosen, "--episodes", "1"]) == 0
+    # One more episode than there was: its picture is that of the one that is run now.
+    assert main(["evaluate", *where, *chosen, "--episodes", "2"]) == 0
+    shown = Shown(tmp_path / "tensorboard")
+    first, second = sorted(shown.runs, key=lambda run: shown.settings(run)["process_noise"])
+    assert shown.settings(first)["process_noise"] == 0.01
+    assert shown.settings(second)["process_noise"] == 0.1
+    stored = rows.read(tmp_path / "rows.jsonl")
+    assert [row["episode_seed"] for row in stored] == [4, 6, 7]
+    assert shown.scalars(first, "episode/nrmse") == {4: pytest.approx(stored[0]["nrmse"])}
+    both = {row["episode_seed"]: pytest.approx(row["nrmse"]) for row in stored[1:]}
+    assert shown.scalars(second, "episode/nrmse") == both
+    assert [image.step for image in shown.runs[second].Images("states")] == [6, 7]

@@ -1,0 +1,47 @@
+"""Tables of measured figures."""
+
+import json
+
+import measured
+import pytest
+
+
+@pytest.fixture
+def groups(tmp_path):
+    def line(figure, value, asked="", holds=None, date="2026-01-02", group="core"):
+        fields = ("group", "figure", "value", "unit", "asked", "holds", "date")
+        return dict(zip(fields, (group, figure, value, "x", asked, holds, date), strict=True))
+
+    lines = [
+        line("slow", 0.5, ">= 1", False, date="2026-01-01"),
+        line("slow", 1.5, ">= 1", True),
+        line("missed", 2, ">= 3", False),
+        line("free", 4),
+    ]
+    path = tmp_path / "figures.jsonl"
+    path.write_text("".join(json.dumps(each) + "\n" for each in lines))
+    return measured.read(path)
+
+
+def test_the_last_line_of_a_figure_counts(groups):
+    assert [(f["figure"], f["value"]) for f in groups["core"]] == [
+        ("slow", 1.5),
+        ("missed", 2),
+        ("free", 4),
+    ]
+
+
+def test_the_readme_says_what_holds_and_what_is_missed(groups):
+    section = measured.readme_section(groups)
+    assert "| `core` | 1 of 2 | missed: 2 x, asked >= 3 |" in section
+    assert "Measured on 2026-01-02 by" in section
+
+
+def test_the_page_has_every_figure(groups):
+    page = measured.page(groups)
+    assert "| missed | 2 x | >= 3 **missed** |" in page
+    assert "| free | 4 x |  |" in page
+
+
+def test_no_file_is_no_figures(tmp_path):
+    assert measured.read(tmp_path / "none") == {}

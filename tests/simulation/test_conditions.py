@@ -1,0 +1,247 @@
+"""Conditions against what they say: invariants, linear algebra, and the nominal episodes."""
+
+import numpy as np
+import pytest
+from linear import A, Linear
+from scipy.linalg import expm
+
+from pinnobs_gym import evaluate
+from pinnobs_gym.cli import main
+from pinnobs_gym.cli.system_page import page
+from pinnobs_gym.envs.env import EstimationEnv
+from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.leaderboard.jobs.plan import jobs_of
+from pinnobs_gym.leaderboard.suites import Entry, Suite
+from pinnobs_gym.scoring import rows
+from pinnobs_gym.simulation.conditions import CONDITIONS, canonical_name, fitting, parse_condition
+from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.systems.induction_motor import InductionMotor
+from pinnobs_gym.systems.satellite import Satellite
+
+
+def played(name, condition, batch=20, **changes):
+    source = EpisodeSource(name, changes.pop("setup", "benchmark"), condition, **changes)
+    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(batch)]
+    return source, source.play(source.draw(streams))
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+@pytest.mark.parametrize("condition", [name for name in CONDITIONS if name != "load_step"])
+def test_every_condition_can_be_played_on_every_system(name, condition):
+    source, episodes = played(name, condition, batch=3)
+    assert np.isfinite(episodes.x).all()
+    assert not np.isnan(episodes.y).all(axis=(0, 2)).any()
+    assert source.system == SYSTEMS.resolve(name)()  # what estimators are given
+
+
+def signs(count):
+    """All combinations (2**count, count) of -1 and 1."""
+    return np.stack(np.meshgrid(*[[-1.0, 1.0]] * count), axis=-1).reshape(-1, count)
+
+
+@pytest.mark.parametrize("part", [0.1, 0.3])
+def test_mismatch_of_a_plant_without_parameters_is_of_its_rates(part):
+    """ẋ₁ = a·x₂³, ẋ₂ = −b·x₁ conserves b·x₁²/2 + a·x₂⁴/4."""
+    _, episodes = played("ReverseDuffing", f"mismatch{round(100 * part)}", batch=40)
+    x1, x2 = np.moveaxis(episodes.x, -1, 0)
+    chosen = []
+    for a, b in 1 + part * signs(2):
+        energy = b * x1**2 / 2 + a * x2**4 / 4
+        chosen.append(np.ptp(energy, axis=0) / energy[0] < 1e-8)
+    # a and b equal cannot be told by the invariant alone which way they are off
+    same = chosen[0] & chosen[3]
+    assert (same | chosen[1] | chosen[2]).all()
+    assert min(same.sum(), chosen[1].sum(), chosen[2].sum()) > 2  # signs vary between episodes
+
+
+def test_mismatch_of_parameters():
+    """Every parameter of the satellite is off, with a sign of its own."""
+    _, episodes = played("Satellite", "mismatch10", batch=40)
+    a = np.array([0.5, -0.875, 2 / 3])
+    found = np.zeros((40, 8), dtype=bool)
+    for i, factor in enumerate(1 + 0.1 * signs(3)):
+        a1, a2, a3 = a * factor
+        invariants = Satellite(a1=a1, a2=a2, a3=a3).invariants(episodes.x)
+        found[:, i] = (np.ptp(invariants, axis=0) < 1e-7).all(axis=-1)
+    # all three off the same way conserve the same as none
+    assert found.any(axis=1).all()
+    assert not found.all(axis=1).any()
+    assert (found.sum(axis=0) > 0).all()
+
+
+def test_mismatch_leaves_out_what_the_system_is_sure_of():
+    source, episodes = played("InductionMotor", "mismatch30", batch=2)
+    plant = source.condition.plant(source.system, [np.random.default_rng(0)] * 2)
+    for name, value in plant.parameters.items():
+        nominal = getattr(InductionMotor(), name)
+        off = np.abs(np.broadcast_to(value, 2) / nominal - 1)
+        np.testing.assert_allclose(off, 0.3 if name in InductionMotor.uncertain else 0, atol=1e-12)
+    assert np.array_equal(
+        episodes.observations[..., 2:4].std(axis=1).max(), 0
+    )  # the input is known
+
+
+def test_process_noise_is_white_and_of_the_size_it_says():
+    _, episodes = played(Linear, "process_noise1e-2", batch=200)
+    disturbance = episodes.x[1:] - episodes.x[:-1] @ expm(0.1 * A).T
+    cov = np.cov(disturbance.reshape(-1, 2).T)
+    np.testing.assert_allclose(cov / 1e-4, np.eye(2), atol=5 * np.sqrt(2 / 4000))
+    lagged = (disturbance[1:] * disturbance[:-1]).mean() / 1e-4
+    across = (disturbance[:, 1:] * disturbance[:, :-1]).mean() / 1e-4
+    assert max(abs(lagged), abs(across)) < 5 / np.sqrt(7600)
+
+
+@pytest.mark.parametrize(("name", "seconds"), [("ReverseDuffing", 1.0), ("InductionMotor", 0.2)])
+def test_the_gap(name, seconds):
+    source, episodes = played(name, "gap", batch=60)
+    _, nominal = played(name, "nominal", batch=60)
+    missing = np.isnan(episodes.y).all(axis=-1)
+    count = round(seconds / source.setup.dt)
+    assert (abs(missing.sum(axis=0) - count) <= 1).all()
+    edges = np.abs(np.diff(missing.astype(int), axis=0)).sum(axis=0)
+    assert (edges <= 2).all()  # in one piece
+    first = missing.argmax(axis=0) / (len(missing) - count)
+    assert first.mean() == pytest.approx(0.5, abs=0.19)  # 5 standard errors
+    assert first.min() < 0.1
+    assert first.max() > 0.9
+    np.testing.assert_array_equal(episodes.y[~missing], nominal.y[~missing])
+
+
+@pytest.mark.parametrize("samples", [1, 5])
+def test_delay(samples):
+    _, late = played("InductionMotor", f"delay{samples}", batch=2)
+    _, nominal = played("InductionMotor", "nominal", batch=2)
+    np.testing.assert_array_equal(late.y[samples:], nominal.y[:-samples])
+    assert np.isnan(late.y[:samples]).all()
+    np.testing.assert_array_equal(late.x, nominal.x)
+    np.testing.assert_array_equal(late.observations[..., 2:], nominal.observations[..., 2:])
+
+
+def test_a_guess_further_away():
+    for name in SYSTEMS.classes():
+        source = EpisodeSource(name, condition="xhat0_far")
+        near = EpisodeSource(name).setup
+        centre = (source.x0_low + source.x0_high) / 2
+        further = abs(np.array(source.setup.xhat0) - centre) - abs(np.array(near.xhat0) - centre)
+        np.testing.assert_allclose(further, near.P0_std)
+    env = EstimationEnv("ReverseDuffing", condition="xhat0_far")
+    np.testing.assert_allclose(env.reset(seed=0)[1]["xhat0"], [2.5, 2.2])
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_initial_states_outside_the_set(name):
+    source, episodes = played(name, "x0_outside", batch=50)
+    assert not source.contains(episodes.x[0]).any()
+    assert source.contains(episodes.x[0] / 1.5).all()
+
+
+def test_the_fixed_initial_state_of_a_setup_is_left_too():
+    _, episodes = played("ReverseDuffing", "x0_outside", batch=2, setup="paper")
+    np.testing.assert_array_equal(episodes.x[0], [[3.0, -1.5]] * 2)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 5.0])
+def test_other_sample_times(factor):
+    source, episodes = played("Academic", f"dt{factor:g}", batch=3)
+    _, nominal = played("Academic", "nominal", batch=3)
+    assert source.setup.dt == 0.02 * factor
+    assert source.times[-1] == pytest.approx(10.0)
+    every = int(max(factor, 1)), int(max(1 / factor, 1))
+    np.testing.assert_allclose(nominal.x[:: every[0]], episodes.x[:: every[1]], atol=1e-8)
+
+
+def test_the_order_of_names_does_not_matter():
+    _, one = played("Satellite", "outliers+mismatch10", batch=2)
+    _, other = played("Satellite", "mismatch10+outliers", batch=2)
+    np.testing.assert_array_equal(one.x, other.x)
+    np.testing.assert_array_equal(one.y, other.y)
+
+
+@pytest.mark.parametrize(
+    ("name", "canonical"),
+    [
+        ("nominal", "nominal"),
+        ("load_step", "load_step"),
+        ("outliers+mismatch10", "mismatch10+outliers"),
+        ("mismatch10+outliers", "mismatch10+outliers"),
+        ("gap+dt2+noise5", "noise5+dt2+gap"),
+        ("noise5+nominal", "noise5"),
+    ],
+)
+def test_a_condition_has_one_name(name, canonical):
+    assert canonical_name(name) == canonical
+    assert parse_condition(name) == parse_condition(canonical)
+
+
+def test_both_spellings_are_one_condition_to_rows_jobs_and_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spellings = ("outliers+dt5", "dt5+outliers")
+    found = [
+        evaluate("ekf", "pinnobs/Academic-v0", episodes=1, condition=name, results="rows.jsonl")
+        for name in spellings
+    ]
+    assert found[0] == found[1]  # its date too: the second is the stored row
+    (row,) = rows.read(tmp_path / "rows.jsonl")
+    assert row["condition"] == "dt5+outliers"
+    suite = Suite(systems=("Academic",), estimators=(Entry("ekf"),), conditions=tuple(spellings))
+    jobs = jobs_of(suite, tmp_path)
+    assert [job.condition for job in jobs] == ["dt5+outliers"]
+    pytest.importorskip("optuna")
+    for name in spellings:
+        chosen = ["--system", "Academic", "--condition", name, "--episodes", "2"]
+        assert main(["tune", "ekf", *chosen, "--trials", "2"]) == 0
+    trials = {path.name for path in (tmp_path / "runs" / "tune").glob("*.journal")}
+    assert trials == {"Academic-v0-benchmark-dt5+outliers-ekf.journal"}
+
+
+@pytest.mark.parametrize(
+    ("condition", "reference"),
+    [
+        ("nominal", True),
+        ("noise5+dropout30", True),
+        ("process_noise1e-3", True),
+        ("dt2+gap", True),
+        ("noise0", False),
+        ("mismatch10", False),
+        ("noise5+outliers", False),
+        ("delay1", False),
+        ("xhat0_far", False),
+        ("x0_outside", False),
+        ("load_step", False),
+    ],
+)
+def test_where_the_reference_is_that_of_the_episodes(condition, reference):
+    assert parse_condition(condition).reference is reference
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("rain", "unknown condition 'rain'; known are nominal, .*mismatch10.*process_noise1e-3"),
+        ("noise5+mismatch10+noise15", "'noise5' and 'noise15' change the same; name one"),
+        ("delay5", "condition 'delay5' leaves no output in 4 sample"),
+        ("dt5", "duration=0.08 s is shorter than one sample, dt=0.1 s"),
+        ("load_step", "needs a plant with a load torque; Academic has none"),
+    ],
+)
+def test_what_cannot_be_played_is_one_clear_line(condition, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        EpisodeSource("Academic", condition=condition, duration=0.08)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_page_of_a_system_has_the_conditions_that_fit_it():
+    assert "| load_step |" in page(InductionMotor, "x")
+    text = page(Satellite, "x")
+    assert "| load_step |" not in text
+    assert "| mismatch10 | parameters of the plant off by ±10 %, the model's nominal |" in text
+    names = fitting(*Satellite.configured())
+    assert set(CONDITIONS) - set(names) == {"load_step"}
+
+
+def test_a_system_that_is_uncertain_of_what_it_has_not_is_refused():
+    class Wrong(Satellite):
+        uncertain = ("a4",)
+
+    with pytest.raises(TypeError, match="Wrong: uncertain names no parameter 'a4'"):
+        Wrong.validate()

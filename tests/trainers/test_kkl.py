@@ -1,0 +1,514 @@
+"""KKL observers: the dynamics of z, the labels, the fit, the three trainers."""
+
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+from linear import A as PLANT
+from linear import H, Linear, linear_record
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm, solve_discrete_lyapunov, solve_sylvester
+
+from pinnobs_gym.envs.registration import record_of
+from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS
+from pinnobs_gym.estimation.learned.kkl_dynamics import (
+    Dynamics,
+    at_rest,
+    bessel,
+    enough,
+    niazi,
+    realised,
+)
+from pinnobs_gym.estimation.learned.kkl_maps import Mlp, Scaling, evaluate
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators.kkl import KKLSupervised
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import Setup, System, stack
+from pinnobs_gym.simulation.truth import truth
+from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.training.by_name import trainer
+from trainers.kkl.fitting import Equations, Fit, Term
+from trainers.kkl.labels import frequency, initial_states, noise_in_z, simulated, steady
+from trainers.kkl.learned_poles import _response
+from trainers.kkl.run import Run, kept_samples
+
+TRAINERS = ("kkl_supervised", "kkl_autoencoder", "kkl_pinn")
+SMALL = {"trajectories": 80, "samples": 40, "iterations": 60, "width": 10, "patience": 1.0}
+
+
+def linear_T(dynamics, plant=PLANT):
+    """T(x) = Mx of the linear system: MF − AM = BH."""
+    return solve_sylvester(dynamics.A, -plant, -dynamics.B @ H)
+
+
+def trained_on(name, system="ReverseDuffing", noise_std=None, part=1.0, **settings):
+    """Trained on the sample times of the first part of an episode."""
+    module = trainer(name)
+    plant, setup, whole = record_of(f"pinnobs/{system}-v0", "benchmark", "nominal", 10**6)
+    n = round(part * whole.num_samples)
+    record = Record(whole.t[:n], whole.y[:, :n], whole.u[:, :n], whole.prior)
+    told = setup.noise_std if noise_std is None else noise_std
+    config = module.Config(**{**SMALL, **settings})
+    return module.train(plant, config, record=record, noise_std=told), plant, setup, record
+
+
+def trained_on_linear(name, **settings):
+    module = trainer(name)
+    config = module.Config(**{**SMALL, "cutoff": 1.0, **settings})
+    t = 0.1 * np.arange(80)
+    record = Record(
+        t, np.zeros((1, 80, 2)), np.zeros((1, 80, 0)), Prior(np.zeros((1, 2)), np.eye(2)[None])
+    )
+    return module.train(Linear(), config, record=record, noise_std=0.0)
+
+
+# --- the dynamics of z
+
+
+@pytest.mark.parametrize("poles", [(-1.0, -2.5), bessel(3, 0.7), niazi(2)])
+def test_z_is_exact_for_piecewise_linear_outputs(poles):
+    dynamics = realised(poles, 2)
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.05, 0.6, 12))
+    y = rng.standard_normal((12, 1, 2))
+
+    def rate(time, z):
+        return dynamics.A @ z + dynamics.B @ [np.interp(time, t, y[:, 0, i]) for i in range(2)]
+
+    z0 = rng.standard_normal(dynamics.size)
+    z = dynamics.filtered(t, y, z0)
+    now = z0
+    for k in range(1, 12):  # piece by piece, so that the peer sees no corner
+        now = solve_ivp(rate, t[k - 1 : k + 1], now, rtol=1e-10, atol=1e-12).y[:, -1]
+        np.testing.assert_allclose(z[k, 0], now, atol=1e-8)
+    flow = dynamics.flows(t)[-1]
+    np.testing.assert_allclose(flow, expm(dynamics.A * (t[-1] - t[0])), atol=1e-12)
+
+
+def test_filters_have_their_poles_and_unit_gain_at_rest():
+    for poles in (bessel(4, 0.3), niazi(1), (-0.5, -2 + 1j, -2 - 1j)):
+        dynamics = realised(poles, 1)
+        found = np.sort_complex(np.linalg.eigvals(dynamics.A))
+        np.testing.assert_allclose(found, np.sort_complex(np.array(poles)), atol=1e-9)
+        rest = at_rest(dynamics, "output")
+        np.testing.assert_allclose(dynamics.A @ rest + dynamics.B, 0, atol=1e-12)
+    cutoff = bessel(3, 0.7)
+    frequencies = 1j * 2 * np.pi * 0.7
+    gain = np.prod(np.array(cutoff)) / np.prod(frequencies - np.array(cutoff))
+    assert abs(gain) == pytest.approx(2**-0.5, rel=1e-6)  # −3 dB there
+
+
+def test_discrete_time_is_the_euler_step():
+    dynamics = realised((-1.0, -2.0), 1, "discrete")
+    y = np.random.default_rng(0).standard_normal((3, 1, 1))
+    z = dynamics.filtered(np.array([0.0, 0.1, 0.3]), y)
+    expected = 0.1 * dynamics.B @ y[0, 0]
+    np.testing.assert_allclose(z[1, 0], expected)
+    expected = expected + 0.2 * (dynamics.A @ expected + dynamics.B @ y[1, 0])
+    np.testing.assert_allclose(z[2, 0], expected)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: realised((-1.0, 0.5), 1), "A_z is not Hurwitz: .* real part 0.5"),
+        (lambda: realised((-1.0, -1.0, -2.0), 1), "not controllable at the pole -1.* repeated"),
+        (lambda: realised((-1.0, -1 + 2j), 1), "conjugate pairs"),
+        (lambda: realised((-1.0, math.nan), 1), "expected finite"),
+        (
+            lambda: realised((-1.0, -30.0), 1, "discrete").step(0.1),
+            r"not Schur in discrete time: .* of size 2",
+        ),
+        (lambda: enough(2, 2, 1), r"n_z=2 .*expected at least nx \+ 1 = 3"),
+        (lambda: Dynamics(np.diag([-1.0, -2.0]), np.array([[1.0], [0.0]])), "not controllable"),
+    ],
+)
+def test_what_gives_no_observer_is_told(make, message):
+    with pytest.raises(ValueError, match=message) as told:
+        make()
+    assert "\n" not in str(told.value)
+
+
+def test_noise_in_z_has_the_covariance_of_the_filter():
+    dynamics = realised((-1.0, -3.0), 1)
+    t, kept = 0.1 * np.arange(150), np.array([149])
+    rest = at_rest(dynamics, "output")
+    rng = np.random.default_rng(0)
+    noise = noise_in_z(dynamics, t, np.array([0.5]), kept, 20_000, rng, rest)[0]
+    flow, before, now = dynamics.step(0.1)
+    # z and the last sample together are a Markov chain.
+    F = np.block([[flow, before], [np.zeros((1, 3))]])
+    G = np.concatenate([now, np.ones((1, 1))])
+    expected = solve_discrete_lyapunov(F, 0.25 * G @ G.T)[:2, :2]
+    np.testing.assert_allclose(np.cov(noise.T), expected, rtol=0.05)
+
+
+# --- labels
+
+
+@pytest.mark.parametrize("poles", [(-1.0, -2.0, -4.0), (-3.0, -2 + 1j, -2 - 1j)])
+def test_labels_are_those_of_sylvesters_equation(poles):
+    dynamics = realised(poles, 2)
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    z, stays = steady(Linear(), dynamics, x, 0.1)
+    assert stays.all()
+    M = linear_T(dynamics)
+    np.testing.assert_allclose(z, x @ M.T, atol=1e-5)  # e⁻¹⁶ is left of where z began
+    rate = x @ PLANT.T @ M.T - x @ M.T @ dynamics.A.T - x @ H.T @ dynamics.B.T
+    np.testing.assert_allclose(rate, 0, atol=1e-12)
+
+
+def test_labels_in_discrete_time_are_those_of_its_own_equation():
+    dynamics = realised((-1.0, -2.0, -4.0), 2, "discrete")
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    z, _ = steady(Linear(), dynamics, x, 0.1)
+    step, flow = expm(0.1 * PLANT), np.eye(6) + 0.1 * dynamics.A
+    M = np.linalg.solve(
+        np.kron(step.T, np.eye(6)) - np.kron(np.eye(2), flow),
+        (0.1 * dynamics.B @ H).T.ravel(),
+    ).reshape(2, 6)
+    np.testing.assert_allclose(z, x @ M, atol=1e-5)
+
+
+@pytest.mark.parametrize("start", ["output", "zero", "prior"])
+def test_episodes_satisfy_T_and_forget_how_z_began(start):
+    dynamics, t = realised((-1.0, -2.0, -4.0), 2), 0.01 * np.arange(800)
+    x0 = np.random.default_rng(0).uniform(-1, 1, (4, 2))
+    kept, xhat0 = np.array([0, 5, 799]), np.array([[0.3, 0.1]])
+    found = simulated(Linear(), dynamics, t, x0, kept, start, xhat0)
+    M = linear_T(dynamics)
+    np.testing.assert_allclose(found.T, found.x @ M.T, atol=5e-4)
+    begins = {"output": x0 @ H.T @ at_rest(dynamics, "output").T, "zero": 0, "prior": xhat0 @ M.T}
+    np.testing.assert_allclose(found.z[0], begins[start] + 0 * found.z[0], atol=2e-4)
+    left = np.einsum("kij,bj->kbi", found.flow, found.z[0] - found.T[0])
+    np.testing.assert_allclose(found.z - found.T, left, atol=1e-9)
+    np.testing.assert_allclose(found.x, truth(Linear(), x0, t)[kept], atol=1e-9)
+
+
+class Cubic(System):
+    """ẋ = −x³ + x runs to infinity backward in finite time from abs x > 1."""
+
+    state_names = ("x",)
+    output_names = ("y",)
+    scale = (1.0,)
+    setups = {"benchmark": Setup((-1.0,), (1.0,), (0.0,), (1.0,), duration=5.0, dt=0.05)}
+
+    def f(self, t, x, u):
+        return stack(x, x[..., 0] - x[..., 0] ** 3)
+
+    def h(self, x):
+        return x
+
+
+def test_escaping_samples_are_dropped_counted_and_refused_if_many():
+    dynamics, t = realised((-1.0, -2.0), 1), 0.05 * np.arange(50)
+    x0 = np.append(np.linspace(-0.9, 0.9, 19), 2.0)[:, None]
+    found = simulated(Cubic(), dynamics, t, x0, np.arange(50))
+    assert (found.dropped, found.drawn, found.x.shape[1]) == (1, 20, 19)
+    config = trainer("kkl_supervised").Config(
+        low=(-1.05,), high=(1.05,), **{**SMALL, "iterations": 3, "cutoff": 0.5}
+    )
+    t = 0.05 * np.arange(50)
+    prior = Prior(np.zeros((1, 1)), np.eye(1)[None])
+    record = Record(t, np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), prior)
+    with pytest.warns(UserWarning, match=r"of 100 initial states of Cubic escape .* left out"):
+        trained = trainer("kkl_supervised").train(Cubic(), config, record=record)
+    assert 0 < trained.facts["dropped"] <= 10
+    assert trained.facts["drawn"] == 100
+    x0 = np.linspace(-2, 2, 20)[:, None]
+    with pytest.raises(ValueError, match=r"10 of 20 initial states of Cubic escape .* at most 10%"):
+        simulated(Cubic(), dynamics, t, x0, np.arange(50))
+
+
+def test_initial_states_fill_the_set():
+    system = SYSTEMS.resolve("Satellite")()
+    x0 = initial_states(system, None, None, 200, 0)
+    assert system.admissible(x0).all()
+    assert (x0[:, 2] > 0).all()  # its declared half
+    box = initial_states(system, (-1, -1, 0), (1, 1, 2), 50, 0)
+    hit = np.sort((box[:, 0] + 1) * 25).astype(int)
+    assert (hit == np.arange(50)).all()  # one in each fiftieth
+    with pytest.raises(ValueError, match="low at most high"):
+        initial_states(system, (1, 1, 1), (0, 0, 0), 5, 0)
+    with pytest.raises(ValueError, match="of 500 states of the box 0 are admissible"):
+        initial_states(NoStates(), None, None, 5, 0)
+
+
+class NoStates(Cubic):
+    def admissible(self, x0):
+        return np.zeros(x0.shape[:-1], dtype=bool)
+
+
+def test_the_frequency_is_that_of_a_sine():
+    class Spring(Linear):
+        def f(self, t, x, u):
+            return stack(x, 3.0 * x[..., 1], -3.0 * x[..., 0])
+
+        setups = {"benchmark": replace(Linear.setups["benchmark"], duration=20.0, dt=0.01)}
+
+    assert frequency(Spring()) == pytest.approx(3 / (2 * np.pi), rel=0.02)
+
+
+@pytest.mark.parametrize("gap", [0, 7])
+def test_kept_samples(gap):
+    kept = kept_samples(200, 0, 40, gap, np.random.default_rng(0))
+    assert kept[0] == 0
+    assert kept[-1] == 199
+    assert (np.diff(kept) > 0).all()
+    if gap:
+        assert sum(k + gap in kept for k in kept) >= 20
+    late = kept_samples(200, 120, 1000, gap, np.random.default_rng(0))
+    assert late[0] == 120
+
+
+# --- networks and their fit
+
+
+def a_network(activation="tanh", seed=0):
+    rng = np.random.default_rng(seed)
+    scalings = [Scaling.white(rng.normal(2, 3, (50, n)), np.zeros((1, n))) for n in (3, 2)]
+    return Mlp(*scalings, 2, 7, activation, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu", "relu"])
+def test_derivatives_of_the_network(activation):
+    net = a_network(activation)
+    rng = np.random.default_rng(1)
+    a, da = (torch.tensor(rng.standard_normal((4, 3))) for _ in range(2))
+    out, J = net.jacobian(a)
+    torch.testing.assert_close(out, net(a))
+    for row in range(4):
+        for i in range(2):
+            expected = torch.autograd.grad(net(a)[row, i], net.parameters)
+            flat = torch.cat([g.reshape(-1) for g in expected])
+            torch.testing.assert_close(J[row, i], flat)
+    h = 1e-6
+    rate = (net(a + h * da) - net(a - h * da)) / (2 * h)
+    torch.testing.assert_close(net.tangent(a, da)[1], rate, atol=1e-7, rtol=1e-6)
+    slope = (net.jacobian(a + h * da)[1] - net.jacobian(a - h * da)[1]) / (2 * h)
+    torch.testing.assert_close(net.tangent_jacobian(a, da)[1][1], slope, atol=1e-7, rtol=1e-6)
+
+
+def test_a_tangent_keeps_its_gradient():
+    net = a_network()
+    a, da = torch.ones(2, 3, dtype=torch.float64), torch.ones(2, 3, dtype=torch.float64)
+    equations = Equations([Term(a, along=da)], torch.zeros(2, 2, dtype=torch.float64))
+    found = torch.autograd.grad(equations.residual(net).square().sum(), net.parameters[0])[0]
+    residual, J = equations.linearised(net)
+    expected = 2 * torch.einsum("bo,bop->p", residual, J)[:21].reshape(7, 3)
+    assert found.abs().max() > 1e-3
+    torch.testing.assert_close(found, expected)
+
+
+def test_numpy_computes_what_torch_does():
+    net = a_network("silu")
+    a = np.random.default_rng(1).normal(2, 3, (5, 3))
+    scaled = torch.tensor(net.inputs.scaled(a))
+    expected = net(scaled).detach().numpy() @ net.outputs.root.T + net.outputs.mean
+    np.testing.assert_allclose(evaluate(net.layers(), "silu", a), expected, atol=1e-12)
+
+
+def test_gauss_newton_solves_a_regression():
+    rng = np.random.default_rng(1)
+    a = torch.tensor(rng.standard_normal((300, 3)))
+    target = torch.stack([torch.sin(a[:, 0]) * a[:, 1], a[:, 2] ** 2], dim=-1)
+
+    def draw(generator):
+        rows = torch.randint(300, (100,), generator=generator)
+        return [Equations([Term(a[rows])], target[rows])]
+
+    def error(method, rate):
+        fit = Fit(a_network(), draw, method, rate, torch.Generator().manual_seed(0))
+        for k in range(150):
+            fit.step(k / 150)
+        return float((fit.net(a) - target).square().mean().detach())
+
+    newton = error("gauss_newton", 0.5)
+    assert newton < 2e-3
+    assert newton < 0.1 * error("adam", 3e-3)
+
+
+# --- trainings
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_T_of_a_linear_system_is_sylvesters(name):
+    settings = {"transient": False, "start": "zero", "iterations": 150, "share": 1.0}
+    trained = trained_on_linear(name, **settings)
+    M = linear_T(trained.dynamics)
+    x = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    x = truth(Linear(), x, np.array([0.0, 2.0]))[-1]  # where episodes are found late
+    expected = x @ M.T
+    assert abs(trained.T(x) - expected).max() < 0.05 * abs(expected).max()
+    record = linear_record(4)
+    assert record.num_samples > 5
+    xhat = trained.inverse(expected, 50.0, np.zeros(0))
+    assert abs(xhat - x).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "system"),
+    [*((name, "ReverseDuffing") for name in TRAINERS), ("kkl_supervised", "InductionMotor")],
+)
+def test_they_estimate_and_conform(name, system, tmp_path):
+    trained, plant, setup, _ = trained_on(name, system, iterations=20)
+    observer = ESTIMATORS.resolve(name)(plant, setup.noise_std, trained=trained)
+    for check in ESTIMATOR_CHECKS.values():
+        check(observer)
+    path = tmp_path / "trained.pt"
+    observer.save(path)
+    again = type(observer).load(path, plant)
+    assert again.training == observer.training
+    assert asdict(again.trained.clock) == asdict(trained.clock)
+    _, _, record = record_of(f"pinnobs/{system}-v0", "benchmark", "nominal", 10**6 + 5, 3)
+    np.testing.assert_array_equal(again.run(record).xhat, observer.run(record).xhat)
+
+
+def test_it_is_exact_where_it_was_trained():
+    """An observer of few seconds' training is far better than its prior."""
+    trained, plant, setup, _ = trained_on("kkl_supervised", iterations=150, width=16)
+    observer = KKLSupervised(plant, setup.noise_std, trained=trained)
+    source, _, record = record_of("pinnobs/ReverseDuffing-v0", "benchmark", "nominal", 10**6 + 5, 8)
+    xhat = observer.run(record).xhat
+    error = xhat[..., :1] - record.y
+    assert np.sqrt((error[:, 500:] ** 2).mean()) < 0.06  # 0.02 of it is the output's noise
+    assert source.nx == 2
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+@pytest.mark.parametrize("system", ["ReverseDuffing", "InductionMotor"])
+def test_the_faithful_preset_trains(name, system):
+    settings = {"preset": "faithful", "iterations": 30, "depth": 2, "batch": 100}
+    if system == "InductionMotor":
+        settings |= {"mode": "continuous"}
+    trained, plant, _, record = trained_on(name, system, **settings)
+    assert trained.start == "zero"
+    assert math.isfinite(trained.loss)
+    xhat = ESTIMATORS.resolve(name)(plant, trained=trained).run(record).xhat
+    assert np.isfinite(xhat).all()
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_the_same_seed_gives_the_same_weights_and_resuming_is_exact(name, tmp_path, monkeypatch):
+    module = trainer(name)
+    system, setup, record = record_of("pinnobs/ReverseDuffing-v0", "benchmark", "nominal", 10**6)
+    config = module.Config(**{**SMALL, "iterations": 40, "checkpoint_every": 10})
+    arguments = {"record": record, "noise_std": setup.noise_std}
+    whole = module.train(system, config, **arguments)
+    steps = {"kkl_supervised": 30, "kkl_autoencoder": 20, "kkl_pinn": 41}[name]  # T*, T, T*
+    original = Run.step
+    made = []
+
+    def step(run):
+        if len(made) == steps:
+            raise KeyboardInterrupt
+        made.append(1)
+        original(run)
+
+    monkeypatch.setattr(Run, "step", step)
+    path = tmp_path / "checkpoint.pt"
+    part = module.train(system, config, checkpoint=path, **arguments)
+    assert part.iterations < whole.iterations
+    monkeypatch.setattr(Run, "step", original)
+    resumed = module.train(system, config, checkpoint=path, resume=True, **arguments)
+    for name in ("encoder", "decoder"):
+        for layer, other in zip(getattr(whole, name), getattr(resumed, name), strict=True):
+            for a, b in zip(layer, other, strict=True):
+                np.testing.assert_array_equal(a, b)
+    assert resumed.iterations == whole.iterations
+    other = replace(config, seed=1)
+    with pytest.raises(ValueError, match=r"trained with seed=0; expected 1"):
+        module.train(system, other, checkpoint=path, resume=True, **arguments)
+    with pytest.raises(ValueError, match="resume=True without a checkpoint"):
+        module.train(system, config, resume=True, **arguments)
+
+
+def test_a_budget_ends_the_cosine_and_the_training():
+    trained, *_ = trained_on("kkl_supervised", iterations=10**6, budget=2.0)
+    assert trained.seconds < 6
+
+
+def test_the_response_to_a_window_is_that_of_the_filter():
+    dynamics = realised((-0.7, -3.0), 1)
+    y = np.random.default_rng(0).standard_normal((9, 1, 1))
+    z = dynamics.filtered(0.2 * np.arange(9), y)[-1, 0]
+    weights = _response(torch.log(torch.tensor([0.7, 3.0], dtype=torch.float64)), 0.2, 8)
+    np.testing.assert_allclose(weights.numpy() @ y[:, 0, 0], z, atol=1e-12)
+
+
+def test_learned_poles_are_stable_and_new():
+    start = (-0.5, -1.5, -4.0)
+    short = {"design": "learned", "iterations": 5}
+    with pytest.raises(ValueError, match="A_z is not Hurwitz"):
+        trained_on("kkl_supervised", poles=(-1.0, 2.0, -3.0), **short)
+    trained, *_ = trained_on("kkl_supervised", poles=start, **short)
+    found = np.sort(np.linalg.eigvals(trained.A).real)[::-1]
+    assert (found < 0).all()
+    assert abs(found - start).max() > 1e-3
+
+
+def test_the_sweep_chooses_a_cutoff_and_draws_its_curve():
+    short = {"iterations": 15, "width": 8, "part": 0.2}
+    trained, plant, _, record = trained_on("kkl_supervised", sweep="cutoff", **short)
+    points = trained.facts["sweep"]
+    chosen = min(points, key=lambda point: point["loss"])
+    assert trained.config["cutoff"] == chosen["cutoff"]
+    assert len(points) == 7
+    assert points[-1]["noise_gain"] > 2 * points[3]["noise_gain"]  # faster filters pass more
+    drawn = trainer("kkl_supervised").figures(plant, trained, record)
+    assert set(drawn) == {"radius", "error", "maps", "sweep"}
+    driven, plant, _, record = trained_on("kkl_supervised", "InductionMotor", **short)
+    assert set(trainer("kkl_supervised").figures(plant, driven, record)) == {"radius"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"preset": "best"}, "preset='best'; expected default or faithful"),
+        ({"cutoff": -1.0}, "cutoff=-1.0; expected None or positive Hz"),
+        ({"design": "poles"}, "poles=.*for design='poles'"),
+        ({"low": (0.0, 0.0)}, "expected both corners or none"),
+        ({"order": 2}, r"n_z=2 .*expected at least nx \+ 1 = 3"),
+        ({"design": "poles", "poles": (-1.0, -1.0, -2.0)}, "not controllable at the pole"),
+        ({"design": "poles", "poles": (-1.0, 1.0, -2.0)}, "A_z is not Hurwitz"),
+        (
+            {"design": "poles", "poles": (-1.0, -2.0, -300.0), "mode": "discrete"},
+            "not Schur in discrete time",
+        ),
+        ({"low": (1.0, 1.0), "high": (-1.0, 2.0)}, "low at most high"),
+        ({"method": "sgd"}, "method='sgd'; expected gauss_newton, adam"),
+    ],
+)
+def test_bad_settings_are_one_line(settings, message):
+    with pytest.raises(ValueError, match=message) as told:
+        trained_on("kkl_supervised", **settings)
+    assert "\n" not in str(told.value)
+
+
+def test_a_file_of_another_system_or_trainer_is_refused(tmp_path):
+    trained, plant, *_ = trained_on("kkl_supervised", iterations=5)
+    path = tmp_path / "trained.pt"
+    trained.save(path)
+    with pytest.raises(ValueError, match="trained with system='ReverseDuffing'; expected 'Acad"):
+        KKLSupervised.load(path, SYSTEMS.resolve("Academic")())
+    with pytest.raises(ValueError, match="trainer='kkl_supervised'; expected 'kkl_pinn'"):
+        ESTIMATORS.resolve("kkl_pinn").load(path, plant)
+    motor, machine, *_ = trained_on("kkl_supervised", "InductionMotor", iterations=5)
+    motor.save(path)
+    with pytest.raises(ValueError, match=r"trained with R_r=0\.15; expected 0\.3"):
+        KKLSupervised.load(path, replace(machine, R_r=0.3))
+    path.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="damaged or no file"):
+        KKLSupervised.load(path, machine)
+
+
+def test_a_measured_input_is_refused():
+    module = trainer("kkl_supervised")
+    system, _, record = record_of("pinnobs/InductionMotor-v0", "benchmark", "nominal", 10**6)
+    with pytest.raises(ValueError, match="InductionMotor has a measured input"):
+        module.train(replace(system, measured_input=True), module.Config(), record=record)
+    short = Record(record.t[:5], record.y[:, :5], record.u[:, :5], record.prior)
+    with pytest.raises(ValueError, match="the record has 5 samples"):
+        module.train(system, module.Config(), record=short)

@@ -1,0 +1,190 @@
+"""Fitting one network to equations that are linear in what it returns."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from pinnobs_gym.estimation.learned.kkl_maps import Mlp
+
+Method: TypeAlias = Literal["gauss_newton", "adam"]
+
+AVERAGE = 0.9
+"""Weight of the past in the averaged Gauss-Newton matrix."""
+LAST_STEP = 0.01
+"""The last step over the first; between them it falls as a half cosine."""
+_TRIALS = 6
+"""Dampings tried before a batch is given up."""
+_LEAST_DAMPING, _FIRST_DAMPING = 1e-4, 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """M·N(a), or M·(∂N/∂a)·da, of a network N at scaled inputs."""
+
+    a: Tensor
+    """Shape (batch, num_inputs)."""
+    matrix: Tensor | None = None
+    """M, (num_outputs, num_outputs) or one for each row; None for the identity."""
+    along: Tensor | None = None
+    """da, shape of a; None for N itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """weight·(Σ terms − target) = 0, in scaled outputs."""
+
+    terms: Sequence[Term]
+    target: Tensor
+    """Shape (batch, num_outputs)."""
+    weight: Tensor | float = 1.0
+    """A number, or one for each row, (batch, 1)."""
+
+    def residual(self, net: Mlp) -> Tensor:
+        """Shape (batch, num_outputs), with its gradient."""
+        total = -self.target
+        for term in self.terms:
+            value = net(term.a) if term.along is None else net.tangent(term.a, term.along)[1]
+            total = total + (value if term.matrix is None else _times(term.matrix, value))
+        return self.weight * total
+
+    def linearised(self, net: Mlp) -> tuple[Tensor, Tensor]:
+        """The residual, and its Jacobian (batch, num_outputs, num_parameters)."""
+        total, J = -self.target, None
+        for term in self.terms:
+            if term.along is None:
+                value, slope = net.jacobian(term.a)
+            else:
+                value, slope = net.tangent_jacobian(term.a, term.along)[1]
+            if term.matrix is not None:
+                value, slope = _times(term.matrix, value), term.matrix @ slope
+            total, J = total + value, slope if J is None else J + slope
+        assert J is not None
+        weight = self.weight[..., None] if isinstance(self.weight, Tensor) else self.weight
+        return self.weight * total, weight * J
+
+
+def _times(matrix: Tensor, values: Tensor) -> Tensor:
+    return (matrix @ values[..., None])[..., 0]
+
+
+Objective: TypeAlias = Callable[[torch.Generator], Sequence[Equations]]
+"""Draws the equations of a step."""
+
+
+class Fit:
+    """One network's training, step by step.
+
+    ``gauss_newton`` solves (H + μI)s = g with the batch's gradient g and a moving average H of the
+    batches' JᵀJ; the step is shortened as a half cosine over the training, which averages what the
+    batches differ in. μ follows Marquardt's rule. ``adam`` has the same schedule.
+
+    Args:
+        net: trained in place.
+        objective: what it is fitted to.
+        method: how.
+        learning_rate: the first step.
+        generator: where batches are drawn from.
+    """
+
+    def __init__(
+        self,
+        net: Mlp,
+        objective: Objective,
+        method: Method,
+        learning_rate: float,
+        generator: torch.Generator,
+    ) -> None:
+        self.net, self.objective, self.method = net, objective, method
+        self.generator, self.learning_rate = generator, learning_rate
+        self.iteration, self.loss = 0, math.nan
+        self._H: Tensor | None = None
+        self._damping = _FIRST_DAMPING
+        self._adam = torch.optim.Adam(net.parameters, learning_rate)
+
+    def step(self, progress: float) -> None:
+        """One step, at a part of the training between 0 and 1."""
+        shape = LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+        length = self.learning_rate * shape
+        equations = self.objective(self.generator)
+        if self.method == "adam":
+            self._adam_step(equations, length)
+        else:
+            self._newton_step(equations, length)
+        self.iteration += 1
+
+    def _adam_step(self, equations: Sequence[Equations], length: float) -> None:
+        residuals = [e.residual(self.net) for e in equations]
+        loss = torch.stack([r.square().mean() for r in residuals]).sum()
+        self.loss = loss.item()
+        for group in self._adam.param_groups:
+            group["lr"] = length
+        self._adam.zero_grad()
+        if math.isfinite(self.loss):
+            loss.backward()
+            self._adam.step()
+
+    def _newton_step(self, equations: Sequence[Equations], length: float) -> None:
+        with torch.no_grad():
+            H, g, self.loss = 0.0, 0.0, 0.0
+            for each in equations:
+                residual, J = each.linearised(self.net)
+                flat, rows = residual.reshape(-1), J.reshape(-1, J.shape[-1])
+                H, g = H + rows.T @ rows / len(flat), g + rows.T @ flat / len(flat)
+                self.loss += float(flat @ flat) / len(flat)
+            assert isinstance(H, Tensor)
+            assert isinstance(g, Tensor)
+            if not math.isfinite(self.loss):
+                return
+            if self._H is not None:
+                past = AVERAGE * min(1.0, self.iteration / (self.iteration + 10.0))
+                H = past * self._H + (1 - past) * H
+            self._H = H
+            before = [p.clone() for p in self.net.parameters]
+            for _ in range(_TRIALS):
+                damped = H.clone()
+                damped.diagonal().add_(self._damping * self.loss)
+                factor, failed = torch.linalg.cholesky_ex(damped)
+                if not failed:
+                    self._move(length * torch.cholesky_solve(g[:, None], factor)[:, 0])
+                    tried = [e.residual(self.net) for e in equations]
+                    if sum(float(r.square().mean()) for r in tried) < self.loss:
+                        self._damping = max(self._damping / 2, _LEAST_DAMPING)
+                        return
+                self._damping *= 4
+                for p, old in zip(self.net.parameters, before, strict=True):
+                    p.copy_(old)
+
+    def _move(self, step: Tensor) -> None:
+        start = 0
+        for p in self.net.parameters:
+            p.sub_(step[start : start + p.numel()].view_as(p))
+            start += p.numel()
+
+    def state(self) -> dict[str, Any]:
+        """All that changes, as tensors and plain values."""
+        return {
+            "iteration": self.iteration,
+            "damping": self._damping,
+            "H": self._H,
+            "parameters": [p.detach().clone() for p in self.net.parameters],
+            "adam": copy.deepcopy(self._adam.state_dict()),
+            "generator": self.generator.get_state(),
+        }
+
+    def take_up(self, state: dict[str, Any]) -> None:
+        """Go on exactly from what `state` gave."""
+        self.iteration, self._damping = state["iteration"], state["damping"]
+        device = self.net.parameters[0].device
+        self._H = None if state["H"] is None else state["H"].to(device)
+        with torch.no_grad():
+            for p, kept in zip(self.net.parameters, state["parameters"], strict=True):
+                p.copy_(kept)
+        self._adam.load_state_dict(state["adam"])
+        self.generator.set_state(state["generator"].cpu())

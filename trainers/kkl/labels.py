@@ -1,0 +1,279 @@
+"""States of simulated episodes and the z that goes with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from pinnobs_gym.estimation.learned.kkl_dynamics import Dynamics, Start, at_rest
+from pinnobs_gym.simulation.system import Array, System, vector
+from pinnobs_gym.simulation.truth import truth
+
+SETTLED = 16.0
+"""How long x is integrated backward, over z's slowest time constant: e⁻¹⁶ of z(−t_c) is left, where
+the papers' 10 leave enough to be the largest error of a good fit."""
+MOST_ESCAPED = 0.1
+"""Largest part of the initial states that may be dropped."""
+FAR = 1e3
+"""Size of a state, over its scale, from which on it has escaped."""
+_DRAWS = 100
+"""Latin hypercubes without enough admissible states before the initial set is taken as empty."""
+
+
+@dataclass(frozen=True)
+class _Reversed(System):
+    """A plant run backward in time."""
+
+    plant: System = field(kw_only=True)
+
+    @property
+    def state_names(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.plant.state_names
+
+    @property
+    def output_names(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.plant.output_names
+
+    @property
+    def scale(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.plant.scale
+
+    @property
+    def setups(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.plant.setups
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        return -self.plant.f(-t, x, u)
+
+    def h(self, x: Array) -> Array:
+        return self.plant.h(x)
+
+
+@dataclass(frozen=True)
+class _Joint(System):
+    """A plant and the z that its output drives, as one system of state (x, z)."""
+
+    plant: System = field(kw_only=True)
+    dynamics: Dynamics = field(kw_only=True)
+
+    @property
+    def state_names(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (*self.plant.state_names, *map(str, range(self.dynamics.size)))
+
+    @property
+    def output_names(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.plant.output_names
+
+    @property
+    def scale(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (*self.plant.scale, *np.ones(self.dynamics.size))
+
+    @property
+    def setups(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.plant.setups
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        nx = self.plant.nx
+        state, z = x[..., :nx], x[..., nx:]
+        rate = z @ self.dynamics.A.T + self.plant.h(state) @ self.dynamics.B.T
+        return np.concatenate([self.plant.f(t, state, u), rate], axis=-1)
+
+    def h(self, x: Array) -> Array:
+        return self.plant.h(x[..., : self.plant.nx])
+
+
+def steady(
+    system: System, dynamics: Dynamics, x: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """T(x) of an autonomous plant: x is integrated backward for `SETTLED` of z's slowest time
+    constants, then (x, z) jointly forward from z = 0.
+
+    Args:
+        system: the plant.
+        dynamics: of z; in discrete time z is driven by the output's samples.
+        x: states, shape (batch, nx).
+        h: time between samples in s, for discrete time.
+
+    Returns:
+        z (batch, nz), not a number where x escapes, and which do not: bool (batch,).
+    """
+    duration = float(np.ceil(SETTLED / dynamics.slowest / h) * h)
+    stays = ~_escapes(system, x, duration)
+    z = np.full((len(x), dynamics.size), np.nan)
+    if not stays.any():
+        return z, stays
+    step = system.setups["benchmark"].truth_step
+    backward = _Reversed(plant=system)
+    if dynamics.mode == "discrete":
+        t = np.arange(round(duration / h) + 1) * h
+        path = truth(backward, x[stays], t, step)[::-1]
+        z[stays] = dynamics.filtered(t, system.h(path))[-1]
+        return z, stays
+    start = truth(backward, x[stays], np.array([0.0, duration]), step)[-1]
+    begin = np.concatenate([start, np.zeros((len(start), dynamics.size))], axis=1)
+    joint = _Joint(plant=system, dynamics=dynamics)
+    z[stays] = truth(joint, begin, np.array([-duration, 0.0]), step)[-1, :, system.nx :]
+    return z, stays
+
+
+def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
+    """Which states (batch, nx) leave for good on the way back."""
+    step = system.setups["benchmark"].truth_step or duration / 100
+    steps = int(np.ceil(2 * duration / step))
+    h, u = -duration / steps, np.zeros(system.nu)
+    t, now = np.zeros(()), np.asarray(x, dtype=float)
+    scale = vector(system.scale, system.nx, "scale")
+    away = np.zeros(len(x), dtype=bool)
+    with np.errstate(all="ignore"):
+        for _ in range(steps):
+            k1 = system.f(t, now, u)
+            k2 = system.f(t, now + h / 2 * k1, u)
+            k3 = system.f(t, now + h / 2 * k2, u)
+            now = now + h / 6 * (k1 + 2 * (k2 + k3) + system.f(t, now + h * k3, u))
+            away |= ~(abs(now) < FAR * scale).all(axis=-1)
+            now = np.where(away[:, None], x, now)
+    return away
+
+
+def frequency(system: System) -> float:
+    """How fast the outputs of the benchmark's episodes change: the root mean square of their rate
+    over that of their departures from the mean, in Hz."""
+    setup = system.setups["benchmark"]
+    x0 = initial_states(system, None, None, 20, seed=0)
+    y = system.h(truth(system, x0, setup.times, setup.truth_step))
+    rate = (np.diff(y, axis=0) ** 2).mean() / setup.dt**2
+    spread = ((y - y.mean(axis=(0, 1))) ** 2).mean()
+    return float(np.sqrt(rate / spread) / (2 * np.pi)) if spread > 0 else 0.0
+
+
+def initial_states(
+    system: System,
+    low: Sequence[float] | None,
+    high: Sequence[float] | None,
+    count: int,
+    seed: int,
+) -> np.ndarray:
+    """States (count, nx) of a Latin hypercube over a box or, without one, over the benchmark's,
+    less those that are not admissible.
+
+    Raises:
+        ValueError: in one line, if the box is none or has hardly any admissible states.
+    """
+    setup = system.setups["benchmark"]
+    own = low is None or high is None
+    lower = vector(setup.x0_low if low is None else low, system.nx, "low")
+    upper = vector(setup.x0_high if high is None else high, system.nx, "high")
+    if not (np.isfinite([lower, upper]).all() and (lower <= upper).all()):
+        raise ValueError(f"low={low}, high={high}; expected finite corners, low at most high")
+    cube = qmc.LatinHypercube(system.nx, rng=np.random.default_rng(seed))
+    found = np.empty((0, system.nx))
+    for _ in range(_DRAWS):
+        x0 = lower + (upper - lower) * cube.random(count)
+        found = np.concatenate([found, x0[system.admissible(x0)] if own else x0])
+        if len(found) >= count:
+            return found[:count]
+    raise ValueError(
+        f"{type(system).__name__}: of {_DRAWS * count} states of the box {len(found)} are "
+        f"admissible; expected {count}"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Simulated episodes at some of their samples."""
+
+    t: np.ndarray
+    """Time since the first sample, in s, shape (kept,)."""
+    u: np.ndarray
+    """Inputs, shape (kept, nu)."""
+    x: np.ndarray
+    """States, shape (kept, batch, nx)."""
+    z: np.ndarray
+    """z as it occurs online, driven by noise-free samples of y, shape (kept, batch, nz)."""
+    x0: np.ndarray
+    """Initial states, shape (batch, nx)."""
+    flow: np.ndarray
+    """Φ from the first sample on, (kept, nz, nz)."""
+    T: np.ndarray | None
+    """T(x) along the episodes, (kept, batch, nz): z from T(x₀) at the first. None if driven."""
+    dropped: int
+    """Initial states that escaped backward."""
+    drawn: int
+    """Initial states drawn."""
+
+
+def simulated(
+    system: System,
+    dynamics: Dynamics,
+    t: np.ndarray,
+    x0: np.ndarray,
+    kept: np.ndarray,
+    start: Start = "zero",
+    xhat0: np.ndarray | None = None,
+) -> Episodes:
+    """Simulate episodes from x0 (batch, nx) on the sample times t (num_samples,) in s; of the
+    samples ``kept`` (kept,) are returned. z begins as ``start`` says, x̂₀ (1, nx) being the prior's.
+
+    A plant with inputs is driven by u(t) from the first sample on, and T(t, x) begins there at
+    what z begins with (Bernard & Andrieu 2019): nothing is integrated backward.
+
+    Raises:
+        ValueError: in one line, if over `MOST_ESCAPED` of the initial states escape backward.
+    """
+    driven, drawn = system.nu > 0, len(x0)
+    T0, h = None, float(np.diff(t).mean())
+    if not driven:
+        T0, stays = steady(system, dynamics, x0, h)
+        escaped = drawn - int(stays.sum())
+        if escaped > MOST_ESCAPED * drawn:
+            raise ValueError(
+                f"{escaped} of {drawn} initial states of {type(system).__name__} escape when "
+                f"integrated backward for {SETTLED / dynamics.slowest:.3g} s; expected at most "
+                f"{MOST_ESCAPED:.0%}: take faster poles, or a smaller box"
+            )
+        x0, T0 = x0[stays], T0[stays]
+    z0 = system.h(x0) @ at_rest(dynamics, start).T
+    if start == "prior" and not driven:
+        assert xhat0 is not None
+        z0 = z0 + steady(system, dynamics, xhat0, h)[0]
+    setup = system.setups["benchmark"]
+    x = np.empty((len(kept), len(x0), system.nx))
+    z = np.empty((len(kept), len(x0), dynamics.size))
+    T = None if T0 is None else np.empty_like(z)
+    for first in range(0, len(x0), _AT_ONCE):  # whole paths of all would take too much memory
+        rows = slice(first, first + _AT_ONCE)
+        path = truth(system, x0[rows], t, setup.truth_step)
+        y = system.h(path)
+        x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows])[kept]
+        if T is not None and T0 is not None:
+            T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
+    u = np.asarray(system.input(t))[kept]
+    flow = dynamics.flows(t)[kept]
+    return Episodes(t[kept] - t[0], u, x, z, x0, flow, T, drawn - len(x0), drawn)
+
+
+_AT_ONCE = 256
+"""Episodes whose whole paths are held at a time."""
+
+
+def noise_in_z(
+    dynamics: Dynamics,
+    t: np.ndarray,
+    std: np.ndarray,
+    kept: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
+    rest: np.ndarray,
+) -> np.ndarray:
+    """What white noise of standard deviations (ny,) in the samples of y adds to z: draws
+    (kept, count, nz). z is linear in y: they can be added to any episode's. z begins at rest·y₀."""
+    out = np.empty((len(kept), count, dynamics.size))
+    for start in range(0, count, _AT_ONCE):
+        rows = min(_AT_ONCE, count - start)
+        noise = rng.standard_normal((len(t), rows, len(std))) * std
+        out[:, start : start + rows] = dynamics.filtered(t, noise, noise[0] @ rest.T)[kept]
+    return out

@@ -1,0 +1,206 @@
+"""Pictures of a trained KKL observer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
+from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.truth import truth
+from trainers.kkl.labels import initial_states, steady
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GRID = 51
+"""Points along each side of a map."""
+RADII = np.linspace(0.1, 2.0, 14)
+"""Sizes of initial states, over that of the training set's edge."""
+_RAYS = 12
+_FLOOR = 1e-6
+"""Least error that is shown."""
+
+
+def figures(system: System, trained: TrainedKKL, record: Record) -> dict[str, Figure]:
+    """All pictures by name: ``error`` over the state space, error against initial ``radius``, the
+    ``maps`` T and T*, and the ``sweep`` if there was one. A driven plant has no ``error`` and
+    ``maps``: its T changes with time."""
+    found = {"radius": radius_figure(system, trained, record)}
+    if system.nu == 0:
+        found["error"] = error_figure(system, trained, record)
+        found["maps"] = maps_figure(system, trained)
+    if trained.facts.get("sweep"):
+        found["sweep"] = sweep_figure(trained)
+    return found
+
+
+def _plane(system: System, trained: TrainedKKL) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values of the first two states, a little beyond those trained on, and the states over them,
+    (GRID, GRID, nx): further ones are the benchmark's x̂₀."""
+    low, high = (np.array(trained.facts[name]) for name in ("low", "high"))
+    margin = 0.25 * (high - low)
+    sides = [np.linspace(low[i] - margin[i], high[i] + margin[i], GRID) for i in range(2)]
+    x = np.empty((GRID, GRID, system.nx))
+    x[:] = vector(system.setups["benchmark"].xhat0, system.nx, "xhat0")
+    x[..., 1], x[..., 0] = np.meshgrid(sides[1], sides[0], indexing="ij")
+    return sides[0], sides[1], x
+
+
+def _late(trained: TrainedKKL) -> float:
+    """A time at which z's beginning is forgotten, in s."""
+    return 20 / trained.dynamics.slowest
+
+
+def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
+    """The scaled error of T*(T(x)) over the first two states, without noise, T(x) integrated; the
+    box of the states trained on, and a trajectory."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    first, second, x = _plane(system, trained)
+    states = x.reshape(-1, system.nx)
+    h = float(np.diff(record.t).mean())
+    z, stays = steady(system, trained.dynamics, states, h)
+    error = np.full(len(states), np.nan)
+    xhat = trained.inverse(z[stays], _late(trained), np.zeros(system.nu))
+    scale = vector(system.scale, system.nx, "scale")
+    error[stays] = np.sqrt((((xhat - states[stays]) / scale) ** 2).mean(axis=-1))
+    figure = Figure(figsize=(6.5, 5), layout="constrained")
+    panel = figure.subplots()
+    shown = np.maximum(error, _FLOOR).reshape(GRID, GRID)
+    image = panel.pcolormesh(first, second, shown, norm=LogNorm(_FLOOR, 1.0), cmap="viridis")
+    figure.colorbar(image, label="scaled error of x̂")
+    low, high = (np.array(trained.facts[name]) for name in ("low", "high"))
+    across, up = [0, 1, 1, 0, 0], [0, 0, 1, 1, 0]
+    box = np.stack([low, high])
+    panel.plot(box[across, 0], box[up, 1], ":", color="0.7", lw=1.5, label="states trained on")
+    path = truth(system, _starts(system, trained, 1), record.t)[:, 0]
+    panel.plot(path[:, 0], path[:, 1], color="#d1495b", lw=1, label="an episode")
+    panel.set_xlabel(system.state_names[0])
+    panel.set_ylabel(system.state_names[1])
+    others = [
+        f"{name} = {value:g}"
+        for name, value in zip(system.state_names[2:], states[0][2:], strict=True)
+    ]
+    panel.set_title(", ".join([f"{trained.trainer}, without noise", *others]), fontsize=10)
+    panel.legend(loc="upper right", fontsize=8)
+    return figure
+
+
+def _starts(system: System, trained: TrainedKKL, count: int) -> np.ndarray:
+    """Initial states (count, nx) of the set that was trained on, others than those."""
+    low, high = (trained.config[name] for name in ("low", "high"))
+    return initial_states(system, low, high, count, 10**6 + 7)
+
+
+def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
+    """The error of the observer over the last quarter of episodes without noise, against how far
+    from the middle of the training set they begin, over the distance of its edge."""
+    from matplotlib.figure import Figure
+
+    x0 = _starts(system, trained, 400)
+    middle = (x0.min(axis=0) + x0.max(axis=0)) / 2
+    reach = (x0.max(axis=0) - x0.min(axis=0)) / 2
+    size = abs((x0 - middle) / np.where(reach > 0, reach, 1.0)).max(axis=1)
+    outer = x0[np.argsort(-size)[:_RAYS]]
+    x0 = middle + RADII[:, None, None] * (outer - middle)
+    errors = _tails(system, trained, record, x0)
+    figure = Figure(figsize=(6.5, 4), layout="constrained")
+    panel = figure.subplots()
+    low, mid, high = np.nanquantile(errors, [0.1, 0.5, 0.9], axis=1)
+    panel.fill_between(RADII, low, high, alpha=0.25, lw=0, label="80 % of episodes")
+    panel.semilogy(RADII, mid, lw=1.5, label="median")
+    panel.axvspan(1.0, RADII[-1], color="#d1495b", alpha=0.08, label="outside the training set")
+    panel.set_xlabel("initial radius, over that of the training set")
+    panel.set_ylabel("NRMSE of the last quarter")
+    panel.set_title(f"{trained.trainer}, without noise", fontsize=10)
+    panel.legend(fontsize=8)
+    panel.grid(alpha=0.3)
+    return figure
+
+
+def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) -> np.ndarray:
+    """NRMSE of the last quarter of episodes from states (groups, batch, nx): (groups, batch), not a
+    number in groups of which an episode runs away."""
+    states = x0.reshape(-1, system.nx)
+    try:
+        x = truth(system, states, record.t).swapaxes(0, 1)
+    except FloatingPointError:
+        if len(x0) == 1:
+            return np.full(x0.shape[:2], np.nan)
+        return np.concatenate([_tails(system, trained, record, group[None]) for group in x0])
+    mean = np.broadcast_to(record.prior.mean[:1], states.shape)
+    cov = np.broadcast_to(record.prior.cov[:1], (len(states), system.nx, system.nx))
+    u = np.broadcast_to(system.input(record.t), (len(states), len(record.t), system.nu))
+    xhat = KKL(system, trained=trained).run(Record(record.t, system.h(x), u, Prior(mean, cov))).xhat
+    late = slice(3 * len(record.t) // 4, None)
+    scale = vector(system.scale, system.nx, "scale")
+    square = (((xhat - x)[:, late] / scale) ** 2).mean(axis=(1, 2))
+    return np.sqrt(square).reshape(x0.shape[:2])
+
+
+def maps_figure(system: System, trained: TrainedKKL) -> Figure:
+    """Components of T over the first two states, and of T* over the plane of z in which states
+    spread most."""
+    from matplotlib.figure import Figure
+
+    first, second, x = _plane(system, trained)
+    z = trained.T(x)
+    shown = min(trained.dynamics.size, 3)
+    columns = max(shown, min(system.nx, 3))
+    figure = Figure(figsize=(3.2 * columns, 6), layout="constrained")
+    panels: Any = figure.subplots(2, columns, squeeze=False)
+    for i in range(shown):
+        image = panels[0, i].pcolormesh(first, second, z[..., i], cmap="viridis")
+        figure.colorbar(image, ax=panels[0, i])
+        panels[0, i].set_title(f"T: z{i + 1}", fontsize=10)
+        panels[0, i].set_xlabel(system.state_names[0])
+    panels[0, 0].set_ylabel(system.state_names[1])
+    flat = trained.T(_starts(system, trained, 500))
+    mean = flat.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(flat - mean, full_matrices=False)
+    reach = 2.5 * sizes[:2] / np.sqrt(len(flat))
+    sides = [np.linspace(-r, r, GRID) for r in reach]
+    a, b = np.meshgrid(*sides)
+    plane = mean + a[..., None] * axes[0] + b[..., None] * axes[1]
+    xhat = trained.inverse(plane, _late(trained), np.zeros(system.nu))
+    for i in range(min(system.nx, 3)):
+        image = panels[1, i].pcolormesh(*sides, xhat[..., i], cmap="viridis")
+        figure.colorbar(image, ax=panels[1, i])
+        panels[1, i].set_title(f"T*: {system.state_names[i]}", fontsize=10)
+        panels[1, i].set_xlabel("first axis of z")
+    panels[1, 0].set_ylabel("second axis of z")
+    for panel in panels.ravel():
+        if not panel.has_data():
+            panel.set_axis_off()
+    return figure
+
+
+def sweep_figure(trained: TrainedKKL) -> Figure:
+    """Noise gain, error and convergence over the cut-off; the one chosen is marked."""
+    from matplotlib.figure import Figure
+
+    points = trained.facts["sweep"]
+    cutoff = [point["cutoff"] for point in points]
+    figure = Figure(figsize=(6.5, 6), layout="constrained")
+    panels: Any = figure.subplots(3, 1, sharex=True)
+    for name in ("noisy", "clean"):
+        values = [point[name] for point in points]
+        panels[0].loglog(cutoff, values, "o-", label=f"{name} outputs")
+    panels[0].set_ylabel("NRMSE at the end")
+    panels[0].legend(fontsize=8)
+    for panel, name, label in (
+        (panels[1], "noise_gain", "noise gain"),
+        (panels[2], "convergence", "convergence (s)"),
+    ):
+        panel.semilogx(cutoff, [point[name] for point in points], "o-")
+        panel.set_ylabel(label)
+    for panel in panels:
+        panel.axvline(trained.config["cutoff"], color="#d1495b", ls="--", lw=1)
+        panel.grid(alpha=0.3)
+    panels[2].set_xlabel("cut-off (Hz)")
+    panels[0].set_title(f"{trained.system}: {trained.trainer}, cut-off chosen in red", fontsize=10)
+    return figure
