@@ -17,14 +17,14 @@ from pinnobs_gym import registry
 from pinnobs_gym.cli.docstrings import field_docs, variable_docs
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.cli.system_page import page
-from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.leaderboard.standings_table import markdown_table
 from pinnobs_gym.scoring import consistency, metrics, rows
-from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
 from pinnobs_gym.simulation.system import System
@@ -117,10 +117,9 @@ def _math(equations: Iterable[tuple[Any, Any]] | str) -> str:
 
 def _episode(cls: type[System]) -> Any:
     """A picture of the EKF in one episode."""
-    system, setup = cls.configured()
-    name, condition = env_id(cls), cls.ranked_condition
-    example = score_batch(EKF.for_setup(system, setup), name, "benchmark", condition, [0])[1]
-    return state_figure(system, title=f"{name}, {condition}: ekf", **example)
+    game = Game.of(cls, condition=cls.ranked_condition)
+    ekf = EKF.for_setup(game.source.system, game.source.setup)
+    return play(game, ekf, [0]).figure(f"{game.name.env_id}, {game.name.condition}: ekf")
 
 
 def estimator_page(name: str, cls: type[Estimator]) -> str:
@@ -276,7 +275,7 @@ def _metrics() -> str:
     return "\n".join(
         [
             "# Metrics\n",
-            f"{docstring(metrics.score)}\n",
+            f"{docstring(metrics.error_scores)}\n",
             markdown_table(("limit", "value", "meaning"), limits),
             f"\n## Where they apply\n\n{optional}\n\n{docs['OPTIONAL_SCORES']}\n",
             docstring(consistency.consistency),

@@ -24,6 +24,7 @@ import torch
 import tyro
 
 from pinnobs_gym import evaluate
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimation.learned.trained_file import check_same
@@ -66,24 +67,24 @@ class Main:
 
     def _trained(self, name: str, config: Config) -> Estimator:
         """The agent, trained unless its file is there."""
-        played = by_name.Played(env_id(name), "benchmark", "nominal", by_name.TRAINING_SEED)
-        title = f"{played.env_id.removeprefix('pinnobs/')}-{config.algorithm}-{config.action_mode}"
+        game = Game.of(name)
+        system = game.name.env_id.removeprefix("pinnobs/")
+        title = f"{system}-{config.algorithm}-{config.action_mode}"
         path = self.out / f"{title}-seed{config.seed}.pt"
-        system = SYSTEMS.resolve(name)()
         if not path.exists():
             checkpoint = path.with_suffix(".checkpoint.zip")
             with Log(self.out / "tensorboard" / path.stem) as log:
                 trained = by_name.train(
                     "rl",
                     config,
-                    played,
+                    game,
                     log=log,
                     checkpoint=checkpoint,
                     resume=checkpoint.exists(),
                     progress=sys.stdout.isatty(),
                 )
             trained.save(path)
-        made = Sb3.load(path, system)
+        made = Sb3.load(path, game.source.system)
         check_same(path, made.trained.config, asdict(config.filled()))
         return made
 

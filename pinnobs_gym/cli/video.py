@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.files import check_writable
 
@@ -53,30 +53,24 @@ def check_video(path: Path) -> None:
     check_writable(path.parent)
 
 
-def write_video(
-    path: Path, estimator: Estimator, env_id: str, setup: str, condition: str, seed: int
-) -> Pace:
+def write_video(path: Path, estimator: Estimator, game: Game, seed: int) -> Pace:
     """Write the video of an episode, from its first sample to its last, which is held for a second;
     a file that is there is replaced when the new one is whole.
 
     Args:
         path: the file.
         estimator: whose estimates are the actions.
-        env_id: such as ``pinnobs/ReverseDuffing-v0``.
-        setup: that is played.
-        condition: that is played.
+        game: what is played.
         seed: of the episode.
 
     Raises:
         ValueError: in one line, if it cannot be written.
     """
     save_video = _recorder()
-    env = make_vector_env(env_id, 1, setup, condition)
-    env.reset(seed=seed)
-    record = env.record()
-    pace = Pace.of(env.source.setup.duration, env.source.setup.dt)
-    actions = estimator.run(record).xhat[0]
-    drawn = gym.make(env_id, setup=setup, condition=condition, render_mode="rgb_array")
+    pace = Pace.of(game.source.setup.duration, game.source.setup.dt)
+    actions = estimator.run(game.record([seed])).xhat[0]
+    name, setup, condition = game.name
+    drawn = gym.make(name, setup=setup, condition=condition, render_mode="rgb_array")
     drawn.reset(seed=seed)
     frames = [drawn.render()]
     for k, action in enumerate(actions, 1):

@@ -1,17 +1,15 @@
-"""How a system becomes an env id, and an id an env."""
+"""How a system becomes an env id."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 
 from pinnobs_gym.systems import SYSTEMS
 
 if TYPE_CHECKING:
-    from pinnobs_gym.envs.vector_env import EstimationVectorEnv
-    from pinnobs_gym.simulation.record import Record
-    from pinnobs_gym.simulation.system import Setup, System
+    from pinnobs_gym.simulation.system import System
 
 
 def register_system(cls: type[System]) -> None:
@@ -59,35 +57,3 @@ def _register_env(name: str, system: str) -> None:
             vector_entry_point="pinnobs_gym.envs.vector_env:EstimationVectorEnv",
             kwargs={"system": system},  # with its module, so that a new process finds it
         )
-
-
-def make_vector_env(
-    env_id: str, num_envs: int, setup: str, condition: str, **changes: Any
-) -> EstimationVectorEnv:
-    """The vectorised env of that id; ``changes`` are further settings of it, such as noise_std.
-
-    Raises:
-        ValueError: listing the valid ids, if it is unknown.
-    """
-    known = [name for name in gym.registry if name.startswith("pinnobs/")]
-    if env_id not in known:
-        raise ValueError(f"unknown env id {env_id!r}; known are {', '.join(sorted(known))}")
-    env: Any = gym.make_vec(
-        env_id,
-        num_envs,
-        vectorization_mode="vector_entry_point",
-        setup=setup,
-        condition=condition,
-        **changes,
-    ).unwrapped
-    return env
-
-
-def record_of(
-    name: str, setup: str, condition: str, seed: int, episodes: int = 1
-) -> tuple[System, Setup, Record]:
-    """An env's model, what estimators are told of the setup, and the record of its episodes of the
-    seeds from seed on."""
-    env = make_vector_env(name, episodes, setup, condition)
-    env.reset(seed=seed)
-    return env.source.system, env.source.setup, env.record()

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-
-from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.scoring.metrics import DIVERGED
-from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.system import vector
 
@@ -27,44 +23,38 @@ class Replay:
 
     name: str
     """What the episode is, beside the record that was trained on."""
-    scores: Row
-    """See `pinnobs_gym.scoring.metrics.score`."""
+    played: Played
+    """The one episode."""
+
+    @property
+    def scores(self) -> Row:
+        """See `pinnobs_gym.scoring.metrics.score`."""
+        return self.played.scores.rows()[0]
 
 
-def replays(
-    estimator: Estimator, env_id: str, setup: str, condition: str, seed: int
-) -> tuple[list[Replay], dict[str, Any]]:
+def replays(estimator: Estimator, game: Game, seed: int) -> list[Replay]:
     """Run an estimator on the record of that seed; on one from the same initial state with fresh
     output noise of the benchmark's size; and on two from other initial states.
 
     These are the episodes of seeds 0 and 1 or, where the setup has but one initial state x₀,
     episodes from x̂₀ + (x₀ − x̂₀)/2 and x̂₀ − (x₀ − x̂₀)/2, all from the same x̂₀.
-
-    Returns:
-        The four replays, and what `pinnobs_gym.envs.figures.state_figure` draws of the first.
     """
-    source = make_vector_env(env_id, 1, setup, condition).source
-
-    def replay(name: str, seed: int, x0: np.ndarray | None = None, **changes: Any) -> Replay:
-        options = None if x0 is None else {"x0": x0}
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*outside the initial set")
-            scores, _ = score_batch(estimator, env_id, setup, condition, [seed], options, **changes)
-        return Replay(name, scores[0])
-
-    own, example = score_batch(estimator, env_id, setup, condition, [seed])
-    x0 = example["x"][0]
-    noise = source.system.setups["benchmark"].noise_std
-    found = [Replay("own record", own[0]), replay("fresh noise", seed + 1, x0, noise_std=noise)]
-    if source.fixed_x0:
-        xhat0 = vector(source.setup.xhat0, source.system.nx, "xhat0")
-        for sign in (0.5, -0.5):
-            other = xhat0 + sign * (x0 - xhat0)
-            name = "x0=[" + ", ".join(f"{v:g}" for v in other) + "]"
-            found.append(replay(name, seed, other))
-    else:
-        found += [replay(f"episode {other}", other) for other in OTHER_SEEDS]
-    return found, example
+    source, system = game.source, game.source.system
+    own = play(game, estimator, [seed])
+    x0 = own.truth[0, 0]
+    noise_std = system.setups["benchmark"].noise_std
+    noisy = Game.of(game.system, game.name.setup, game.name.condition, noise_std=noise_std)
+    fresh = play(noisy, estimator, [seed + 1], x0[None])
+    found = [Replay("own record", own), Replay("fresh noise", fresh)]
+    if not source.fixed_x0:
+        others = [Replay(f"episode {k}", play(game, estimator, [k])) for k in OTHER_SEEDS]
+        return found + others
+    xhat0 = vector(source.setup.xhat0, system.nx, "xhat0")
+    for sign in (0.5, -0.5):
+        other = xhat0 + sign * (x0 - xhat0)
+        name = "x0=[" + ", ".join(f"{v:g}" for v in other) + "]"
+        found.append(Replay(name, play(game, estimator, [seed], other[None])))
+    return found
 
 
 def warning(loss: float, own: Row) -> str | None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.scoring.metrics import by_sample, window
 from pinnobs_gym.simulation.model import model_step
@@ -69,7 +68,7 @@ def expected_scores(
     P: np.ndarray, scale: Sequence[float], scored: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """The root mean squares over scale, (batch,) each, that errors of covariances P have:
-    ``nrmse``, ``nrmse_75`` and ``nrmse_tail``, to compare with those of `metrics.score`.
+    ``nrmse``, ``nrmse_75`` and ``nrmse_tail``, to compare with those of `metrics.error_scores`.
 
     Args:
         P: covariances, shape (batch, num_samples, nx, nx).
@@ -202,29 +201,44 @@ def _moments(weight: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return mean, np.einsum("nb,nbi,nbj->bij", weight, error, error, optimize=True)
 
 
-@lru_cache(maxsize=8)
-def _reference(
-    system: type[System], setup: str, condition: str, seeds: tuple[int, ...]
-) -> dict[str, np.ndarray] | None:
-    """What `expected_scores` says of the Cramér-Rao reference of these episodes, (batch,) each, NaN
-    where it is below what a single step of the model errs by; and as ``by_sample`` what is expected
-    of each sample, (batch, num_samples). None where there is none: without noise, from a fixed
-    initial state, or under a condition that is not in the model (`Condition.reference`)."""
-    source = EpisodeSource(system, setup, condition)
+@dataclass(frozen=True)
+class Reference:
+    """What errors that are as large as the Cramér-Rao reference score, for a batch of episodes; not
+    a number where it is below what a single step of the model errs by."""
+
+    nrmse: np.ndarray
+    """Of the whole episode, shape (batch,)."""
+    nrmse_75: np.ndarray
+    """Of its last 75 %."""
+    nrmse_tail: np.ndarray
+    """Of its last 25 %."""
+    by_sample: np.ndarray
+    """Of each sample, shape (batch, num_samples)."""
+
+
+def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None:
+    """The Cramér-Rao reference of a game's episodes, in terms of scores.
+
+    Args:
+        game: what is played.
+        record: what estimators see of the episodes.
+        truth: true states at its samples, shape (batch, num_samples, nx).
+
+    Returns:
+        None where there is none: without noise, from a fixed initial state, or under a condition
+        that is not in the model (`Condition.reference`).
+    """
+    source = game.source
     std = vector(source.setup.noise_std, source.system.ny, "noise_std")
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
         return None
-    draws = source.draw([Stream(np.random.SeedSequence(seed)) for seed in seeds])
-    episodes = source.play(draws)
-    record, x = source.record(episodes), episodes.x[: source.setup.num_steps].swapaxes(0, 1)
     Q = None if source.process_noise is None else np.diag(source.process_noise**2)
     P0, R = record.prior.cov[0], np.diag(std**2)
-    P = cramer_rao(source.system, record.t, x, P0, R, Q, np.isnan(record.y))
-    counted = (source.system.scale, source.system.observable(x))
+    P = cramer_rao(source.system, record.t, truth, P0, R, Q, np.isnan(record.y))
+    counted = (source.system.scale, source.system.observable(truth))
     expected = expected_scores(P, *counted)
     if Q is None:
-        error = step_error(source.system, record.t, x)
+        error = step_error(source.system, record.t, truth)
         floor = expected_scores(error[..., None] * error[..., None, :], *counted)
         expected = {n: np.where(v > floor[n], v, np.nan) for n, v in expected.items()}
-    std = np.sqrt(np.einsum("bkii->bki", P))
-    return expected | {"by_sample": by_sample(std, *counted)}
+    return Reference(**expected, by_sample=by_sample(np.sqrt(np.einsum("bkii->bki", P)), *counted))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ import numpy as np
 
 from pinnobs_gym.envs.figures import measured_states
 from pinnobs_gym.files import replacing
+from pinnobs_gym.scoring.metrics import by_sample
+from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.system import System
 
@@ -89,38 +91,24 @@ def labels(system: System) -> tuple[str, ...]:
     return tuple(f"{name} ({unit})" if unit else name for name, unit in pairs)
 
 
-def curves_of(
-    system: System,
-    seeds: Sequence[int],
-    t: np.ndarray,
-    error: np.ndarray,
-    reference: np.ndarray | None,
-    example: Example,
-) -> Curves:
-    """The curves of a batch of whole episodes, at the kept times.
-
-    Args:
-        system: names and units.
-        seeds: of the episodes.
-        t: sample times in s, shape (num_samples,).
-        error: NRMSE of each sample, shape (episodes, num_samples).
-        reference: that of the Cramér-Rao reference, if there is one.
-        example: one of them, at all samples.
-    """
+def curves_of(played: Played) -> Curves:
+    """The curves of a batch of whole episodes, at the kept times; the first is the example."""
+    system, t, xhat = played.system, played.record.t, played.estimates.xhat
+    error = by_sample(xhat - played.truth, system.scale, system.observable(played.truth))
+    reference, std = played.reference, played.std
     k, m = kept(len(t)), _kept_of_example(len(t))
-    std = None if example.std is None else _short(example.std[m])
     return Curves(
         t=t[k],
-        seeds=np.asarray(seeds),
+        seeds=np.asarray(played.seeds),
         error=_short(error[:, k]),
-        reference=None if reference is None else _short(reference[:, k]),
+        reference=None if reference is None else _short(reference.by_sample[:, k]),
         example=Example(
-            example.seed,
+            played.seeds[0],
             t[m],
-            _short(example.x[m]),
-            _short(example.xhat[m]),
-            _short(example.y[m]),
-            std,
+            _short(played.truth[0, m]),
+            _short(xhat[0, m]),
+            _short(played.record.y[0, m]),
+            None if std is None else _short(std[0, m]),
         ),
         states=labels(system),
         measured=measured_states(system),

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.envs.registration import make_vector_env
-from pinnobs_gym.envs.vector_env import EstimationVectorEnv
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring import rows as rows_module
-from pinnobs_gym.scoring.curves import folder_of, save
-from pinnobs_gym.scoring.playing import play_batch
-from pinnobs_gym.scoring.provenance import canonical, versions
+from pinnobs_gym.scoring.curves import curves_of, folder_of, save
+from pinnobs_gym.scoring.playing import Played, play
+from pinnobs_gym.scoring.provenance import canonical, now, versions
 from pinnobs_gym.scoring.rows import SCHEMA, Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.simulation.conditions import canonical_name
+from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import SILENT, Log
 
 BATCH = 256
@@ -60,7 +60,7 @@ def evaluate(
     """Score an estimator on an env's episodes.
 
     All estimators see the same episodes: that of seed s is the first of the single env reset with
-    seed s. The env is stepped with the estimates, x̂(k|k) against x_k, and its states are scored
+    seed s. Scored are the estimates x̂(k|k) against the states x_k, as the env's reward does
     (`pinnobs_gym.scoring.metrics.score`).
 
     Args:
@@ -85,85 +85,90 @@ def evaluate(
         ValueError: in one line, for an unknown id, setup, condition or option, or an estimator
             whose model does not fit the env.
     """
-    result, made, example = run_episodes(
-        estimator,
-        env_id,
-        range(seed, seed + episodes),
-        setup,
-        condition,
-        options,
-        None if results is None else Results(Path(results)),
-        progress,
-    )
-    log_episodes(log, result, made, example)
-    log_summary(log, result)
-    return result
+    game = Game.of(env_id, setup, condition)
+    made = make_estimator(estimator, game, options or {})
+    stored = None if results is None else Results(Path(results))
+    found = run_episodes(game, made, range(seed, seed + episodes), stored, progress)
+    log_episodes(log, found.rows, found.first_played)
+    log_summary(log, found.rows)
+    return found.rows
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What came of an evaluation."""
+
+    rows: list[Row]
+    """In the order of seeds. Rows that are only known to be stored have no scores."""
+    first_played: Played | None
+    """The first batch that was played; None if all was there already."""
 
 
 def run_episodes(
-    estimator: Estimator | type[Estimator] | str,
-    env_id: str,
+    game: Game,
+    estimator: Estimator,
     seeds: range,
-    setup: str,
-    condition: str,
-    options: Mapping[str, Any] | None = None,
     results: Results | None = None,
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
-) -> tuple[list[Row], Estimator, dict[str, Any] | None]:
-    """What `evaluate` does but for logging; returns also the estimator that was scored, and the
-    seed of the first episode that was run, if any was, with what `state_figure` draws of it. Rows
-    that are only known to be stored have no scores. The label is the estimator's name in rows, if
-    not its own."""
+) -> Evaluated:
+    """Play and score the episodes that are not stored yet, batch by batch.
+
+    Args:
+        game: what is played.
+        estimator: that is scored.
+        seeds: of the episodes.
+        results: what is stored, and where rows are appended.
+        progress: called with the number of episodes done.
+        label: the estimator's name in rows, if not its own.
+
+    Raises:
+        ValueError: in one line, if there are no episodes or a seed is below zero.
+    """
     if not len(seeds):
         raise ValueError(f"episodes={len(seeds)}; expected at least 1")
     if seeds[0] < 0:
         raise ValueError(f"seed={seeds[0]}; expected at least 0")
-    condition = canonical_name(condition)
-    env = make_vector_env(env_id, 1, setup, condition)
-    made = _make(estimator, env, options or {})
-    common = _common(made, env, env_id, setup, condition)
-    common["estimator"] = label or made.label
+    common = _common(estimator, game) | {"estimator": label or estimator.label}
     wanted = [{**common, "episode_seed": seed} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
-    example = None
+    first_played = None
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
-        seeds_now = [row["episode_seed"] for row in batch]
-        scored, first_played, curves = play_batch(made, env_id, setup, condition, seeds_now)
-        if example is None:
-            example = {"seed": seeds_now[0], **first_played}
-        done = [{**row, **scores} for row, scores in zip(batch, scored, strict=True)]
+        played = play(game, estimator, [row["episode_seed"] for row in batch])
+        first_played = first_played or played
+        done = [{**row, **scores} for row, scores in zip(batch, _scored(played), strict=True)]
         if results is not None:
             # Curves first: episodes that have rows are not run again.
-            save(folder_of(results.path), done[0], curves)
-            rows_module.append(results.path, done, new=made.trains_on_record is not None)
+            save(folder_of(results.path), done[0], curves_of(played))
+            rows_module.append(results.path, done, new=estimator.trains_on_record is not None)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))
-    return [stored[rows_module.key(row)] for row in wanted], made, example
+    return Evaluated([stored[rows_module.key(row)] for row in wanted], first_played)
 
 
-def _make(
-    estimator: Estimator | type[Estimator] | str,
-    env: EstimationVectorEnv,
-    options: Mapping[str, Any],
+def _scored(played: Played) -> list[Row]:
+    """The scores of each episode by name, and what they cost."""
+    cost = {"us_per_step": played.us_per_step, "batch": played.record.batch, "date": now()}
+    return [scores | cost for scores in played.scores.rows()]
+
+
+def make_estimator(
+    estimator: Estimator | type[Estimator] | str, game: Game, options: Mapping[str, Any]
 ) -> Estimator:
-    system, setup = env.source.system, env.source.setup
+    """The estimator that a name, a class or an instance means in a game.
+
+    Raises:
+        ValueError: in one line, if it is unknown, has to be trained first, does not take the
+            options, or has another model than the game's.
+    """
+    system, setup = game.source.system, game.source.setup
     if isinstance(estimator, Estimator):
         if options:
             raise ValueError(f"options {dict(options)} go with a name or a class, not an instance")
-        model = estimator.system
-        if (type(model).__name__, model.nx, model.ny) != (
-            type(system).__name__,
-            system.nx,
-            system.ny,
-        ):
-            raise ValueError(
-                f"the estimator's model is {type(model).__name__} (nx={model.nx}, ny={model.ny}); "
-                f"the env plays {type(system).__name__} (nx={system.nx}, ny={system.ny})"
-            )
+        _check_model(estimator.system, system)
         return estimator
     cls = ESTIMATORS.resolve(estimator)
     if cls.needs_training is not None:
@@ -177,27 +182,32 @@ def _make(
         raise ValueError(f"estimator {ESTIMATORS.name_of(cls)!r}: {error}") from None
 
 
-def _common(
-    estimator: Estimator, env: EstimationVectorEnv, env_id: str, setup: str, condition: str
-) -> Row:
+def _check_model(model: System, system: System) -> None:
+    found, expected = (
+        f"{type(each).__name__} (nx={each.nx}, ny={each.ny})" for each in (model, system)
+    )
+    if found != expected:
+        raise ValueError(f"the estimator's model is {found}; the env plays {expected}")
+
+
+def _common(estimator: Estimator, game: Game) -> Row:
     """What all rows of an evaluation share."""
+    system = game.source.system
     identity = {
         "class": f"{type(estimator).__module__}.{type(estimator).__qualname__}",
         "model": canonical(estimator.system),
         "noise_std": canonical(estimator.noise_std),
         "options": canonical(estimator.options),
         "training": {k: v for k, v in canonical(estimator.training).items() if k != "seconds"},
-        "played": canonical(env.source.setup),
+        "played": canonical(game.source.setup),
     }
     text = json.dumps(identity, sort_keys=True)
     return {
         "schema": SCHEMA,
         "kind": "score",
-        "env_id": env_id,
-        "setup": setup,
-        "condition": condition,
-        "ranked": condition == canonical_name(env.source.system.ranked_condition),
-        "nx": env.source.system.nx,
+        **game.name._asdict(),
+        "ranked": game.name.condition == canonical_name(system.ranked_condition),
+        "nx": system.nx,
         "estimator": estimator.label,
         "track": estimator.track,
         "knows": list(estimator.knows),

@@ -3,43 +3,99 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, fields
+from typing import Any
 
 import numpy as np
+
+from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.scoring.consistency import consistency
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
 
 DIVERGED = 0.2
 """NRMSE over the last quarter from which on an episode counts as diverged."""
 SETTLED = 0.05
 """NRMSE of a sample below which the estimate counts as settled."""
 
-SCORES = (
-    "mae",
-    "mse",
-    "rmse",
-    "smape",
-    "nrmse",
-    "nrmse_75",
-    "nrmse_tail",
-    "settling",
-    "peak",
-    "nrmse_modulo",
-    "nrmse_tail_modulo",
-)
-"""The numbers that `score` returns for each episode, besides ``diverged``."""
 
-OPTIONAL_SCORES = (
-    "anees",
-    "coverage",
-    "nis",
-    "innovation_correlation",
-    "reference_ratio",
-    "reference_ratio_tail",
-)
-"""Numbers that episodes have where they apply: those of `pinnobs_gym.scoring.consistency`, and the
-NRMSE of the whole episode and of its tail over their Cramér-Rao reference
-(`pinnobs_gym.scoring.cramer_rao`)."""
+@dataclass(frozen=True)
+class Scores:
+    """The scores of a batch of episodes: arrays (batch,), of which those that do not apply are None
+    or, in single episodes, not a number. `error_scores` and `consistency` say what they are."""
+
+    mae: np.ndarray
+    mse: np.ndarray
+    rmse: np.ndarray
+    smape: np.ndarray
+    nrmse: np.ndarray
+    nrmse_75: np.ndarray
+    nrmse_tail: np.ndarray
+    settling: np.ndarray
+    peak: np.ndarray
+    nrmse_modulo: np.ndarray
+    nrmse_tail_modulo: np.ndarray
+    diverged: np.ndarray
+    anees: np.ndarray | None = None
+    coverage: np.ndarray | None = None
+    nis: np.ndarray | None = None
+    innovation_correlation: np.ndarray | None = None
+    reference_ratio: np.ndarray | None = None
+    """NRMSE of the whole episode over that of its Cramér-Rao reference
+    (`pinnobs_gym.scoring.cramer_rao`), the error taken modulo what no output tells apart."""
+    reference_ratio_tail: np.ndarray | None = None
+    """The same of the tail."""
+
+    def rows(self) -> list[dict[str, float | bool | None]]:
+        """The scores of each episode by name."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        return [
+            {name: _number(name, column, i) for name, column in columns.items()}
+            for i in range(len(self.nrmse))
+        ]
 
 
-def score(
+def _number(name: str, column: np.ndarray | None, i: int) -> float | bool | None:
+    """The value of one episode, None if it has none."""
+    if column is None or (name in OPTIONAL_SCORES and np.isnan(column[i])):
+        return None
+    return column[i].item()
+
+
+SCORES = tuple(f.name for f in fields(Scores) if f.default is MISSING and f.name != "diverged")
+"""The numbers that each episode has, besides ``diverged``."""
+OPTIONAL_SCORES = tuple(f.name for f in fields(Scores) if f.default is None)
+"""Numbers that episodes have where they apply."""
+
+
+def score(system: System, record: Record, truth: np.ndarray, estimates: Estimates) -> Scores:
+    """The scores of estimates of a batch of episodes.
+
+    Args:
+        system: the model, which says what errors are divided by and what can be told from outputs.
+        record: what the estimator saw.
+        truth: true states at its samples, shape (batch, num_samples, nx), in state units.
+        estimates: x̂(k|k) at its samples, and what else the estimator gave.
+
+    Returns:
+        All scores but those that hold against the Cramér-Rao reference.
+
+    Raises:
+        ValueError: if truth and estimates are not of one shape.
+    """
+    errors: dict[str, Any] = error_scores(
+        record.t,
+        truth,
+        np.asarray(estimates.xhat, dtype=float),
+        system.scale,
+        scored=system.observable(truth),
+        alternatives=system.indistinguishable(truth),
+    )
+    own: dict[str, Any] = consistency(truth, estimates, np.isnan(record.y))
+    return Scores(**errors, **own)
+
+
+def error_scores(
     t: np.ndarray,
     x: np.ndarray,
     xhat: np.ndarray,
@@ -48,7 +104,7 @@ def score(
     scored: np.ndarray | None = None,
     alternatives: Sequence[np.ndarray] = (),
 ) -> dict[str, np.ndarray]:
-    """The scores of a batch of episodes.
+    """The scores of a batch of episodes that follow from errors alone.
 
     Args:
         t: sample times in s, shape (num_samples,).

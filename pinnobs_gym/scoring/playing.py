@@ -1,104 +1,123 @@
-"""Playing a batch of episodes and scoring it."""
+"""Playing a batch of a game's episodes with an estimator."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.estimation.estimator import Estimates, Estimator
-from pinnobs_gym.scoring.consistency import consistency
-from pinnobs_gym.scoring.cramer_rao import _reference
-from pinnobs_gym.scoring.curves import Curves, Example, curves_of
-from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, by_sample, score
-from pinnobs_gym.scoring.provenance import now
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.cramer_rao import Reference, reference
+from pinnobs_gym.scoring.metrics import Scores, score
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_REFERENCES: dict[tuple[type[System], GameName, tuple[int, ...]], Reference | None] = {}
+"""The references of the last batches: one estimator after the other plays the same episodes."""
+_MOST_REFERENCES = 8
 
 
-def score_batch(
-    estimator: Estimator,
-    env_id: str,
-    setup: str,
-    condition: str,
-    seeds: list[int],
-    reset_options: dict[str, Any] | None = None,
-    **changes: Any,
-) -> tuple[list[Row], dict[str, Any]]:
-    """The scores of the episodes of these seeds, and the first of them for a picture; the env is
-    made with the changes and reset with the options."""
-    return play_batch(estimator, env_id, setup, condition, seeds, reset_options, **changes)[:2]
+@dataclass(frozen=True)
+class Played:
+    """A batch of episodes, and what an estimator made of them."""
+
+    game: Game
+    seeds: tuple[int, ...]
+    """Of the episodes."""
+    record: Record
+    """What the estimator saw."""
+    truth: np.ndarray
+    """True states at the record's samples, shape (batch, num_samples, nx), in state units."""
+    estimates: Estimates
+    """x̂(k|k) at the same samples."""
+    us_per_step: float
+    """CPU microseconds per step and episode that the estimates took."""
+    drawn: bool = True
+    """Whether initial states are those that the game draws."""
+
+    @property
+    def system(self) -> System:
+        """The model."""
+        return self.game.source.system
+
+    @property
+    def std(self) -> np.ndarray | None:
+        """Standard deviations of the estimates, shape (batch, num_samples, nx), of those that give
+        them."""
+        P = self.estimates.P
+        return None if P is None else np.sqrt(np.maximum(np.einsum("bkii->bki", P), 0))
+
+    @cached_property
+    def reference(self) -> Reference | None:
+        """The Cramér-Rao reference of the episodes; None where there is none, and where anything
+        was changed in the game."""
+        if not self.drawn or self.game.changes:
+            return None
+        key = (type(self.system), self.game.name, self.seeds)
+        if key not in _REFERENCES:
+            while len(_REFERENCES) >= _MOST_REFERENCES:
+                del _REFERENCES[next(iter(_REFERENCES))]
+            _REFERENCES[key] = reference(self.game, self.record, self.truth)
+        return _REFERENCES[key]
+
+    @cached_property
+    def scores(self) -> Scores:
+        """The scores of the episodes, against their reference too where there is one."""
+        scores = score(self.system, self.record, self.truth, self.estimates)
+        if self.reference is None:
+            return scores
+        return replace(
+            scores,
+            reference_ratio=scores.nrmse_modulo / self.reference.nrmse,
+            reference_ratio_tail=scores.nrmse_tail_modulo / self.reference.nrmse_tail,
+        )
+
+    def figure(self, title: str, row: int = 0) -> Figure:
+        """A picture of one of the episodes, a panel per state."""
+        estimates, record = self.estimates, self.record
+        P = None if estimates.P is None else estimates.P[row]
+        shown = {"x": self.truth[row], "y": record.y[row], "P": P, "title": title}
+        return state_figure(self.system, record.t, estimates.xhat[row], **shown)
 
 
-def play_batch(
-    estimator: Estimator,
-    env_id: str,
-    setup: str,
-    condition: str,
-    seeds: list[int],
-    reset_options: dict[str, Any] | None = None,
-    **changes: Any,
-) -> tuple[list[Row], dict[str, Any], Curves]:
-    """What `score_batch` returns, and the curves of all episodes."""
-    env = make_vector_env(env_id, len(seeds), setup, condition, **changes)
-    _, infos = env.reset(seed=seeds, options=reset_options)
-    record = env.record()
+def play(
+    game: Game, estimator: Estimator, seeds: Sequence[int], x0: np.ndarray | None = None
+) -> Played:
+    """Run an estimator on the episodes of a game.
+
+    The episodes are those that the env reset with these seeds plays; stepping it with x̂(k|k) as the
+    actions scores the same errors.
+
+    Args:
+        game: what is played.
+        estimator: what is run.
+        seeds: of the episodes.
+        x0: initial states (batch, nx) that replace those drawn.
+
+    Raises:
+        ValueError: if the estimates have not the shape (batch, num_samples, nx).
+    """
+    source = game.source
+    episodes = game.episodes(seeds, x0)
+    record = source.record(episodes)
+    truth = np.ascontiguousarray(episodes.x[: record.num_samples].swapaxes(0, 1))
     start = time.process_time()
     estimates = estimator.run(record)
     cost = (time.process_time() - start) / (record.num_samples * record.batch) * 1e6
-    xhat = _checked(estimates, estimator, (record.batch, record.num_samples, env.source.system.nx))
-    x = np.empty_like(xhat)
-    bounded = np.where(np.isfinite(xhat), xhat, 0.0)  # a row that is not finite is scored as such
-    for k in range(record.num_samples):
-        x[:, k] = infos["state"]
-        *_, infos = env.step(bounded[:, k])
-    system = env.source.system
-    scores = score(
-        record.t,
-        x,
-        xhat,
-        system.scale,
-        scored=system.observable(x),
-        alternatives=system.indistinguishable(x),
-    )
-    optional = consistency(x, estimates, np.isnan(record.y))
-    reference = None
-    if reset_options is None and not changes:
-        reference = _reference(type(system), setup, condition, tuple(seeds))
-        for name, whole in (("reference_ratio", "nrmse"), ("reference_ratio_tail", "nrmse_tail")):
-            ratio = None if reference is None else scores[f"{whole}_modulo"] / reference[whole]
-            optional[name] = ratio
-    cost_now = {"us_per_step": cost, "batch": record.batch, "date": now()}
-    rows = [
-        {name: values[i].item() for name, values in scores.items()}
-        | {name: _number_of(optional.get(name), i) for name in OPTIONAL_SCORES}
-        | cost_now
-        for i in range(record.batch)
-    ]
-    P = None if estimates.P is None else estimates.P[0]
-    example = {"t": record.t, "xhat": xhat[0], "x": x[0], "y": record.y[0], "P": P}
-    std = None if P is None else np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0))
-    curves = curves_of(
-        system,
-        seeds,
-        record.t,
-        by_sample(xhat - x, system.scale, system.observable(x)),
-        None if reference is None else reference["by_sample"],
-        Example(seeds[0], record.t, x[0], xhat[0], record.y[0], std),
-    )
-    return rows, example, curves
-
-
-def _number_of(values: np.ndarray | None, row: int) -> float | None:
-    """That row's value, if it has one."""
-    return None if values is None or np.isnan(values[row]) else values[row].item()
-
-
-def _checked(estimates: Estimates, estimator: Estimator, shape: tuple[int, ...]) -> np.ndarray:
     xhat = np.asarray(estimates.xhat, dtype=float)
-    if xhat.shape != shape:
+    if xhat.shape != truth.shape:
         raise ValueError(
-            f"{type(estimator).__name__} returned estimates of shape {xhat.shape}; expected {shape}"
+            f"{type(estimator).__name__} returned estimates of shape {xhat.shape}; expected "
+            f"{truth.shape}"
         )
-    return xhat
+    estimates = replace(estimates, xhat=xhat)
+    return Played(game, tuple(seeds), record, truth, estimates, cost, drawn=x0 is None)

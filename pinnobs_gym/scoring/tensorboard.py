@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.envs.figures import state_figure
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.training.log import Log
 
@@ -17,19 +15,16 @@ LOGGED = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
 """The scores that TensorBoard shows."""
 
 
-def log_episodes(
-    log: Log, rows: list[Row], estimator: Estimator, example: dict[str, Any] | None
-) -> None:
-    """Log the scores of each episode over its seed, and a picture of one of them."""
+def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
+    """Log the scores of each episode over its seed, and a picture of the first that was played."""
     for row in rows:
         for name in LOGGED:
             if np.isfinite(row[name]):
                 log.scalar(f"episode/{name}", row[name], row["episode_seed"])
     first = rows[0]
-    if example is not None and log.active:
+    if played is not None and log.active:
         title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
-        drawn = {name: value for name, value in example.items() if name != "seed"}
-        log.figure("states", state_figure(estimator.system, title=title, **drawn), example["seed"])
+        log.figure("states", played.figure(title), played.seeds[0])
 
 
 def log_summary(log: Log, rows: list[Row]) -> None:

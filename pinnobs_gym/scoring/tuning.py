@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.scoring.playing import play
 
 if TYPE_CHECKING:
     import optuna
@@ -38,9 +39,7 @@ class Search:
     Optuna's tree-structured Parzen estimator (Bergstra et al. 2011)."""
 
     estimator: type[Estimator]
-    env_id: str
-    setup: str
-    condition: str
+    game: Game
     episodes: int
     """How many episodes each trial is of, of the seeds from `TUNING_SEED` on."""
     storage: Path
@@ -63,11 +62,12 @@ class Search:
         Raises:
             ValueError: in one line, if the estimator does not take them.
         """
-        source = make_vector_env(self.env_id, 1, self.setup, self.condition).source
+        source = self.game.source
         estimator = self.estimator.for_setup(source.system, source.setup, **settings)
-        seeds = [TUNING_SEED + i for i in range(self.episodes)]
-        scored, _ = score_batch(estimator, self.env_id, self.setup, self.condition, seeds)
-        nrmse = [WORST if row["diverged"] else min(row["nrmse"], WORST) for row in scored]
+        seeds = range(TUNING_SEED, TUNING_SEED + self.episodes)
+        played = play(self.game, estimator, seeds)
+        scores = score(played.system, played.record, played.truth, played.estimates)
+        nrmse = np.where(scores.diverged, WORST, np.minimum(scores.nrmse, WORST))
         return float(np.exp(np.mean(np.log(nrmse))))
 
     def run(self, trials: int, progress: Callable[[Tried | None], None]) -> None:
@@ -136,5 +136,5 @@ class Search:
 
     def _name(self) -> str:
         """What trials of one storage must have in common."""
-        what = (self.env_id, self.setup, self.condition, ESTIMATORS.name_of(self.estimator))
+        what = (*self.game.name, ESTIMATORS.name_of(self.estimator))
         return "-".join([*what, f"{self.episodes} episodes", str(dict(self.estimator.tunable))])

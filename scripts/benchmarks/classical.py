@@ -203,22 +203,15 @@ def over_the_reference() -> Iterator[Figure]:
         source, x, record = played(name, 100)
         R = np.diag(EKF.for_setup(source.system, source.setup).output_variance)
         bound = cramer_rao(source.system, record.t, x, record.prior.cov[0], R)
-        scored, others = source.system.observable(x), source.system.indistinguishable(x)
+        scored = source.system.observable(x)
         reference = expected_scores(bound, source.system.scale, scored)["nrmse"]
         best, ratio = "", np.inf
         for label, cls in ESTIMATORS.classes().items():
             if cls.track != "online" or cls.needs_training or cls.trains_on_record:
                 continue
             own: Estimator = cls.for_setup(source.system, source.setup)
-            scores = score(
-                record.t,
-                x,
-                own.run(record).xhat,
-                source.system.scale,
-                scored=scored,
-                alternatives=others,
-            )
-            now = float(np.median(scores["nrmse_modulo"] / reference))
+            scores = score(source.system, record, x, own.run(record))
+            now = float(np.median(scores.nrmse_modulo / reference))
             if now < ratio:
                 best, ratio = label, now
         good += ratio <= 1.15

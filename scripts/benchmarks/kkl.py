@@ -15,7 +15,8 @@ import trainers.kkl_pinn
 import trainers.kkl_supervised
 from benchmarks import Figure, at_most
 from pinnobs_gym import evaluate
-from pinnobs_gym.envs.registration import env_id, record_of
+from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
 from pinnobs_gym.leaderboard.standings_table import markdown_table
@@ -228,7 +229,8 @@ def benchmark() -> Iterator[Figure]:
 def _scored(name: str, trainer: str) -> list[dict[str, Any]]:
     module = MODULES[trainer]
     torch.set_num_threads(1)
-    system, setup, record = record_of(env_id(name), "benchmark", "nominal", TRAINING_SEED)
+    game = Game.of(name)
+    system, setup, record = game.source.system, game.source.setup, game.record([TRAINING_SEED])
     config = module.Config(budget=BENCHMARK_BUDGET)
     trained = module.train(system, config, record=record, noise_std=setup.noise_std)
     observer: Any = ESTIMATORS.resolve(trainer)

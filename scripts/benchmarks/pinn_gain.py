@@ -8,13 +8,14 @@ import numpy as np
 
 from benchmarks import Figure, at_most, cpu_seconds
 from pinnobs_gym import evaluate
-from pinnobs_gym.envs.registration import env_id, record_of
+from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training.by_name import TRAINING_SEED
-from trainers.pinn_gain import Config, train
+from pinnobs_gym.training import by_name
+from trainers.pinn_gain import Config
 
 SEEDS = 3
 """Training seeds, of which the median counts."""
@@ -54,15 +55,14 @@ def of_system(name: str, repeats: int) -> Iterator[Figure]:
 def trained_on(name: str, seed: int) -> TrainedGain:
     """A gain trained by the default recipe."""
     config = Config(seed=seed)
-    place = (env_id(name), "benchmark", "nominal", TRAINING_SEED)
-    system, setup, record = record_of(*place, config.episodes)
-    return train(system, config, record=record, noise_std=setup.noise_std)
+    return by_name.train("pinn_gain", config, Game.of(name))
 
 
 def compared(name: str, condition: str, trained: TrainedGain) -> dict[str, float]:
     """The scores of a gain and of the EKF, both told the noise; see `summary`."""
     env = env_id(name)
-    system, setup, _ = record_of(env, "benchmark", condition, 0)
+    source = Game.of(name, condition=condition).source
+    system, setup = source.system, source.setup
     ekf, gain = EKF(system, setup.noise_std), PinnGain(system, setup.noise_std, trained=trained)
     scores = (evaluate(e, env, episodes=EPISODES, condition=condition) for e in (ekf, gain))
     return summary(*scores)
@@ -109,7 +109,8 @@ def asked(
 
 def speed(name: str, trained: TrainedGain, repeats: int) -> Iterator[Figure]:
     """Time per step and episode of a batch of 256."""
-    system, setup, record = record_of(env_id(name), "benchmark", "nominal", 0, 256)
+    game = Game.of(name)
+    system, setup, record = game.source.system, game.source.setup, game.record(range(256))
     steps = record.batch * record.num_samples
     gain = PinnGain(system, setup.noise_std, trained=trained)
     for label, estimator in (("EKF", EKF(system, setup.noise_std)), ("gain", gain)):

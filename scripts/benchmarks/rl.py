@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from benchmarks import Figure, at_least, at_most, median_ratio
 from pinnobs_gym import evaluate
-from pinnobs_gym.envs.registration import env_id, make_vector_env
+from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.envs.sb3_env import Sb3VecEnv
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
 from pinnobs_gym.leaderboard.standings_table import markdown_table
@@ -94,8 +95,7 @@ def _of(values: dict[str, float], start: str, end: str = "") -> float:
 
 def trained_on(name: str, seed: int) -> TrainedAgent:
     """An agent trained by the default recipe."""
-    played = by_name.Played(env_id(name), "benchmark", "nominal", by_name.TRAINING_SEED)
-    return by_name.train("rl", Config(seed=seed), played)
+    return by_name.train("rl", Config(seed=seed), Game.of(name))
 
 
 def scores(name: str, trained: TrainedAgent) -> list[Row]:
@@ -137,7 +137,7 @@ def speed(repeats: int) -> Iterator[Figure]:
     arguments: dict[str, Any] = {"action_mode": "gain", "reward": "improvement"}
 
     def own() -> VecEnv:
-        return Sb3VecEnv(make_vector_env(name, 256, "benchmark", "nominal", **arguments))
+        return Sb3VecEnv(Game.of(DUFFING).vector_env(256, **arguments))
 
     def peer() -> VecEnv:
         return DummyVecEnv([lambda: gym.make(name, **arguments) for _ in range(8)])

@@ -22,7 +22,7 @@ from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.kkl import KKL
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.files import append_lines
-from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.scoring.metrics import error_scores
 from pinnobs_gym.scoring.provenance import canonical
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.record import Record
@@ -151,7 +151,7 @@ def _row(
     scores = {}
     for window, start in WINDOWS.items():
         late = t >= start - 1e-9
-        values = score(t[late], x[None, late], xhat[None, late], (1.0, 1.0))
+        values = error_scores(t[late], x[None, late], xhat[None, late], (1.0, 1.0))
         scores[window] = {metric: float(values[metric][0]) for metric in METRICS}
     key = comparison.key(method, episode)
     seconds = trained.seconds

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.pinn_obs import Trained
-from pinnobs_gym.simulation.system import System
+from pinnobs_gym.scoring.playing import Played
 from trainers.pinn_obs import gain_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def estimates_figure(system: System, example: Mapping[str, Any], title: str) -> Figure:
-    """True states and estimates (see `state_figure`), the legend above instead of on the curves."""
-    figure = state_figure(system, title=title, **example)
+def estimates_figure(played: Played, title: str) -> Figure:
+    """True states and estimates of an episode, the legend above instead of on the curves."""
+    figure = played.figure(title)
     top = figure.axes[0]
     legend = top.get_legend()
     assert legend is not None

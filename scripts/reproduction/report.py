@@ -12,7 +12,7 @@ import numpy as np
 
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
-from reproduction.running import PLAYED, REPEATS, Job
+from reproduction.running import REPEATS, SETUP, Job
 from reproduction.tables import Case, Printed, Table
 from trainers.pinn_obs import Config
 
@@ -31,7 +31,7 @@ HEADER = (
 _NUMBERS = ("rmse", "mae", "replay_rmse", "loss", "seconds", "inference_ms")
 
 PROTOCOL = (
-    f"Ours: setup `{PLAYED[0]}`, without noise. RMSE and MAE are those of the network's own x̂(t), "
+    f"Ours: setup `{SETUP}`, without noise. RMSE and MAE are those of the network's own x̂(t), "
     "in state units, over all samples of the record and all states, the transient included. The "
     "replay is the observer integrated with the learned L(t) over the same record, which the paper "
     "does not score. The loss is that of the samples trained on, and “found at” the iteration that "
@@ -48,7 +48,7 @@ def starts(table: Table) -> str:
     """The records of a table: initial states and estimates, and samples."""
     parts, sizes = [], set()
     for name in dict.fromkeys(case.system for case in table.cases):
-        _, setup = SYSTEMS.resolve(name).configured(PLAYED[0])
+        _, setup = SYSTEMS.resolve(name).configured(SETUP)
         x0, xhat0 = (_vector(value) for value in (setup.x0_low, setup.xhat0))
         parts.append(f"{name} x₀ = {x0}, x̂₀ = {xhat0}")
         sizes.add(f"{setup.num_steps:,} samples over {setup.duration:g} s")

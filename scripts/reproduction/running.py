@@ -21,18 +21,18 @@ import torch
 from machine import processor
 
 from pinnobs_gym.cli.output import write_figure
-from pinnobs_gym.envs.registration import env_id, record_of
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, Trained
-from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.provenance import canonical, versions
 from pinnobs_gym.scoring.rows import Row
-from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import Log
 from reproduction.figures import estimates_figure, loss_figure, readable_gain_figure
 from reproduction.tables import Case
 from trainers.pinn_obs import Config, train
 
-PLAYED = ("paper", "nominal", 0)
+SETUP = "paper"
+SEED = 0
 """Setup, condition and seed of the episode."""
 REPEATS = 20
 """How often inference is timed; the median counts."""
@@ -90,7 +90,7 @@ class Job:
 
 def _digest(case: Case, config: Config) -> str:
     kind = f"{Config.__module__}.{Config.__qualname__}"
-    decides = {"system": case.system, "played": PLAYED, kind: config}
+    decides = {"system": case.system, "played": (SETUP, SEED), kind: config}
     text = json.dumps(canonical(decides), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -109,15 +109,15 @@ def run(job: Job, progress: bool = False) -> Row:
         KeyboardInterrupt: on Ctrl-C; the last checkpoint stays.
     """
     torch.set_num_threads(1)
-    name = env_id(job.case.system)
-    system, setup, record = record_of(name, *PLAYED)
+    game = _game(job)
+    system, record = game.source.system, game.record([SEED])
     checkpoint, resume = job.folder / CHECKPOINT, job.prepare()
     with _stopping() as check, Log(job.folder / "tensorboard") as log:
         trained = train(
             system,
             job.config,
             record=record,
-            noise_std=setup.noise_std,
+            noise_std=game.source.setup.noise_std,
             log=log,
             checkpoint=checkpoint,
             resume=resume,
@@ -125,7 +125,7 @@ def run(job: Job, progress: bool = False) -> Row:
         )
         check()
     trained.save(job.folder / "trained.pt")
-    scores, curve = _scores(job, system, trained), loss_curve(job.folder / "tensorboard")
+    scores, curve = _scores(job, game, trained), loss_curve(job.folder / "tensorboard")
     write_figure(job.folder / "gain.png", readable_gain_figure(trained))
     write_figure(job.folder / "loss.png", loss_figure(curve, f"{trained.system}: as minimised"))
     budget = job.config.budget
@@ -172,19 +172,23 @@ def _stopping() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _scores(job: Job, system: System, trained: Trained) -> dict[str, float]:
+def _game(job: Job) -> Game:
+    """What is played: the paper's setup."""
+    return Game.of(job.case.system, SETUP)
+
+
+def _scores(job: Job, game: Game, trained: Trained) -> Row:
     """The scores of the network and of its replay, each with a picture."""
-    found: dict[str, float] = {}
+    found: Row = {}
     for prefix, picture, cls in (
         ("", "states", PinnObsDirect),
         ("replay_", "replay", PinnObsReplay),
     ):
-        setup, condition, seed = PLAYED
-        estimator = cls.of(system, trained)
-        (row,), example = score_batch(estimator, env_id(job.case.system), setup, condition, [seed])
+        played = play(game, cls.of(game.source.system, trained), [SEED])
+        row: Row = played.scores.rows()[0]
         found |= {f"{prefix}{name}": row[name] for name in ("rmse", "mae")}
         rmse = f"RMSE {row['rmse']:.3g}" if math.isfinite(row["rmse"]) else "diverges"
-        figure = estimates_figure(system, example, f"{job.case.system}, {cls.name}: {rmse}")
+        figure = estimates_figure(played, f"{job.case.system}, {cls.name}: {rmse}")
         write_figure(job.folder / f"{picture}.png", figure)
     return found
 

@@ -9,7 +9,7 @@ from linear import Linear
 
 from pinnobs_gym.cli import main, video
 from pinnobs_gym.cli.video import Pace, write_video
-from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring import rows
 
@@ -102,7 +102,7 @@ def test_an_estimate_that_is_not_finite_ends_the_video(tmp_path):
     estimator = Lost.for_setup(Linear(), setup)
     path = tmp_path / "lost.mp4"
     path.write_text("of an earlier run")
-    pace = write_video(path, estimator, env_id(Linear), "benchmark", "nominal", 0)
+    pace = write_video(path, estimator, Game.of(Linear), 0)
     _, frames = read(path, (336, 640))
     assert abs(len(frames) - (6 + round(pace.fps))) <= 1
     assert len(list(tmp_path.iterdir())) == 1

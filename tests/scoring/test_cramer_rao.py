@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring.cramer_rao import cramer_rao, exact_bayes, expected_scores, step_error
-from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.scoring.metrics import error_scores
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.system import Setup
 from pinnobs_gym.systems import SYSTEMS
@@ -81,7 +81,7 @@ def test_expected_scores_are_those_of_errors_of_these_covariances():
     x, scale = np.zeros_like(error), (2.0, 5.0)
     scored = np.ones(x.shape, dtype=bool)
     scored[:, ::2, 0] = False
-    scores = score(np.arange(20.0), x, error, scale, scored=scored)
+    scores = error_scores(np.arange(20.0), x, error, scale, scored=scored)
     expected = expected_scores(np.repeat(P[None], 4000, axis=0), scale, scored)
     for name, values in expected.items():
         assert np.sqrt(np.mean(scores[name] ** 2)) == pytest.approx(values[0], rel=0.01)

@@ -9,12 +9,14 @@ import pytest
 from linear import Linear
 
 from pinnobs_gym.cli import main
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import Estimator, Range, State
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring import rows, tuning
 from pinnobs_gym.scoring.evaluation import evaluate
+from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.tuning import TUNING_SEED, Search
 
 pytest.importorskip("optuna")
@@ -42,14 +44,8 @@ class Stubborn(Estimator):
 
 def search(path, **changes):
     chosen = {"estimator": Stubborn, "condition": "nominal", "episodes": 8, **changes}
-    return Search(
-        chosen["estimator"],
-        env_id(Linear),
-        "benchmark",
-        chosen["condition"],
-        chosen["episodes"],
-        path / "trials",
-    )
+    game = Game.of(Linear, condition=chosen["condition"])
+    return Search(chosen["estimator"], game, chosen["episodes"], path / "trials")
 
 
 @pytest.mark.parametrize("name", ESTIMATORS.classes())
@@ -106,14 +102,17 @@ def test_it_goes_on_with_what_was_tried(tmp_path):
 def test_episodes_are_never_the_leaderboards(tmp_path, monkeypatch):
     seen = []
 
-    def record(estimator, env, setup, condition, seeds):
+    def noted(game, estimator, seeds):
         seen.extend(seeds)
-        return [{"diverged": False, "nrmse": 1.0}, {"diverged": True, "nrmse": 0.1}], {}
+        played = play(game, estimator, seeds)
+        played.estimates.xhat[0] = played.truth[0] + 0.5  # of the scale, and diverged
+        played.estimates.xhat[1] = played.truth[1] + 0.1
+        return played
 
-    monkeypatch.setattr(tuning, "score_batch", record)
+    monkeypatch.setattr(tuning, "play", noted)
     error = search(tmp_path, episodes=2).error({})
     assert seen == [TUNING_SEED, TUNING_SEED + 1]
-    assert error == pytest.approx(10**0.5)  # one that diverged counts as 10
+    assert error == pytest.approx((10 * 0.1) ** 0.5)  # one that diverged counts as 10
 
 
 def test_the_error_is_the_geometric_mean_of_nrmse(tmp_path):
@@ -176,7 +175,7 @@ def test_ctrl_c_keeps_what_was_tried_and_the_next_run_goes_on(tmp_path, monkeypa
         text=True,
     )
     path = tmp_path / "tune" / "Academic-v0-benchmark-dt5-ekf.journal"
-    one = Search(EKF, "pinnobs/Academic-v0", "benchmark", "dt5", 4, path)
+    one = Search(EKF, Game.of("Academic", condition="dt5"), 4, path)
     deadline = time.monotonic() + 120
     while not (path.exists() and path.stat().st_size and one.done() >= 5):
         assert process.poll() is None, process.communicate()

@@ -11,7 +11,7 @@ from linear import H, Linear, linear_record
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_lyapunov, solve_sylvester
 
-from pinnobs_gym.envs.registration import record_of
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS
 from pinnobs_gym.estimation.learned.kkl_dynamics import (
     Dynamics,
@@ -46,7 +46,8 @@ def linear_T(dynamics, plant=PLANT):
 def trained_on(name, system="ReverseDuffing", noise_std=None, part=1.0, **settings):
     """Trained on the sample times of the first part of an episode."""
     module = trainer(name)
-    plant, setup, whole = record_of(f"pinnobs/{system}-v0", "benchmark", "nominal", 10**6)
+    game = Game.of(system)
+    plant, setup, whole = game.source.system, game.source.setup, game.record([10**6])
     n = round(part * whole.num_samples)
     record = Record(whole.t[:n], whole.y[:, :n], whole.u[:, :n], whole.prior)
     told = setup.noise_std if noise_std is None else noise_std
@@ -362,7 +363,7 @@ def test_they_estimate_and_conform(name, system, tmp_path):
     again = type(observer).load(path, plant)
     assert again.training == observer.training
     assert asdict(again.trained.clock) == asdict(trained.clock)
-    _, _, record = record_of(f"pinnobs/{system}-v0", "benchmark", "nominal", 10**6 + 5, 3)
+    record = Game.of(system).record(range(10**6 + 5, 10**6 + 8))
     np.testing.assert_array_equal(again.run(record).xhat, observer.run(record).xhat)
 
 
@@ -370,11 +371,10 @@ def test_it_is_exact_where_it_was_trained():
     """An observer of few seconds' training is far better than its prior."""
     trained, plant, setup, _ = trained_on("kkl_supervised", iterations=150, width=16)
     observer = KKLSupervised(plant, setup.noise_std, trained=trained)
-    source, _, record = record_of("pinnobs/ReverseDuffing-v0", "benchmark", "nominal", 10**6 + 5, 8)
+    record = Game.of("ReverseDuffing").record(range(10**6 + 5, 10**6 + 13))
     xhat = observer.run(record).xhat
     error = xhat[..., :1] - record.y
     assert np.sqrt((error[:, 500:] ** 2).mean()) < 0.06  # 0.02 of it is the output's noise
-    assert source.nx == 2
 
 
 @pytest.mark.parametrize("name", TRAINERS)
@@ -393,7 +393,8 @@ def test_the_faithful_preset_trains(name, system):
 @pytest.mark.parametrize("name", TRAINERS)
 def test_the_same_seed_gives_the_same_weights_and_resuming_is_exact(name, tmp_path, monkeypatch):
     module = trainer(name)
-    system, setup, record = record_of("pinnobs/ReverseDuffing-v0", "benchmark", "nominal", 10**6)
+    game = Game.of("ReverseDuffing")
+    system, setup, record = game.source.system, game.source.setup, game.record([10**6])
     config = module.Config(**{**SMALL, "iterations": 40, "checkpoint_every": 10})
     arguments = {"record": record, "noise_std": setup.noise_std}
     whole = module.train(system, config, **arguments)
@@ -506,7 +507,8 @@ def test_a_file_of_another_system_or_trainer_is_refused(tmp_path):
 
 def test_a_measured_input_is_refused():
     module = trainer("kkl_supervised")
-    system, _, record = record_of("pinnobs/InductionMotor-v0", "benchmark", "nominal", 10**6)
+    game = Game.of("InductionMotor")
+    system, record = game.source.system, game.record([10**6])
     with pytest.raises(ValueError, match="InductionMotor has a measured input"):
         module.train(replace(system, measured_input=True), module.Config(), record=record)
     short = Record(record.t[:5], record.y[:, :5], record.u[:, :5], record.prior)

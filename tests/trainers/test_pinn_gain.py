@@ -10,7 +10,7 @@ import torch
 from linear import Linear
 
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
-from pinnobs_gym.envs.registration import env_id, record_of
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS
 from pinnobs_gym.estimation.kalman import update_with
 from pinnobs_gym.estimation.learned.gain_network import memory_size, shapes
@@ -230,9 +230,8 @@ def test_training_is_not_worse_than_the_ekf_on_the_records_held_out():
 
 def test_training_sees_a_record_alone(monkeypatch):
     """Whoever trains gets outputs, inputs, times and the prior; the truth is computed before."""
-    system, setup, record = record_of(
-        env_id("ReverseDuffing"), "benchmark", "nominal", TRAINING_SEED, 10
-    )
+    game = Game.of("ReverseDuffing")
+    record = game.record(range(TRAINING_SEED, TRAINING_SEED + 10))
     assert record.batch == 10
     assert [f.name for f in fields(record)] == ["t", "y", "u", "prior"]
     record = Record(record.t[:50], record.y[:, :50], record.u[:, :50], record.prior)
@@ -242,6 +241,7 @@ def test_training_sees_a_record_alone(monkeypatch):
 
     monkeypatch.setattr("pinnobs_gym.simulation.truth.truth", refuse)
     monkeypatch.setattr("pinnobs_gym.envs.episodes.truth", refuse)
+    system, setup = game.source.system, game.source.setup
     train(system, SMALL, record=record, noise_std=setup.noise_std)
 
 

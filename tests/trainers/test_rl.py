@@ -20,17 +20,18 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pinnobs_gym import evaluate
 from pinnobs_gym.cli import main as cli
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.checks import check_estimator
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from pinnobs_gym.training.by_name import TRAINING_SEED, Played, train
+from pinnobs_gym.training.by_name import TRAINING_SEED, train
 from pinnobs_gym.training.log import Log
 from trainers.rl import Config
 from trainers.rl.agent import begin, options
 
-DUFFING = Played("pinnobs/ReverseDuffing-v0", "benchmark", "nominal", TRAINING_SEED)
+DUFFING = Game.of("ReverseDuffing")
 SMALL = {"steps": 512, "rows": 4, "rollout": 16, "batch": 32, "epochs": 2, "width": 8}
 SMALL |= {"held_out": 4, "check_every": 256}
 KINDS = [
@@ -53,7 +54,9 @@ def agent() -> TrainedAgent:
 
 
 def scores(estimator: Sb3) -> list[float]:
-    return [row["nrmse"] for row in evaluate(estimator, DUFFING.env_id, episodes=3, seed=2_000_000)]
+    return [
+        row["nrmse"] for row in evaluate(estimator, DUFFING.name.env_id, episodes=3, seed=2_000_000)
+    ]
 
 
 # What it computes
@@ -62,7 +65,7 @@ def scores(estimator: Sb3) -> list[float]:
 @pytest.mark.parametrize(("algorithm", "mode"), KINDS)
 def test_actions_are_those_of_sb3(algorithm: str, mode: str) -> None:
     """Without exploration, with normalisation, over steps that a recurrent layer remembers."""
-    training = begin(ReverseDuffing(), small(algorithm, mode), DUFFING)
+    training = begin(ReverseDuffing(), small(algorithm, mode), DUFFING, TRAINING_SEED)
     env, model = training.env, training.model
     rng = np.random.default_rng(0)
     features = env.reset()
@@ -91,14 +94,14 @@ def test_actions_are_those_of_sb3(algorithm: str, mode: str) -> None:
 )
 def test_conforms(system: str, mode: str) -> None:
     plant = SYSTEMS.resolve(system)()
-    played = DUFFING._replace(env_id=f"pinnobs/{system}-v0")
+    played = Game.of(system)
     training = begin(plant, small(mode=mode), played)
     check_estimator(Sb3(plant, trained=training.agent(0.0, 0.0)))
 
 
 def test_the_estimator_is_the_agent_in_its_env() -> None:
     """The estimates of a record are those that the env scores when the agent plays it."""
-    training = begin(ReverseDuffing(), small(rows=3, batch=48), DUFFING)
+    training = begin(ReverseDuffing(), small(rows=3, batch=48), DUFFING, TRAINING_SEED)
     kept = training.agent(0.0, 0.0)
     env: Any = training.env.unwrapped.env  # pyright: ignore
     observations, infos = env.reset(seed=9)
@@ -124,7 +127,7 @@ def test_the_best_gain_of_a_schedule_is_learned() -> None:
     learned = train("rl", config, DUFFING)
     rows = evaluate(
         Sb3(ReverseDuffing(), learned.setup["noise_std"], trained=learned),
-        DUFFING.env_id,
+        DUFFING.name.env_id,
         episodes=20,
         seed=2_000_000,
     )
@@ -179,7 +182,7 @@ def test_a_loaded_agent_has_the_same_scores_to_the_bit(
 
 def test_its_rows_say_what_training_saw(agent: TrainedAgent) -> None:
     estimator = Sb3(ReverseDuffing(), agent.setup["noise_std"], trained=agent)
-    row = evaluate(estimator, DUFFING.env_id, episodes=1, seed=2_000_000)[0]
+    row = evaluate(estimator, DUFFING.name.env_id, episodes=1, seed=2_000_000)[0]
     assert row["track"] == "online"
     assert "true states in training" in row["knows"]
     assert row["training"]["reward"] == "of the true states"
@@ -243,7 +246,7 @@ def test_bad_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"the checkpoint file .* is missing"):
         train("rl", small(), DUFFING, **go_on)
     train("rl", small(steps=64), DUFFING, checkpoint=checkpoint)
-    academic = DUFFING._replace(env_id="pinnobs/Academic-v0")
+    academic = Game.of("Academic")
     with pytest.raises(ValueError, match="trained with system='ReverseDuffing'; expected 'Acad"):
         train("rl", small(), academic, **go_on)
     with pytest.raises(ValueError, match="action_mode='gain'; expected 'correction'"):

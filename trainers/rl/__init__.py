@@ -11,9 +11,9 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.sb3 import TrainedAgent
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.training.by_name import Played
 from pinnobs_gym.training.log import SILENT, Log
 from pinnobs_gym.training.loop import bar, interruption
 from trainers.rl.config import Config
@@ -25,7 +25,8 @@ def train(
     system: System,
     config: Config,
     *,
-    played: Played,
+    game: Game,
+    seed: int,
     log: Log = SILENT,
     checkpoint: Path | None = None,
     resume: bool = False,
@@ -39,7 +40,8 @@ def train(
     Args:
         system: the model.
         config: the recipe.
-        played: which env is played, and the first of the seeds that no one is scored on.
+        game: what is played.
+        seed: of the first episode; no one is scored on these.
         log: where curves go, in SB3's own layout.
         checkpoint: a file to keep SB3's agent in, written again as training goes on; its
             normalisation lies beside it, ending in ``.vecnormalize.pkl``, and the best agent so
@@ -64,9 +66,9 @@ def train(
     config = config.filled()
     begun = time.process_time()
     if resume and checkpoint is not None:
-        training = restore(system, config, played, checkpoint)
+        training = restore(system, config, game, seed, checkpoint)
     else:
-        training = begin(system, config, played)
+        training = begin(system, config, game, seed)
     model = training.model
     folder = log.folder
     model.set_logger(

@@ -19,12 +19,11 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import nn
 
-from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.sb3_env import Sb3VecEnv
 from pinnobs_gym.estimation.learned.trained_file import check_same, identity
 from pinnobs_gym.estimators.sb3 import Layer, TrainedAgent, setup_of
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.training.by_name import Played
 from trainers.rl.config import Config
 
 SEEDS_APART = 1000
@@ -43,7 +42,9 @@ class Training:
 
     system: System
     config: Config
-    played: Played
+    game: Game
+    seed: int
+    """Of the first episode."""
     model: BaseAlgorithm
     env: VecNormalize
     earlier: float = 0.0
@@ -96,9 +97,9 @@ class Training:
         temporary.replace(checkpoint)
 
 
-def begin(system: System, config: Config, played: Played) -> Training:
+def begin(system: System, config: Config, game: Game, seed: int) -> Training:
     """An agent that knows nothing, and the env that it is to play."""
-    venv = _venv(config, played, played.seed)
+    venv = _venv(config, game, seed)
     env = VecNormalize(
         venv, norm_reward=config.action_mode == "normalized", gamma=config.gamma or 0.0
     )
@@ -106,10 +107,10 @@ def begin(system: System, config: Config, played: Played) -> Training:
     policy = "MlpLstmPolicy" if config.algorithm == "recurrent_ppo" else "MlpPolicy"
     chosen = options(config, shape[0])
     model = _algorithm(config)(policy, env, seed=config.seed, device="cpu", **chosen)
-    return Training(system, config, played, model, env)
+    return Training(system, config, game, seed, model, env)
 
 
-def restore(system: System, config: Config, played: Played, checkpoint: Path) -> Training:
+def restore(system: System, config: Config, game: Game, seed: int, checkpoint: Path) -> Training:
     """The agent in a checkpoint, to be trained further.
 
     Raises:
@@ -129,7 +130,7 @@ def restore(system: System, config: Config, played: Played, checkpoint: Path) ->
         ) from None
     check_same(checkpoint, facts, _facts(system, config))
     # Other episodes than those played so far: the state of the env is not in the checkpoint.
-    venv = _venv(config, played, played.seed + RESUMED + model.num_timesteps)
+    venv = _venv(config, game, seed + RESUMED + model.num_timesteps)
     try:
         env = VecNormalize.load(str(parts["normalization"]), venv)
     except Exception as error:
@@ -137,15 +138,15 @@ def restore(system: System, config: Config, played: Played, checkpoint: Path) ->
         raise ValueError(f"{parts['normalization']} is damaged: {reason}") from None
     model.set_env(env)
     best = TrainedAgent.load(parts["best"], system) if parts["best"].exists() else None
-    return Training(system, config, played, model, env, facts["seconds"], best)
+    return Training(system, config, game, seed, model, env, facts["seconds"], best)
 
 
-def _venv(config: Config, played: Played, seed: int) -> VecMonitor:
+def _venv(config: Config, game: Game, seed: int) -> VecMonitor:
     """The rows that are played, of seeds from this one on."""
     assert config.rows is not None
     learns_gain = config.action_mode != "normalized"
-    env = make_vector_env(
-        *(played.env_id, config.rows, played.setup, played.condition),
+    env = game.vector_env(
+        config.rows,
         action_mode=config.action_mode,
         stack_outputs=config.stack,
         reward="improvement" if learns_gain else "error",

@@ -12,7 +12,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
-from pinnobs_gym.scoring.playing import score_batch
+from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.scoring.playing import play
 from trainers.rl.agent import Training
 
 HELD_OUT = 500_000
@@ -68,15 +69,15 @@ class Watch(BaseCallback):
         self._looked = training.model.num_timesteps
         agent = training.agent(math.nan, self.seconds)
         estimator = Sb3(training.system, agent.setup["noise_std"], trained=agent)
-        played, first = training.played, training.played.seed + HELD_OUT
-        seeds = list(range(first, first + training.config.held_out))
-        rows, _ = score_batch(estimator, played.env_id, played.setup, played.condition, seeds)
+        first = training.seed + HELD_OUT
+        played = play(training.game, estimator, range(first, first + training.config.held_out))
+        scores = score(played.system, played.record, played.truth, played.estimates)
         parts = ("nrmse_modulo", "nrmse_tail_modulo")
-        medians = {p: float(np.median([row[p] for row in rows])) for p in parts}
+        medians = {p: float(np.median(getattr(scores, p))) for p in parts}
         self._loss = math.sqrt(math.prod(medians.values()))
         for name, value in medians.items():
             self.logger.record(f"held_out/{name}", value)
-        self.logger.record("held_out/diverged", float(np.mean([r["diverged"] for r in rows])))
+        self.logger.record("held_out/diverged", float(scores.diverged.mean()))
         if training.best is None or self._loss < training.best.loss:
             training.best = training.agent(self._loss, self.seconds)
         self.logger.record("held_out/best", training.best.loss)

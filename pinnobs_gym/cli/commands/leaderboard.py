@@ -83,7 +83,7 @@ class Leaderboard:
                 view.ended(job.name, error)
         stored = rows.load(path)
         tensorboard.log_summaries(self.out, stored.rows)
-        self._report(stored, {job.condition for job in jobs})
+        self._report(stored, {job.game.name.condition for job in jobs})
         if left_out:
             console.print(
                 f"{len(left_out)} job(s) failed before and were left out; --retry-failed runs "

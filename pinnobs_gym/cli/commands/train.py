@@ -15,15 +15,12 @@ from pinnobs_gym import registry
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.output import write_figure
-from pinnobs_gym.envs import registration
-from pinnobs_gym.envs.figures import state_figure
-from pinnobs_gym.envs.registration import env_id, make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.scoring import acceptance
-from pinnobs_gym.scoring.playing import score_batch
-from pinnobs_gym.simulation.conditions import canonical_name
+from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.training import by_name
 from pinnobs_gym.training.log import Log
 
@@ -58,12 +55,8 @@ def run(arguments: Sequence[str]) -> int:
     module = registry.trainer(name)
     chosen = _chosen_training(name, module.Config, arguments[1:])
     check_writable(chosen.out)
-    env = env_id(chosen.system)
-    condition = canonical_name(chosen.condition)
-    played = by_name.Played(env, chosen.setup, condition, chosen.episode)
-    source = make_vector_env(env, 1, chosen.setup, condition).source
-    system, setup = source.system, source.setup
-    title = f"{env.removeprefix('pinnobs/')}-{chosen.setup}-{condition}"
+    game = Game.of(chosen.system, chosen.setup, chosen.condition)
+    title = game.name.file_stem
     stem = chosen.out / f"{title}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
     path = stem.with_name(stem.name + ".pt")
@@ -76,7 +69,8 @@ def run(arguments: Sequence[str]) -> int:
         result = by_name.train(
             name,
             chosen.config,
-            played,
+            game,
+            chosen.episode,
             log=log,
             checkpoint=checkpoint,
             resume=chosen.resume,
@@ -85,8 +79,7 @@ def run(arguments: Sequence[str]) -> int:
         result.save(path)
         pictures = {}
         if hasattr(module, "figures"):
-            record = registration.record_of(*played)[2]
-            pictures = module.figures(system, result, record)
+            pictures = module.figures(game.source.system, result, game.record([chosen.episode]))
         for kind, figure in pictures.items():
             log.figure(f"trained/{kind}", figure, result.iterations)
             write_figure(stem.with_name(f"{stem.name}-{kind}.png"), figure)
@@ -97,10 +90,10 @@ def run(arguments: Sequence[str]) -> int:
         console.print(f"picture: {stem.with_name(f'{stem.name}-{kind}.png')}", soft_wrap=True)
     for label, cls in ESTIMATORS.classes().items():
         if cls.needs_training == name:
-            estimator = by_name.load(cls, path, system, setup)
-            example = _report_training(label, estimator, played, result.loss)
+            estimator = by_name.load(cls, path, game)
+            own = _report_training(label, estimator, game, chosen.episode, result.loss)
             picture = stem.with_name(f"{stem.name}-{label}.png")
-            write_figure(picture, state_figure(system, title=f"{label}: {title}", **example))
+            write_figure(picture, own.figure(f"{label}: {title}"))
             console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"trained file: {path}", soft_wrap=True)
     if checkpoint.exists():
@@ -123,14 +116,13 @@ def _chosen_training(name: str, config: type, arguments: Sequence[str]) -> Train
 
 
 def _report_training(
-    label: str, estimator: Estimator, played: by_name.Played, loss: float
-) -> dict[str, Any]:
-    """Print how a trained estimator does; returns what `state_figure` draws of its own record."""
+    label: str, estimator: Estimator, game: Game, episode: int, loss: float
+) -> Played:
+    """Print how a trained estimator does; returns what it makes of its own record."""
     if estimator.track == "online":
-        found, example = acceptance.replays(estimator, *played)
+        found = acceptance.replays(estimator, game, episode)
     else:
-        own, example = score_batch(estimator, *played[:-1], [played[-1]])
-        found = [acceptance.Replay("own record", own[0])]
+        found = [acceptance.Replay("own record", play(game, estimator, [episode]))]
     for replay in found:
         row = replay.scores
         console.print(
@@ -140,4 +132,4 @@ def _report_training(
         )
     if estimator.track == "online" and (told := acceptance.warning(loss, found[0].scores)):
         console.print(f"warning: {told}", style="yellow")
-    return example
+    return found[0].played

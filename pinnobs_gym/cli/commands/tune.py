@@ -11,11 +11,10 @@ import tyro
 
 from pinnobs_gym.cli.console import console, progress
 from pinnobs_gym.cli.options import parse
-from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.scoring.tuning import Search, Tried
-from pinnobs_gym.simulation.conditions import canonical_name
 
 
 @dataclass(frozen=True)
@@ -44,13 +43,11 @@ class Tune:
         """Search, and print the best settings."""
         if self.trials < 1:
             raise ValueError(f"trials={self.trials}; expected at least 1")
-        cls, env = ESTIMATORS.resolve(self.name), env_id(self.system)
+        cls = ESTIMATORS.resolve(self.name)
+        game = Game.of(self.system, self.setup, self.condition)
         check_writable(self.out)
-        condition = canonical_name(self.condition)
-        game = f"{env.removeprefix('pinnobs/')}-{self.setup}-{condition}"
-        path = self.out / f"{game}-{ESTIMATORS.name_of(cls)}.journal"
-        played = (env, self.setup, condition, self.episodes)
-        search = Search(cls, *played, path, self.seed)
+        path = self.out / f"{game.name.file_stem}-{ESTIMATORS.name_of(cls)}.journal"
+        search = Search(cls, game, self.episodes, path, self.seed)
         done = search.done()
         default = Tried({}, search.error({}))
         console.print(f"default: geometric mean NRMSE {default.error:.4g}", highlight=False)

@@ -9,15 +9,16 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from pinnobs_gym.envs.registration import env_id, make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.registry import trainer
 from pinnobs_gym.scoring import rows as rows_module
-from pinnobs_gym.scoring.evaluation import Results, run_episodes
+from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes
 from pinnobs_gym.scoring.provenance import canonical, now, versions
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder
-from pinnobs_gym.training.by_name import TRAINING_SEED, Played, load, train, trainer
+from pinnobs_gym.training.by_name import load, train
 from pinnobs_gym.training.log import Log
 
 
@@ -25,12 +26,10 @@ from pinnobs_gym.training.log import Log
 class Job:
     """One evaluation, to be run in any process."""
 
-    system: str
-    """Name or ``module:Class`` of the system."""
+    game: Game
+    """What is played."""
     estimator: str
     """Name or ``module:Class`` of the estimator."""
-    setup: str
-    condition: str
     episodes: int
     seed: int
     folder: Path
@@ -55,7 +54,8 @@ class Job:
     def name(self) -> str:
         """What the job does, in a few words."""
         many = f"{self.episodes} episodes" if self.episodes > 1 else f"episode {self.seed}"
-        return f"{self.label or self.estimator} on {self.system}, {self.condition}, {many}"
+        system, condition = self.game.system.partition(":")[2], self.game.name.condition
+        return f"{self.label or self.estimator} on {system}, {condition}, {many}"
 
     @property
     def digest(self) -> str:
@@ -85,9 +85,7 @@ class Job:
         return {
             "schema": rows_module.SCHEMA,
             "kind": kind,
-            "env_id": env_id(self.system),
-            "setup": self.setup,
-            "condition": self.condition,
+            **self.game.name._asdict(),
             "estimator": self.label or ESTIMATORS.name_of(ESTIMATORS.resolve(self.estimator)),
             "episode_seed": self.seed,
             "episodes": self.episodes,
@@ -99,48 +97,42 @@ class Job:
 
 def run_job(job: Job) -> None:
     """Train if the estimator needs it, evaluate, and append the rows that are missing."""
-    import torch
-
-    torch.set_num_threads(1)
-    name = env_id(job.system)
     cls = ESTIMATORS.resolve(job.estimator)
+    if cls.needs_training or cls.trains_on_record:
+        import torch
+
+        torch.set_num_threads(1)  # a job is one thread
     options = dict(job.settings)
-    estimator: Estimator | type[Estimator] = cls
+    chosen: Estimator | type[Estimator] = cls
     if cls.trains_on_record is not None:
         recipe = trainer(cls.trains_on_record).Config(**job.training)
-        place = f"{_played(job)}-{cls.trains_on_record}-{_digest(recipe)}-episode{job.seed}"
+        stem = job.game.name.file_stem
+        place = f"{stem}-{cls.trains_on_record}-{_digest(recipe)}-episode{job.seed}"
         options = {"config": recipe, "folder": job.folder / "trained" / place}
     elif cls.needs_training is not None:
-        estimator = trained(cls, job)
+        chosen = trained(cls, job)
+    estimator = make_estimator(chosen, job.game, options)
     seeds = range(job.seed, job.seed + job.episodes)
     results = Results(job.rows, job.known)
-    found, made, example = run_episodes(
-        estimator, name, seeds, job.setup, job.condition, options, results, label=job.label
-    )
-    scored = [row for row in found if "nrmse" in row]
-    if example is not None:  # something was run, and not all of it was there already
+    found = run_episodes(job.game, estimator, seeds, results, label=job.label)
+    scored = [row for row in found.rows if "nrmse" in row]
+    if found.first_played is not None:  # not all of it was there already
         with Log(log_folder(job.folder, scored[0])) as log:
-            log_episodes(log, scored, made, example)
+            log_episodes(log, scored, found.first_played)
 
 
 def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on episodes that are never scored, loaded if that was done before."""
     name = str(cls.needs_training)
     recipe = trainer(name).Config(**{**cls.recipe, **job.training})
-    played = Played(env_id(job.system), job.setup, job.condition, TRAINING_SEED)
-    label = f"{_played(job)}-{name}-{_digest(recipe)}"
+    label = f"{job.game.name.file_stem}-{name}-{_digest(recipe)}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = train(name, recipe, played, log=log)
+            result = train(name, recipe, job.game, log=log)
         if not path.exists():  # of two that trained at the same time, the first counts
             result.save(path)
-    source = make_vector_env(played.env_id, 1, played.setup, played.condition).source
-    return load(cls, path, source.system, source.setup)
-
-
-def _played(job: Job) -> str:
-    return f"{env_id(job.system).removeprefix('pinnobs/')}-{job.setup}-{job.condition}"
+    return load(cls, path, job.game)
 
 
 def _digest(recipe: Any) -> str:

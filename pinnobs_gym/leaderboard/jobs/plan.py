@@ -9,16 +9,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.envs.episodes import EpisodeSource
-from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
+from pinnobs_gym.registry import trainer
 from pinnobs_gym.scoring.rows import Stored
-from pinnobs_gym.simulation.conditions import canonical_name, fitting
+from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training.by_name import trainer
 
 
 def default_estimators() -> tuple[str, ...]:
@@ -48,33 +47,29 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
             raise suite.wrong("estimators", told)
     quick, long = [], []
     for system in suite.systems or tuple(SYSTEMS.classes()):
-        for game, (entry, cls) in product(_games(suite, system), chosen):
+        for table, (entry, cls) in product(_tables(suite, system), chosen):
             if cls.needs_training or cls.trains_on_record:
-                if not game.untrained_only:
-                    long += _learning(suite, entry, cls, game, folder)
+                if not table.untrained_only:
+                    long += _learning(suite, entry, cls, table.game, folder)
             else:
-                _check_settings(suite, entry, cls, game.source, {})
-                quick.append(_job(suite, entry, game, folder, settings=entry.settings))
+                _check_settings(suite, entry, cls, table.game, {})
+                quick.append(_job(suite, entry, table.game, folder, settings=entry.settings))
     return long + quick
 
 
 @dataclass(frozen=True)
-class Game:
-    """What is played."""
+class Table:
+    """A game, and who plays it."""
 
-    system: str
-    condition: str
-    source: EpisodeSource
+    game: Game
     untrained_only: bool
     """Whether estimators that need training leave it out."""
 
 
 def _job(suite: Suite, entry: Entry, game: Game, folder: Path, **more: Any) -> Job:
     return Job(
-        system=game.system,
+        game=game,
         estimator=entry.name,
-        setup=suite.setup,
-        condition=game.condition,
         episodes=1 if game.source.deterministic else suite.episodes,
         seed=suite.seed,
         folder=folder,
@@ -91,7 +86,7 @@ def _learning(
     seeds = [{"seed": seed} for seed in suite.training_seeds] or [{}]
     for budget, seed in product(suite.budgets, seeds):
         training = {"budget": budget, **seed, **entry.settings}
-        _check_settings(suite, entry, cls, game.source, training)
+        _check_settings(suite, entry, cls, game, training)
         job = _job(suite, entry, game, folder, training=training)
         if cls.trains_on_record is None:
             yield job
@@ -103,10 +98,12 @@ def _learning(
 def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[Job], list[Job]]:
     """The jobs to run, each told what of it is stored already, and those that are left out since
     they failed before; with ``retry_failed`` they are run again."""
-    there: dict[tuple[str, ...], list[tuple[str, int | None, int]]] = defaultdict(list)
+    there: dict[tuple[GameName, str], list[tuple[str, int | None, int]]] = defaultdict(list)
     for row in stored.rows:
-        game = (row["env_id"], row["setup"], row["condition"], row["estimator"])
-        there[game].append((row["config_hash"], row["training_seed"], row["episode_seed"]))
+        name = GameName(row["env_id"], row["setup"], row["condition"])
+        there[name, row["estimator"]].append(
+            (row["config_hash"], row["training_seed"], row["episode_seed"])
+        )
     failed = {row["job"] for row in stored.failures}
     to_run, left_out = [], []
     for job in jobs:
@@ -118,7 +115,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
         cls = ESTIMATORS.resolve(job.estimator)
         if job.label is not None or cls.label is Estimator.label:
             name = job.label or ESTIMATORS.name_of(cls)
-            found = there[env_id(job.system), job.setup, job.condition, name]
+            found = there[job.game.name, name]
             seeds = range(job.seed, job.seed + job.episodes)
             known = frozenset(entry for entry in found if entry[2] in seeds)
         to_run.append(replace(job, known=known, failed=again))
@@ -135,11 +132,10 @@ def _class(suite: Suite, entry: Entry) -> type[Estimator]:
     return cls
 
 
-def _games(suite: Suite, system: str) -> list[Game]:
+def _tables(suite: Suite, system: str) -> list[Table]:
     """What of a system is played."""
     try:
         cls = SYSTEMS.resolve(system)
-        env_id(system)  # registers it
     except ValueError as error:
         raise suite.wrong("systems", error) from error
     try:
@@ -154,21 +150,21 @@ def _games(suite: Suite, system: str) -> list[Game]:
         names = dict.fromkeys([*ranked, *fitting(model, setup)])
     else:
         names, ranked = suite.conditions or ranked, list(suite.conditions or ranked)
-    games = []
+    tables: dict[GameName, Table] = {}
     for name in names:
         try:
-            source = EpisodeSource(cls, suite.setup, name)
+            game = Game.of(cls, suite.setup, name)
         except ValueError as error:
             raise suite.wrong("conditions", f"{name!r} on {system}: {error}") from error
-        games.append(Game(system, canonical_name(name), source, name not in ranked))
-    return list({game.condition: game for game in games}.values())
+        tables[game.name] = Table(game, name not in ranked)
+    return list(tables.values())
 
 
 def _check_settings(
     suite: Suite,
     entry: Entry,
     cls: type[Estimator],
-    source: EpisodeSource,
+    game: Game,
     training: Mapping[str, Any],
 ) -> None:
     """Whether the estimator takes its settings, or its trainer its own."""
@@ -182,7 +178,7 @@ def _check_settings(
             raise suite.wrong("estimators", told)
     try:
         if name is None:
-            cls.for_setup(source.system, source.setup, **entry.settings)
+            cls.for_setup(game.source.system, game.source.setup, **entry.settings)
         else:
             made(**{**cls.recipe, **training})
     except (ValueError, TypeError) as error:

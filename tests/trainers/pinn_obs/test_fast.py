@@ -14,10 +14,11 @@ from small_trainings import (
     same_weights,
 )
 
-from pinnobs_gym.envs.registration import env_id, record_of
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.mlp import Architecture, Network
 from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, Trained
 from pinnobs_gym.scoring import acceptance
+from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import Config, train
 from trainers.pinn_obs.config import PRESETS
@@ -110,19 +111,20 @@ def test_a_fast_oscillation_is_found():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
-    system, setup, record = record_of(env_id("ReverseDuffing"), "paper", "nominal", 0)
-    estimator = PinnObs(system, config=Config(seed=seed), noise_std=setup.noise_std)
+    game = Game.of("ReverseDuffing", "paper")
+    system, record = game.source.system, game.record([0])
+    estimator = PinnObs(system, config=Config(seed=seed), noise_std=game.source.setup.noise_std)
     (trained,) = estimator.fit(record)
-    direct = PinnObsDirect(system, trained=trained)
-    _, example = acceptance.score_batch(direct, env_id("ReverseDuffing"), "paper", "nominal", [0])
-    error = example["xhat"] - example["x"]
+    played = play(game, PinnObsDirect(system, trained=trained), [0])
+    error = played.estimates.xhat - played.truth
     assert trained.loss <= 9.56e-4
     assert np.sqrt(np.mean(error**2)) <= 0.0562
     assert abs(trained.xhat(record.t[:1]) - record.prior.mean).max() < 1e-2
 
 
 def test_noise_is_not_fitted():
-    system, setup, record = record_of(env_id("Academic"), "benchmark", "nominal", 3)
+    game = Game.of("Academic")
+    system, setup, record = game.source.system, game.source.setup, game.record([3])
     trained = train(system, Config(), record=record, noise_std=setup.noise_std)
     output = system.h(trained.xhat(record.t)) - record.y[0]
     later = record.t > 5
@@ -131,7 +133,8 @@ def test_noise_is_not_fitted():
 
 def test_every_known_system_can_be_trained_on():
     for name, cls in SYSTEMS.classes().items():
-        system, _, record = record_of(env_id(name), "benchmark", "nominal", 0)
+        game = Game.of(name)
+        system, record = game.source.system, game.record([0])
         record.y[0, ::7] = np.nan
         start = train(system, replace(SMALL, iterations=2), record=record, noise_std=0.1)
         end = train(system, replace(SMALL, iterations=30), record=record, noise_std=0.1)
@@ -206,15 +209,15 @@ def test_presets_fill_what_is_not_given():
 
 @pytest.mark.parametrize("setup", ["benchmark", "paper"])
 def test_a_trained_observer_is_replayed_on_four_records(setup):
-    name = env_id("Academic")
-    system, _, record = record_of(name, setup, "nominal", 7)
+    game = Game.of("Academic", setup)
+    system, record = game.source.system, game.record([7])
     trained = constant_gain(system, [[2.0], [1.0]], record)
     replay = PinnObsReplay(system, trained=trained)
-    found, example = acceptance.replays(replay, name, setup, "nominal", 7)
+    found = acceptance.replays(replay, game, 7)
     rmse = [one.scores["rmse"] for one in found]
     assert len(set(rmse)) == 4
     assert found[0].name == "own record"
-    error = replay.run(record).xhat[0] - example["x"]
+    error = replay.run(record).xhat - found[0].played.truth
     assert rmse[0] == pytest.approx(np.sqrt(np.mean(error**2)))
     bad, good = {"nrmse": np.inf}, {"nrmse": 0.01}
     assert acceptance.warning(1e-6, bad)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pinnobs_gym import Setup, System
-from pinnobs_gym.envs.registration import make_vector_env
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.mlp import Architecture, Network, evaluate, layers_of
 from pinnobs_gym.estimation.smoother import backward, flows
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
@@ -142,21 +142,17 @@ def test_numpy_evaluates_the_network_as_torch_does(activation):
 
 def played(name, seed, setup="benchmark"):
     """The record and the true states (num_samples, nx) of one episode."""
-    env = make_vector_env(f"pinnobs/{name}-v0", 1, setup, "nominal")
-    _, info = env.reset(seed=seed)
-    states = [info["state"][0]]
-    action = np.zeros(env.action_space.shape, env.action_space.dtype)
-    for _ in range(env.record().num_samples - 1):
-        states.append(env.step(action)[4]["state"][0])
-    env.reset(seed=seed)
-    return env.record(), np.array(states)
+    game = Game.of(name, setup)
+    episodes = game.episodes([seed])
+    record = game.source.record(episodes)
+    return record, episodes.x[: record.num_samples, 0]
 
 
 @pytest.mark.parametrize("name", ["ReverseDuffing", "Satellite"])
 def test_from_any_seed_direct_estimates_and_replay_find_the_states(name):
     record, x = played(name, 10**6)
-    env = make_vector_env(f"pinnobs/{name}-v0", 1, "benchmark", "nominal")
-    system, setup = env.source.system, env.source.setup
+    source = Game.of(name).source
+    system, setup = source.system, source.setup
     tail, scale = slice(3 * len(x) // 4, None), np.asarray(system.scale)
     for seed in (0, 1):
         config = Config(iterations=500, seed=seed)
@@ -184,9 +180,7 @@ def test_a_record_too_long_for_the_points_is_told():
 
 def test_a_gain_meant_for_other_records_beats_one_that_is_not():
     """On ReverseDuffing's own paper record and another, with other x₀ and x̂₀."""
-    env = make_vector_env("pinnobs/ReverseDuffing-v0", 1, "paper", "nominal")
-    env.reset(seed=0)
-    record = env.record()
+    record = Game.of("ReverseDuffing", "paper").record([0])
     system = ReverseDuffing()
     x = truth(system, np.array([[1.0, 1.5]]), record.t)[:, 0]
     prior = Prior(np.zeros((1, 2)), record.prior.cov)
