@@ -75,7 +75,7 @@ class Pendulum(System):
         angle, rate = x[..., 0], x[..., 1]
         return stack(x, rate, -array_namespace(x).sin(angle) - self.damping * rate)
 
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return array_namespace(x).sin(x[..., :1])
 
 
@@ -86,7 +86,7 @@ class QuickPendulum(Pendulum):
     def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -self.damping]])
 
-    def h_jacobian(self, x: Any) -> Any:
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[np.cos(x[..., 0]), 0.0]])
 
 
@@ -98,7 +98,7 @@ class WrongJacobian(Pendulum):
 
 @dataclass(frozen=True)
 class WrongOutputJacobian(Pendulum):
-    def h_jacobian(self, x: Any) -> Any:
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[1.0, 0.0]])
 
 
@@ -132,10 +132,10 @@ class NumPyOnly(Pendulum):
 class NumPyFunction(Pendulum):
     """np.sin takes a torch tensor without a word, and returns one, unless it needs a gradient."""
 
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return np.sin(x[..., :1])
 
-    def h_jacobian(self, x: Any) -> Any:
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[np.cos(x[..., 0]), 0.0]])
 
 
@@ -151,7 +151,7 @@ class OneRowOnly(Pendulum):
 
 @dataclass(frozen=True)
 class NoLastAxis(Pendulum):
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return array_namespace(x).sin(x[..., 0])
 
 

@@ -25,7 +25,7 @@ class Linear(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], -2.0 * x[..., 0] - 0.3 * x[..., 1])
 
-    def h(self, x):
+    def h(self, t, x, u):
         return stack(x, x[..., 0], 2 * x[..., 1])
 
 

@@ -37,7 +37,7 @@ def test_it_is_the_information_of_all_outputs(name):
                 step = (float(t[k - 1]), float(t[k]), x[row : row + 1, k - 1])
                 F = model_step_jacobian(system, *step, u[:1, k - 1], u[:1, k])[1][0]
                 Phi = F @ Phi
-            G = system.h_jacobian(x[row, k][None])[0] @ Phi
+            G = system.h_jacobian(t[k], x[row, k][None], u[:1, k])[0] @ Phi
             information = information + G.T @ np.linalg.solve(R, G)
         expected = Phi @ np.linalg.inv(information) @ Phi.T
         size = np.sqrt(np.diag(expected))

@@ -198,7 +198,7 @@ class Cubic(System):
     def f(self, t, x, u):
         return stack(x, x[..., 0] - x[..., 0] ** 3)
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x
 
 

@@ -163,7 +163,7 @@ def test_on_a_linear_system_P_is_the_covariance_of_any_gain(monkeypatch):
     gain = gain_of(system, 1.0, noise_std=(0.1, 0.1))
     gain = replace(gain, process_noise=0.0)
     found = gain.run(record)
-    H = system.h_jacobian(np.zeros(2))
+    H = system.h_jacobian(0.0, np.zeros(2), np.empty(0))
     F = model_step_jacobian(system, 0.0, 0.1, np.zeros((1, 2)))[1][0]
     roots = np.linalg.cholesky(record.prior.cov[0])  # the error is roots @ unit noises
     for k, K in enumerate(gains):
