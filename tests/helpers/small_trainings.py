@@ -48,7 +48,7 @@ class Spring(System):
 
 @dataclass(frozen=True)
 class Mixer(System):
-    """Three states, two nonlinear outputs, two inputs and time in f: nothing the paper has."""
+    """Three states, two nonlinear outputs, two inputs, time in f and h: nothing the paper has."""
 
     state_names = ("a", "b", "c")
     output_names = ("y1", "y2")
@@ -62,7 +62,8 @@ class Mixer(System):
         return stack(x, b * c + u[..., 0], xp.sin(a) * t - b, u[..., 1] * a - c)
 
     def h(self, t, x, u):
-        return stack(x, x[..., 0] * x[..., 1], x[..., 2] ** 2)
+        a, b, c = x[..., 0], x[..., 1], x[..., 2]
+        return stack(x, a * b + t * u[..., 1], c**2 + t * b + u[..., 0] * a)
 
     def input(self, t):
         xp = array_namespace(t)

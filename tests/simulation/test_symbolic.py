@@ -46,7 +46,7 @@ class Pendulum(System):
 
     def h(self, t, x, u):
         xp = array_namespace(x)
-        return xp.atan2(x[..., :1], 2 + xp.cos(x[..., 1:]))
+        return xp.atan2(x[..., :1] + u[..., :1], 2 + xp.cos(t * x[..., 1:]))
 
     def input(self, t):
         xp = array_namespace(t)
