@@ -27,7 +27,7 @@ class Decay(System):
     def f(self, t, x, u):
         return stack(x, -x[..., 0])
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x
 
 
@@ -129,7 +129,7 @@ def test_what_a_registry_forgets(zoo):
         def f(self, t, x, u):
             return -x
 
-        def h(self, x):
+        def h(self, t, x, u):
             return x
 
     with zoo.isolated():
@@ -158,7 +158,7 @@ def test_register_refuses_what_is_incomplete_or_taken():
         def f(self, t, x, u):
             return -x
 
-        def h(self, x):
+        def h(self, t, x, u):
             return x
 
     with pytest.raises(TypeError, match="NoSetups has no class attribute 'setups'"):

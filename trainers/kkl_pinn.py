@@ -65,14 +65,13 @@ class Config(KKLConfig):
 def physics(run: Run) -> Objective:
     """T(x) = z at samples of simulated episodes, and the equation of T at others."""
     assert run.labels is not None
-    known, config, data = run.labels, run.config, run.data
+    known, config = run.labels, run.config
     assert isinstance(config, Config)
     scaling, dynamics = run.z_scaling, run.dynamics
     unit = config.equation**0.5 / dynamics.slowest
     root = np.linalg.inv(scaling.root)
     matrix = run.tensor(-unit * root @ dynamics.A @ scaling.root)
-    y = run.system.h(data.x)
-    target = run.tensor(unit * (y @ dynamics.B.T + dynamics.A @ scaling.mean) @ root.T)
+    target = run.tensor(unit * (run.outputs() @ dynamics.B.T + dynamics.A @ scaling.mean) @ root.T)
     rate = run.tensor(unit * run.rates())
 
     def draw(generator: torch.Generator) -> Sequence[Equations]:

@@ -186,7 +186,7 @@ class Normalized(Estimate):
 
 
 class Gain(Form):
-    """The action is a gain L on the innovation: x̂ = x̂⁻ + L(y − h(x̂⁻)), x̂⁻ from the model.
+    """The action is a gain L on the innovation: x̂ = x̂⁻ + L(y − h(t, x̂⁻, u)), x̂⁻ from the model.
 
     Kalman's gain of state i and output j is ρσᵢ/√Sⱼ, where σᵢ is the standard deviation of the
     prediction's error, √Sⱼ that of the innovation, and ρ their correlation. The action is ρ, nx·ny
@@ -218,7 +218,7 @@ class Gain(Form):
     def _predicted(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
         xhat = model_step(self.system, memory.t, t, memory.xhat, memory.u, u)
         y = memory.y[:, 0]
-        surprise = (y - self.system.h(xhat)) / self.root_S[self._samples(t, memory)]
+        surprise = (y - self.system.h(t, xhat, u)) / self.root_S[self._samples(t, memory)]
         return replace(memory, xhat=xhat, surprise=np.where(np.isnan(y), 0.0, surprise))
 
     def _features(self, memory: Memory) -> np.ndarray:
@@ -315,7 +315,7 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
             if k:
                 x, P, _ = predict(system, (times[k - 1], t), x, P, Q, (u[k - 1], u[k]))
             variance[k] = np.einsum("iib->ib", P)
-            H = system.h_jacobian(x).transpose(1, 2, 0)
+            H = system.h_jacobian(t, x, u[k]).transpose(1, 2, 0)
             _, P, S = joseph_update(x, P, zero, H, R)
             S_all[k] = np.einsum("iib->ib", S)
         sound = np.isfinite(variance).all(axis=(0, 1)) & np.isfinite(S_all).all(axis=(0, 1))

@@ -152,7 +152,7 @@ class EpisodeSource:
         else:
             truth(plant, start, self.times, self.setup.truth_step, out=x)
         np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
-        y += plant.h(x)
+        y += plant.h(self.times[:, None], x, self.inputs[:, None])
         if not self.trivial:
             sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
             y[:] = self.condition.outputs(sent, rngs)

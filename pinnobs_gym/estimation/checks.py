@@ -67,8 +67,8 @@ def _record(estimator: Estimator, batch: int = 3, *, irregular: bool = False) ->
     t = np.append(0.0, np.cumsum(steps))
     x = truth(system, initial_states(system, setup, batch), t).swapaxes(0, 1)
     std = vector(setup.noise_std, system.ny, "noise_std")
-    y = system.h(x) + std * rng.standard_normal((batch, len(t), system.ny))
     u = np.broadcast_to(system.input(t), (batch, len(t), system.nu)).copy()
+    y = system.h(t, x, u) + std * rng.standard_normal((batch, len(t), system.ny))
     return Record(t, y, u, Prior.of(system, setup, batch))
 
 

@@ -27,7 +27,7 @@ class State:
     P: np.ndarray | None = None
     """Covariances of the estimates, shape (batch, nx, nx), where the estimator has them."""
     innovation: np.ndarray | None = None
-    """y − h(x̂(k|k−1)), shape (batch, ny), zero where y was missing."""
+    """y − h(t, x̂(k|k−1), u), shape (batch, ny), zero where y was missing."""
     S: np.ndarray | None = None
     """Covariances of the innovations, shape (batch, ny, ny)."""
     memory: Any = None

@@ -37,10 +37,20 @@ def predict(
     return xhat, P, F
 
 
-def observe(system: System, xhat: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations (batch, ny) and output Jacobians (ny, nx, batch), zero where y is missing."""
-    innovation = y - system.h(xhat)
-    H = system.h_jacobian(xhat).transpose(1, 2, 0)
+def observe(
+    system: System, t: float, xhat: np.ndarray, y: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations (batch, ny) and output Jacobians (ny, nx, batch), zero where y is missing.
+
+    Args:
+        system: the model.
+        t: time of the sample in s.
+        xhat: predictions, shape (batch, nx).
+        y: outputs, shape (batch, ny); NaN is a missing one.
+        u: inputs at the sample, shape (batch, nu).
+    """
+    innovation = y - system.h(t, xhat, u)
+    H = system.h_jacobian(t, xhat, u).transpose(1, 2, 0)
     missing = np.isnan(y)
     if np.count_nonzero(missing):  # several times faster than any() on few numbers
         innovation = np.where(missing, 0.0, innovation)
@@ -56,7 +66,7 @@ def joseph_update(
     Args:
         xhat: predictions, shape (batch, nx).
         P: their covariances, shape (nx, nx, batch): here the batch comes last.
-        innovation: y − h(x̂), shape (batch, ny).
+        innovation: y − h(t, x̂, u), shape (batch, ny).
         H: output Jacobians, shape (ny, nx, batch).
         R: covariance of the output noise, shape (ny, ny, batch or 1).
 

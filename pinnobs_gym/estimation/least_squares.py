@@ -63,7 +63,7 @@ def linearised(
             x, F = model_step_jacobian(system, *times, x, u[k - 1], u[k])
             X = product(F.transpose(1, 2, 0), X)
         states[k], derivatives[k] = x, X
-        error, H = observe(system, x, y[k])
+        error, H = observe(system, float(t[k]), x, y[k], u[k])
         G = product(H, X)
         weighted = (G / R[:, None, None]).transpose(1, 0, 2)
         cost += (error**2 / R).sum(axis=-1)

@@ -47,7 +47,7 @@ def linearised_scaled(
     now, scale = np.asarray(t), vector(system.scale, system.nx, "scale")
     u = np.asarray(system.input(now))
     A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
-    H = np.asarray(system.h_jacobian(x)) * scale
+    H = np.asarray(system.h_jacobian(now, x, u)) * scale
     powers = [np.linalg.matrix_power(A / max(abs(A).max(), 1e-300), i) for i in range(system.nx)]
     rows = np.concatenate([H @ power for power in powers])
     if np.linalg.matrix_rank(rows, tol=1e-9 * abs(H).max(initial=0.0)) < system.nx:
@@ -106,7 +106,7 @@ def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarr
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
             x, F = model_step_jacobian(system, times[k], times[k + 1], x, u[k], u[k + 1])
-            H = np.asarray(system.h_jacobian(x))
+            H = np.asarray(system.h_jacobian(times[k + 1], x, u[k + 1]))
             K = injection(L, np.repeat(H, len(parts), axis=0), weight, times[k + 1] - times[k])
             flow = (np.eye(system.nx) - K @ H) @ F @ flow
         left = abs(flow * scale / scale[:, None]).max(axis=(1, 2))
@@ -142,8 +142,9 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
     axes = [np.linspace(a, b, grid) for a, b in zip(low, high, strict=True)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, nx)
     now = np.asarray(0.0)
-    A = np.asarray(system.f_jacobian(now, x, np.asarray(system.input(now)))) * scale
-    A, H = A / scale[:, None], np.asarray(system.h_jacobian(x)) * scale
+    u = np.asarray(system.input(now))
+    A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
+    H = np.asarray(system.h_jacobian(now, x, u)) * scale
     A, kept = np.unique(np.round(A, 12), axis=0, return_index=True)
     P, Y = cp.Variable((nx, nx), symmetric=True), cp.Variable((nx, system.ny))
     constraints: list[Any] = [P >> np.eye(nx)]
@@ -162,9 +163,9 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
 
 
 def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np.ndarray:
-    """The gain K (batch, nx, ny) of a step of length dt: x̂ = x⁻ + K(y − h(x⁻)).
+    """The gain K (batch, nx, ny) of a step of length dt: x̂ = x⁻ + K(y − h(t, x⁻, u)).
 
-    One step of Euler's implicit method for x̂' = L·weight·(y − h(x̂)), linearised:
+    One step of Euler's implicit method for x̂' = L·weight·(y − h(t, x̂, u)), linearised:
     K = dt·L·weight·(I + dt·H·L·weight)⁻¹, which large gains do not make unstable as dt·L would.
 
     Args:

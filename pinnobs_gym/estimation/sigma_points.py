@@ -43,8 +43,8 @@ class SigmaPointFilter(GaussianEstimator):
 \chi_i^- &= \varphi(\hat x_{k-1} + \sqrt{P_{k-1}}\, \xi_i), \qquad
 \hat x_k^- = \sum_i w_i \chi_i^- \\
 P_k^- &= \sum_i v_i (\chi_i^- - \hat x_k^-)(\chi_i^- - \hat x_k^-)^\top + Q \\
-\chi_i &= \hat x_k^- + \sqrt{P_k^-}\, \xi_i, \qquad \hat y = \sum_i w_i h(\chi_i) \\
-X_i &= \sqrt{v_i} (\chi_i - \hat x_k^-), \qquad Y_i = \sqrt{v_i} (h(\chi_i) - \hat y) \\
+\chi_i &= \hat x_k^- + \sqrt{P_k^-}\, \xi_i, \qquad \hat y = \sum_i w_i h(t_k, \chi_i, u_k) \\
+X_i &= \sqrt{v_i} (\chi_i - \hat x_k^-), \qquad Y_i = \sqrt{v_i} (h(t_k, \chi_i, u_k) - \hat y) \\
 K &= X Y^\top (Y Y^\top + R)^{-1} \\
 \hat x_k &= \hat x_k^- + K\, (y_k - \hat y) \\
 P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
@@ -78,7 +78,8 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
             L, jitter = factor(P, jitter)
         X = unit @ L  # (nx, num_points, batch)
         points = X + xhat.T[:, None]
-        outputs = np.asarray(self.system.h(points.transpose(1, 2, 0))).transpose(2, 0, 1)
+        outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
+        outputs = outputs.transpose(2, 0, 1)
         mean = mean_weights @ outputs
         X, Y = X * weights, (outputs - mean[:, None]) * weights
         innovation, missing = y - mean.T, np.isnan(y)

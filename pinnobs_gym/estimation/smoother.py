@@ -82,7 +82,8 @@ def forward(
             x = ends[k - 1] + np.einsum("ijb,bj->bi", F[k - 1], x - about[k - 1])
             P = sandwich(F[k - 1], P) + Q
         before.xhat[k], before.P[k] = x, P
-        innovation, H[k] = observe(system, x if about is None else about[k], y[k])
+        at = x if about is None else about[k]
+        innovation, H[k] = observe(system, float(t[k]), at, y[k], u[k])
         if about is not None:
             innovation = innovation - np.einsum("pib,bi->bp", H[k], x - about[k])
         noise = R + caution * sandwich(H[k], P) if caution else R

@@ -18,7 +18,7 @@ from pinnobs_gym.simulation.record import Record
 class BatchLeastSquares(OfflineEstimator):
     """The model's trajectory nearest to all outputs of a record and to the prior.
 
-    It minimises (x₀ − x̂₀)ᵀP₀⁻¹(x₀ − x̂₀) + Σ(y − h(x))ᵀR⁻¹(y − h(x)) over x₀ by Levenberg and
+    It minimises (x₀ − x̂₀)ᵀP₀⁻¹(x₀ − x̂₀) + Σ(y − h)ᵀR⁻¹(y − h) over x₀ by Levenberg and
     Marquardt's method (Nocedal & Wright 2006, section 10.3), first over the beginning of the record
     and then over stretches of twice the length, so that it follows an oscillation from the phase
     that the prior knows. Where the model is exact this attains the Cramér–Rao bound. Covariances
@@ -38,7 +38,7 @@ class BatchLeastSquares(OfflineEstimator):
     name = "batch_least_squares"
     equations = r"""
 \hat x_{0|n} &= \arg\min_x \; (x - \hat x_0)^\top P_0^{-1} (x - \hat x_0)
-+ \sum_{k=0}^{n} \bigl\| y_k - h(\varphi_k(x)) \bigr\|^2_{R^{-1}} \\
++ \sum_{k=0}^{n} \bigl\| y_k - h(t_k, \varphi_k(x), u_k) \bigr\|^2_{R^{-1}} \\
 \hat x_k &= \varphi_k(\hat x_{0|n}), \qquad \Phi_k = \tfrac{\partial \varphi_k}{\partial x} \\
 P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \Bigr)^{-1}
 \Phi_k^\top

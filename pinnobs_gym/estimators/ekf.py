@@ -60,7 +60,8 @@ class EKF(GaussianEstimator):
 \dot{\hat x} &= f(t, \hat x, u), \qquad
 \dot\Phi = \tfrac{\partial f}{\partial x}(t, \hat x, u)\, \Phi \\
 P_k^- &= \Phi P_{k-1} \Phi^\top + Q, \qquad Q = \operatorname{diag}(q \cdot \mathrm{scale})^2 \\
-e_k &= y_k - h(\hat x_k^-), \qquad H = \tfrac{\partial h}{\partial x}(\hat x_k^-) \\
+e_k &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
+H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
 S &= H P_k^- H^\top + R, \qquad K = P_k^- H^\top S^{-1} \\
 \hat x_k &= \hat x_k^- + K e_k \\
 P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
@@ -92,7 +93,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         memory: Memory = state.memory
         xhat, P = predicted(self.system, state, t, u, memory.Q)
         R = memory.R
-        innovation, H = observe(self.system, xhat, y)
+        innovation, H = observe(self.system, t, xhat, y, u)
         if self.gate is not None:
             P, memory = self._gated(P, innovation, H, memory)
         if self.huber is not None:

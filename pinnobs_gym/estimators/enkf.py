@@ -53,9 +53,9 @@ class EnKF(GaussianEstimator):
 \chi_i &= \varphi(x_{k-1}^i), \qquad \bar\chi = \tfrac1N \sum_i \chi_i \\
 x_k^{i-} &= \bar\chi + \lambda\, (\chi_i - \bar\chi) + w_i, \qquad w_i \sim \mathcal N(0, Q) \\
 X &= \tfrac{1}{\sqrt{N-1}} \bigl[ x_k^{i-} - \bar x_k^- \bigr]_i, \qquad
-Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(x_k^{i-}) - \bar y \bigr]_i \\
+Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(t_k, x_k^{i-}, u_k) - \bar y \bigr]_i \\
 K &= X Y^\top (Y Y^\top + R)^{-1} \\
-x_k^i &= x_k^{i-} + K\, (y_k + v_i - h(x_k^{i-})), \qquad v_i \sim \mathcal N(0, R) \\
+x_k^i &= x_k^{i-} + K\, (y_k + v_i - h(t_k, x_k^{i-}, u_k)), \qquad v_i \sim \mathcal N(0, R) \\
 \hat x_k &= \tfrac1N \sum_i x_k^i, \qquad
 P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 """
@@ -83,7 +83,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             members = model_step(self.system, state.t, t, members, state.u, u)
             mean = members.mean(axis=0)
             members = mean + self.inflation * (members - mean) + memory.Q_std * draws[..., :nx]
-        mean, outputs = members.mean(axis=0), np.asarray(self.system.h(members))
+        mean, outputs = members.mean(axis=0), np.asarray(self.system.h(t, members, u))
         yhat, noise = outputs.mean(axis=0), memory.R_std * draws[..., nx:]
         weight = 1 / np.sqrt(self.members - 1)
         X = weight * (members - mean).transpose(2, 0, 1)

@@ -16,7 +16,7 @@ from pinnobs_gym.simulation.record import Prior
 @dataclass(frozen=True)
 class HighGain(GaussianEstimator):
     """The high-gain observer with exponential forgetting (Bornard, Couenne & Celle 1989; Deza et
-    al. 1992): x̂' = f(x̂, u) + S⁻¹HᵀR⁻¹(y − h(x̂)), Ṡ = −θS − AᵀS − SA + HᵀR⁻¹H.
+    al. 1992): x̂' = f(t, x̂, u) + S⁻¹HᵀR⁻¹(y − h(t, x̂, u)), Ṡ = −θS − AᵀS − SA + HᵀR⁻¹H.
 
     S⁻¹ = P is carried as a covariance: between samples ΦPΦᵀ·exp(θ·dt), at a sample the update in
     Joseph's form. Old outputs are forgotten at the rate θ, instead of process noise. What no output
@@ -39,7 +39,7 @@ P_k^- = e^{\theta (t_k - t_{k-1})}\, \Phi P_{k-1} \Phi^\top + Q \\
 & \text{without the factor where } \textstyle\sum_i P_{ii} / \mathrm{scale}_i^2
 \text{ would exceed that of } P_0 + \operatorname{diag}(\mathrm{scale}^2) \\
 K &= P_k^- H^\top (H P_k^- H^\top + R)^{-1} \\
-\hat x_k &= \hat x_k^- + K\, (y_k - h(\hat x_k^-)) \\
+\hat x_k &= \hat x_k^- + K\, (y_k - h(t_k, \hat x_k^-, u_k)) \\
 P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
 """
     tunable = {"theta": Range(0.1, 1e3, log=True)}
@@ -61,7 +61,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
             grown = P * np.exp(theta * (t - state.t))
             P = np.where(self._size(grown) < largest, grown, P)
             xhat, P, _ = predict(self.system, (state.t, t), xhat, P, Q, (state.u, u))
-        innovation, H = observe(self.system, xhat, y)
+        innovation, H = observe(self.system, t, xhat, y, u)
         xhat, P, S = joseph_update(xhat, P, innovation, H, R)
         P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, state.memory)

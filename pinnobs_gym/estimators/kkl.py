@@ -56,10 +56,10 @@ class TrainedKKL:
     mode: Mode
     start: Start
     clock: Clock
-    """What T* is told beside z; T, too, if the plant is driven."""
+    """What T* is told beside z; T, too, if it changes with time."""
     activation: Activation
     encoder: Layers
-    """T: from x (and the clock, if the plant is driven) to z."""
+    """T: from x (and the clock, if T changes with time) to z."""
     decoder: Layers
     """T*: from z and the clock to x."""
     system: str
@@ -92,8 +92,9 @@ class TrainedKKL:
         return at_rest(self.dynamics, self.start)
 
     def T(self, x: np.ndarray, t: float = 0.0, u: np.ndarray | None = None) -> np.ndarray:
-        """What z is at states (..., nx), (..., nz); of a driven plant at time t, inputs u."""
-        if self.clock.amplitudes:
+        """What z is at states (..., nx), (..., nz); if T changes with time, at time t since the
+        first sample (s) and inputs u."""
+        if self.encoder[0][0].shape[1] > x.shape[-1]:
             u = np.zeros(len(self.clock.amplitudes)) if u is None else u
             told = self.clock(np.asarray(t), u)
             x = np.concatenate([x, np.broadcast_to(told, (*x.shape[:-1], told.shape[-1]))], -1)
@@ -166,7 +167,8 @@ class KKL(Estimator):
     knows = ("model", "noise", "simulated true states")
     equations = r"""
 \dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
-\hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial x}(x)\, f(x) = A_z T(x) + B_z h(x)
+\hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial t} + \tfrac{\partial T}{\partial x}\,
+f(t, x, u) = A_z T + B_z h(t, x, u)
 """
 
     def reset(self, prior: Prior) -> State:
@@ -201,7 +203,7 @@ class KKL(Estimator):
             before = None if state.u is None else state.u[rows]
             xhat = model_step(self.system, state.t, t, xhat, before, u[rows])
         y = y.copy()
-        y[rows] = np.where(missing[rows], self.system.h(xhat), y[rows])
+        y[rows] = np.where(missing[rows], self.system.h(t, xhat, u[rows]), y[rows])
         return y
 
     def save(self, path: str | Path) -> None:
@@ -248,7 +250,8 @@ class KKLPinn(KKL):
         KKL.equations.rstrip()
         + r""" \\
 T &: \; \min \sum_i \| T(x_i) - z_i \|^2 + \frac{w}{\lambda^2} \sum_j
-\Bigl\| \tfrac{\partial T}{\partial x}(x_j)\, f(x_j) - A_z T(x_j) - B_z h(x_j) \Bigr\|^2, \qquad
+\Bigl\| \Bigl( \tfrac{\partial T}{\partial t} + \tfrac{\partial T}{\partial x}\, f
+- A_z T - B_z h \Bigr) (t_j, x_j, u_j) \Bigr\|^2, \qquad
 \lambda = \min |\operatorname{Re} \lambda(A_z)| \\
 T^* &: \; \min \textstyle\sum_i \| T^*(z_i) - x_i \|^2
 """

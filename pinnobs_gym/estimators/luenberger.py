@@ -21,7 +21,8 @@ from pinnobs_gym.simulation.record import Prior
 
 @dataclass(frozen=True)
 class Luenberger(Estimator):
-    """The Luenberger observer x̂' = f(x̂, u) + L(y − h(x̂)) with a constant gain (Luenberger 1964).
+    """The Luenberger observer x̂' = f(t, x̂, u) + L(y − h(t, x̂, u)) with a constant gain
+    (Luenberger 1964).
 
     Between samples the model alone; at a sample the correction over the time since the last, by
     Euler's implicit method (`pinnobs_gym.estimation.observer_gains.injection`). A missing output
@@ -46,9 +47,9 @@ class Luenberger(Estimator):
 
     name = "luenberger"
     equations = r"""
-\hat x_k &= \hat x_k^- + K\, (y_k - h(\hat x_k^-)) \\
+\hat x_k &= \hat x_k^- + K\, (y_k - h(t_k, \hat x_k^-, u_k)) \\
 K &= \Delta t\, L\, (I + \Delta t\, H L)^{-1}, \qquad
-H = \tfrac{\partial h}{\partial x}(\hat x_k^-) \\
+H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
 \text{poles: } L &= P H^\top, \qquad (A + \rho I) P + P (A + \rho I)^\top - P H^\top H P
 + (0.1 \rho)^2 I = 0 \\
 \text{lmi: } L &= P^{-1} Y, \qquad P A + A^\top P - Y H - H^\top Y^\top + 2 \rho P \preceq 0
@@ -89,7 +90,8 @@ H = \tfrac{\partial h}{\partial x}(\hat x_k^-) \\
         if state.t is not None:
             xhat, dt = model_step(self.system, state.t, t, xhat, state.u, u), t - state.t
         missing = np.isnan(y)
-        innovation = np.where(missing, 0.0, y - self.system.h(xhat))
-        K = injection(L, np.asarray(self.system.h_jacobian(xhat)), 1.0 - missing, dt)
+        innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
+        H = np.asarray(self.system.h_jacobian(t, xhat, u))
+        K = injection(L, H, 1.0 - missing, dt)
         xhat = xhat + (K @ innovation[..., None])[..., 0]
         return State(xhat, t, u, innovation=innovation, memory=L)

@@ -61,9 +61,9 @@ class MHE(GaussianEstimator):
     name = "mhe"
     equations = r"""
 x_{k-N+1} &= \arg\min_x \; (x - \bar x)^\top \bar P^{-1} (x - \bar x)
-+ \sum_{j=k-N+1}^{k} \bigl\| y_j - h(\varphi_j(x)) \bigr\|^2_{R^{-1}} \\
++ \sum_{j=k-N+1}^{k} \bigl\| y_j - h(t_j, \varphi_j(x), u_j) \bigr\|^2_{R^{-1}} \\
 \hat x_k &= \varphi_k(x_{k-N+1}), \qquad
-G_j = \tfrac{\partial h(\varphi_j)}{\partial x}, \quad
+G_j = \tfrac{\partial h(t_j, \varphi_j, u_j)}{\partial x}, \quad
 \Phi = \tfrac{\partial \varphi_k}{\partial x} \\
 P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\top
 """
@@ -87,7 +87,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
         start = memory.start
         fit = self._fit(memory, start)
-        innovation, H = observe(self.system, fit.x[-1], y)
+        innovation, H = observe(self.system, t, fit.x[-1], y, u)
         step, P = _step(fit, memory.P, memory.arrival - start)
         for _ in range(self.steps - 1):
             start = start + step
@@ -111,7 +111,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
     def _moved(self, memory: Memory, t: float, u: np.ndarray) -> Memory:
         """The window without its first sample, which x̄ and P̄ take in."""
         start = memory.start
-        innovation, H = observe(self.system, start, memory.y[0])
+        innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])
         ahead = memory.arrival - start
         innovation = innovation - np.einsum("pib,bi->bp", H, ahead)
         ahead, P, _ = joseph_update(ahead, memory.P, innovation, H, memory.R)

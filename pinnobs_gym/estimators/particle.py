@@ -13,6 +13,8 @@ from pinnobs_gym.simulation.matrices import factor
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
+_Sample = tuple[float, np.ndarray, np.ndarray]
+"""Time in s, outputs (batch, ny) and inputs (batch, nu)."""
 _FEW = 10
 """One particle in so many must be left, or the likelihood is taken in parts."""
 _ROUNDS = 20
@@ -60,7 +62,8 @@ class ParticleFilter(Estimator):
     name = "particle"
     equations = r"""
 x_i &:= \varphi(x_i) \\
-w_i &:\propto w_i \exp\bigl( -\tfrac12 (y_k - h(x_i))^\top R^{-1} (y_k - h(x_i)) \bigr) \\
+w_i &:\propto w_i \exp\bigl( -\tfrac12 e_i^\top R^{-1} e_i \bigr), \qquad
+e_i = y_k - h(t_k, x_i, u_k) \\
 \hat x_k &= \sum_i w_i x_i, \qquad P_k = \sum_i w_i (x_i - \hat x_k)(x_i - \hat x_k)^\top \\
 \text{if } \Bigl( \sum_i w_i^2 \Bigr)^{-1} &< \frac N2: \quad
 x_i := a\, x_{j(i)} + (1 - a)\, \hat x_k + \sqrt{1 - a^2} \sqrt{P_k}\, \xi_i, \quad
@@ -92,10 +95,10 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         if state.t is not None:
             x = model_step(self.system, state.t, t, x, state.u, u)
         missing = np.isnan(y)
-        outputs = np.where(missing, 0.0, np.asarray(self.system.h(x)))
+        outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
         yhat, S = _moments(np.exp(log_weights), outputs)
         S = S + np.diag(self.output_variance)
-        x, log_weights = self._tempered(x, log_weights, y, memory.sample)
+        x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
         weights = np.exp(log_weights)
         xhat, P = _moments(weights, x)
         rows = np.flatnonzero((weights**2).sum(axis=0) > 2 / self.particles)
@@ -106,15 +109,16 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 
     def _tempered(
-        self, x: np.ndarray, log_weights: np.ndarray, y: np.ndarray, sample: int
+        self, x: np.ndarray, log_weights: np.ndarray, seen: _Sample, sample: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Particles and the logarithms of their weights after the outputs y (batch, ny).
+        """Particles and the logarithms of their weights after a sample.
 
         Where these say so much that hardly a particle would be left, their likelihood is taken in
         parts, each of a power of it that leaves a quarter, with a resampling between them.
         """
+        t, y, u = seen
         left = np.ones(len(y))
-        log_likelihood = self._log_likelihood(x, y)
+        log_likelihood = self._log_likelihood(x, seen)
         for part_number in range(_ROUNDS):
             trial = log_weights + left * log_likelihood
             rows = np.flatnonzero(_effective(trial) < self.particles / _FEW)
@@ -127,12 +131,13 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             )
             left[rows] -= part
             x, log_weights = self._resampled(x, log_weights, rows, (sample, part_number))
-            log_likelihood[:, rows] = self._log_likelihood(x[:, rows], y[rows])
+            log_likelihood[:, rows] = self._log_likelihood(x[:, rows], (t, y[rows], u[rows]))
         return x, _normalised(log_weights + left * log_likelihood)
 
-    def _log_likelihood(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
         """Of the outputs, (num_particles, batch)."""
-        errors = np.nan_to_num(y - np.asarray(self.system.h(x)))
+        t, y, u = seen
+        errors = np.nan_to_num(y - np.asarray(self.system.h(t, x, u)))
         return np.einsum("nbp,p->nb", errors**2, -0.5 / self.output_variance)
 
     def _resampled(

@@ -111,8 +111,8 @@ class PinnGain(GaussianEstimator):
     at. The form is near that of Recursive KalmanNet (Mortada et al. 2025) and KalmanNet (Revach et
     al. 2022), which learn from true states.
 
-    The variant ``gru`` is a recurrent network that gives the gain of x̂ = x̂⁻ + K(y − h(x̂⁻)) alone;
-    it has no covariance.
+    The variant ``gru`` is a recurrent network that gives the gain of
+    x̂ = x̂⁻ + K(y − h(t, x̂⁻, u)) alone; it has no covariance.
     """
 
     trained: TrainedGain = field(kw_only=True, repr=False)
@@ -151,7 +151,7 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         fixed, memory = state.memory
         scale, Q, R = fixed
         xhat, P = predicted(self.system, state, t, u, Q)
-        innovation, H = observe(self.system, xhat, y)
+        innovation, H = observe(self.system, t, xhat, y, u)
         K, S = kalman_gain(P, H, R)
         e, variance = np.ascontiguousarray(innovation.T), np.einsum("iib->ib", S)
         share = np.maximum(1 - np.einsum("iib->ib", R) / variance, 0.0)
@@ -169,7 +169,7 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         xhat = state.xhat
         if state.t is not None:
             xhat = model_step(self.system, state.t, t, xhat, state.u, u)
-        innovation = np.where(np.isnan(y), 0.0, y - self.system.h(xhat))
+        innovation = np.where(np.isnan(y), 0.0, y - self.system.h(t, xhat, u))
         x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
         told = np.broadcast_to(std, e.shape)
         K, memory = recurrent_gain(self.trained.layers, scale, size, x, e, told, memory)

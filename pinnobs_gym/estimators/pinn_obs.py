@@ -174,9 +174,9 @@ MOST_STEPS = 200
 
 @dataclass(frozen=True)
 class PinnObsReplay(_Learned, Estimator):
-    """The observer x̂' = f(t, x̂, u) + L(t)(y − h(x̂)) with a learned gain L(t) (Farkane et al.,
-    PINN-Obs, the time-varying observer of "Nonlinear State Observer", run as in "Neural Network
-    Training and Testing").
+    """The observer x̂' = f(t, x̂, u) + L(t)(y − h(t, x̂, u)) with a learned gain L(t) (Farkane et
+    al., PINN-Obs, the time-varying observer of "Nonlinear State Observer", run as in "Neural
+    Network Training and Testing").
 
     Between samples by the classical Runge-Kutta method in equal steps of at most the system's
     `System.model_step`, and of at most `STEP` over the largest eigenvalue of L(t)C. Outputs and
@@ -193,7 +193,7 @@ class PinnObsReplay(_Learned, Estimator):
 
     name = "pinn_obs_replay"
     equations = r"""
-\dot{\hat x} &= f(t, \hat x, u) + L(t)\, (y - h(\hat x)), \qquad \hat x(t_0) = \hat x_0
+\dot{\hat x} &= f(t, \hat x, u) + L(t)\, (y - h(t, \hat x, u)), \qquad \hat x(t_0) = \hat x_0
 """
     knows = ("model", "prior")
     needs_training = "pinn_obs"
@@ -210,33 +210,61 @@ class PinnObsReplay(_Learned, Estimator):
         return State(xhat, t, u, memory=y)
 
     def _step(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """x̂ (batch, nx) at time t, from that at the sample before."""
+        """x̂ (batch, nx) at time t, from that at the sample before: rows of equal steps together."""
         assert state.t is not None
-        start, duration, y0 = state.t, t - state.t, state.memory
+        start, x, u0, y0 = state.t, state.xhat.copy(), state.u, state.memory
+        fastest = np.broadcast_to(self._fastest(start, t, u0, u), len(x))
+        for value in np.unique(fastest):
+            rows = fastest == value
+            before = None if u0 is None else u0[rows]
+            x[rows] = self._integrated(
+                (start, t), x[rows], (y0[rows], y[rows]), (before, u[rows]), STEP / float(value)
+            )
+        return x
+
+    def _integrated(
+        self,
+        times: tuple[float, float],
+        x: np.ndarray,
+        outputs: tuple[np.ndarray, np.ndarray],
+        inputs: tuple[np.ndarray | None, np.ndarray],
+        longest: float,
+    ) -> np.ndarray:
+        """x̂ (batch, nx) at the later of two times, from x at the earlier, in steps of at most
+        ``longest`` (s); outputs (batch, ny) and inputs (batch, nu) are those at both."""
+        (start, end), (y0, y) = times, outputs
         missing = np.isnan(y0) | np.isnan(y)
-        y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, (y - y0) / duration)
+        y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, (y - y0) / (end - start))
 
         def rate(t: float, x: np.ndarray, u: np.ndarray, L: np.ndarray) -> np.ndarray:
-            innovation = np.where(missing, 0.0, y0 + (t - start) * slope - self.system.h(x))
+            outputs = self.system.h(t, x, u)
+            innovation = np.where(missing, 0.0, y0 + (t - start) * slope - outputs)
             return self.system.f(t, x, u) + innovation @ L.T
 
-        x = state.xhat
-        longest = STEP / self._fastest(np.linspace(start, t, 3))
-        for times, step, u_at in substeps(self.system, start, t, x, state.u, u, longest):
-            L = self.trained.gain(times)
-            k1 = rate(times[0], x, u_at[0], L[0])
-            k2 = rate(times[1], x + step / 2 * k1, u_at[1], L[1])
-            k3 = rate(times[1], x + step / 2 * k2, u_at[1], L[1])
-            k4 = rate(times[2], x + step * k3, u_at[2], L[2])
+        for t, step, u in substeps(self.system, start, end, x, *inputs, longest):
+            L = self.trained.gain(t)
+            k1 = rate(t[0], x, u[0], L[0])
+            k2 = rate(t[1], x + step / 2 * k1, u[1], L[1])
+            k3 = rate(t[1], x + step / 2 * k2, u[1], L[1])
+            k4 = rate(t[2], x + step * k3, u[2], L[2])
             x = x + step / 6 * (k1 + 2 * (k2 + k3) + k4)
         return x
 
-    def _fastest(self, t: np.ndarray) -> float:
-        """The largest absolute eigenvalue of L(t)C (1/s) at times t (...) in s, C = ∂h/∂x at the
-        network's own estimates; not over what would take too many steps."""
-        L, H = self.trained.gain(t), self.system.h_jacobian(self.trained.xhat(t))
-        largest = abs(np.linalg.eigvals(H @ L)).max()
-        return float(np.clip(largest, 1e-9, MOST_STEPS * STEP / (t[-1] - t[0])))
+    def _fastest(
+        self, start: float, end: float, u0: np.ndarray | None, u1: np.ndarray
+    ) -> np.ndarray:
+        """The largest absolute eigenvalue of L(t)C (1/s) over three times from start to end (s),
+        C = ∂h/∂x at the network's own estimates; not over what would take too many steps. Shape
+        (batch,) if the input is measured, u0 and u1 (batch, nu) at both ends, and (1,) if not."""
+        t = np.linspace(start, end, 3)
+        if self.system.measured_input and u0 is not None:
+            u = u0 + np.array([0.0, 0.5, 1.0])[:, None, None] * (u1 - u0)
+        else:
+            u = np.asarray(self.system.input(t))[:, None]
+        x = np.repeat(self.trained.xhat(t)[:, None], u.shape[1], axis=1)
+        H = np.asarray(self.system.h_jacobian(t[:, None], x, u))
+        largest = abs(np.linalg.eigvals(H @ self.trained.gain(t)[:, None])).max(axis=(0, 2))
+        return np.clip(largest, 1e-9, MOST_STEPS * STEP / (end - start))
 
     @classmethod
     def of(cls, system: System, trained: Trained) -> Self:
@@ -297,9 +325,9 @@ class PinnObs(OfflineEstimator):
     equations = r"""
 (\hat x(t), L(t)) &= \text{network}_\vartheta(t) \\
 \min_\vartheta \; & w_0 \| \hat x(t_0) - \hat x_0 \|^2
-+ w_y \operatorname{mean} \| h(\hat x) - y \|^2 \\
++ w_y \operatorname{mean} \| h(t, \hat x, u) - y \|^2 \\
 & + w_{\mathrm{ode}} \operatorname{mean}
-\bigl\| \dot{\hat x} - f(t, \hat x, u) - L\, (y - h(\hat x)) \bigr\|^2 \\
+\bigl\| \dot{\hat x} - f(t, \hat x, u) - L\, (y - h(t, \hat x, u)) \bigr\|^2 \\
 & + w_{\mathrm{guide}} \operatorname{mean} \| \hat x - x^{\mathrm{smoother}} \|^2
 + w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2
 """

@@ -183,7 +183,7 @@ class Sb3(Estimator):
     name = "sb3"
     equations = r"""
 \hat x_k &= \hat x_k^- + \sigma(k) \odot \rho_k\, \bigl( e_k \oslash \sqrt{S(k)} \bigr), \qquad
-e_k = y_k - h(\hat x_k^-) \\
+e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 \rho_k &= \pi(\text{features of } e_k, \hat x_k^-, u_k, k) \quad
 \text{(action mode gain: correlations in } [-1, 1]^{n_x \times n_y} \text{)}
 """

@@ -15,7 +15,7 @@ from pinnobs_gym.simulation.record import Prior
 @dataclass(frozen=True)
 class SlidingMode(Estimator):
     """The sliding-mode observer with a boundary layer (Slotine, Hedrick & Misawa 1987):
-    x̂' = f(x̂, u) + L(e + ρ·sat(e/ε)), e = y − h(x̂).
+    x̂' = f(t, x̂, u) + L(e + ρ·sat(e/ε)), e = y − h(t, x̂, u).
 
     The switching term drives e to the surface e = 0 as long as what the model does not know of the
     output's rate stays below it, and within the layer it is a higher gain. Beyond the layer it
@@ -36,7 +36,7 @@ class SlidingMode(Estimator):
 
     name = "sliding_mode"
     equations = r"""
-e &= y_k - h(\hat x_k^-), \qquad
+e &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
 s_j = 1 + \frac{\rho_j}{\varepsilon_j} \min\Bigl( 1, \frac{\varepsilon_j}{|e_j|} \Bigr) \\
 K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{diag}(s))^{-1} \\
 \hat x_k &= \hat x_k^- + K e
@@ -64,9 +64,9 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         if state.t is not None:
             xhat, dt = model_step(self.system, state.t, t, xhat, state.u, u), t - state.t
         missing = np.isnan(y)
-        innovation = np.where(missing, 0.0, y - self.system.h(xhat))
+        innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
         secant = 1 + self.switching / np.maximum(abs(innovation) / layer, 1.0)
-        H = np.asarray(self.system.h_jacobian(xhat))
+        H = np.asarray(self.system.h_jacobian(t, xhat, u))
         K = injection(L, H, np.where(missing, 0.0, secant), dt)
         xhat = xhat + (K @ innovation[..., None])[..., 0]
         return State(xhat, t, u, innovation=innovation, memory=state.memory)

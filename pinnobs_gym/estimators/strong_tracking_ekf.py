@@ -39,7 +39,7 @@ Q_k &= \Bigl( \frac{\gamma}{n_y} e_{k-1}^\top R^{-1} e_{k-1} + q^2 \Bigr)
 P_k^- &= \Phi P_{k-1} \Phi^\top + Q_k \\
 R_k &= R + r\, H P_k^- H^\top \quad (r: \text{output\_factor}) \\
 K &= P_k^- H^\top (H P_k^- H^\top + R_k)^{-1} \\
-\hat x_k &= \hat x_k^- + K e_k, \qquad e_k = y_k - h(\hat x_k^-) \\
+\hat x_k &= \hat x_k^- + K e_k, \qquad e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
 """
     tunable = {
@@ -66,7 +66,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
             assert state.innovation is not None
             Q = Q + growth * (state.innovation**2 / variance).mean(axis=-1)
         xhat, P = predicted(self.system, state, t, u, Q)
-        innovation, H = observe(self.system, xhat, y)
+        innovation, H = observe(self.system, t, xhat, y, u)
         if self.output_factor:
             R = R + self.output_factor * sandwich(H, P)
         xhat, P, S = joseph_update(xhat, P, innovation, H, R)

@@ -19,9 +19,9 @@ def consistency(
     (Bar-Shalom, Li & Kirubarajan 2001, section 5.4).
 
     The error is that of x̂(k|k) and needs P(k|k) alone, so that filters and smoothers are told
-    alike. Innovations are the estimator's own, y − h(x̂(k|k−1)) and its S: from x̂(k|k) and P(k|k)
-    they could be had only with its own Q and gain. Of an estimator that does not give them, they
-    are not known.
+    alike. Innovations are the estimator's own, y − h(t, x̂(k|k−1), u) and its S: from x̂(k|k) and
+    P(k|k) they could be had only with its own Q and gain. Of an estimator that does not give them,
+    they are not known.
 
     Args:
         x: true states, shape (batch, num_samples, nx).

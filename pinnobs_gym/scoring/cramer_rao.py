@@ -55,7 +55,7 @@ def cramer_rao(
         if k:
             times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
             _, P, _ = predict(system, times, x[:, k - 1], P, noise[..., None], inputs)
-        H = system.h_jacobian(now).transpose(1, 2, 0)
+        H = system.h_jacobian(t[k], now, u[k]).transpose(1, 2, 0)
         if missing is not None:
             H = np.where(missing[:, k].T[:, None], 0.0, H)
         innovation = np.zeros((batch, system.ny))
@@ -184,7 +184,8 @@ def _run(
         if k:
             times = float(record.t[k - 1]), float(record.t[k])
             x = model_step(system, *times, x, record.u[:, k - 1], record.u[:, k])
-        misfit = (record.y[:, k] - system.h(x)) ** 2 / R
+        outputs = system.h(record.t[k], x, record.u[:, k])
+        misfit = (record.y[:, k] - outputs) ** 2 / R
         log_weight = log_weight - np.nansum(misfit, axis=-1) / 2
         if k >= samples[0]:
             weight = np.exp(log_weight - log_weight.max(axis=0))

@@ -56,21 +56,33 @@ def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
 
 
 def _points(system: System, *batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (*batch,), states (*batch, nx) about the benchmark's initial ones, and inputs."""
+    """Times (*batch,), states (*batch, nx) about the benchmark's initial ones, and inputs: those of
+    `System.input` or, where these are zero throughout, others."""
     count = int(np.prod(batch))
     setup = system.setups["benchmark"]
     rng = np.random.default_rng(1)
     spread = 0.01 * vector(system.scale, system.nx, "scale")
     x = initial_states(system, setup, count) + spread * rng.standard_normal((count, system.nx))
     t = rng.uniform(0, setup.duration, batch)
-    return t, x.reshape(*batch, system.nx), np.asarray(system.input(t))
+    return t, x.reshape(*batch, system.nx), _inputs(system, t)
 
 
-def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> np.ndarray:
-    """The truth (num_samples, batch, nx) at no more samples than checks need."""
+def _inputs(system: System, t: np.ndarray) -> np.ndarray:
+    """Inputs (..., nu) at times t (...); any number from 0.1 to 1 for those that `System.input`
+    leaves at zero, which may be measured."""
+    u = np.array(system.input(t))
+    idle = (u == 0).all(axis=tuple(range(u.ndim - 1)))
+    drawn = np.random.default_rng(2).uniform(0.1, 1.0, u.shape)
+    return np.where(idle, drawn, u)
+
+
+def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The truth (num_samples, batch, nx) and its outputs (num_samples, batch, ny) at no more
+    samples than checks need."""
     times = setup.times
-    samples = np.unique(np.linspace(0, len(times) - 1, 200).astype(int))
-    return truth(system, x0, times[samples], setup.truth_step)
+    t = times[np.unique(np.linspace(0, len(times) - 1, 200).astype(int))]
+    x, u = truth(system, x0, t, setup.truth_step), np.asarray(system.input(t))
+    return x, np.asarray(system.h(t[:, None], x, u[:, None]))
 
 
 @into(SYSTEM_CHECKS, "attributes")
@@ -105,14 +117,11 @@ def _system_attributes(cls: type[System]) -> None:
 def _system_shapes(cls: type[System]) -> None:
     """All functions act on the last axis and take any leading ones."""
     system = cls()
-    nx, ny, nu = system.nx, system.ny, system.nu
     for batch in ((), (1,), (5,), (2, 3)):
         t, x, u = _points(system, *batch)
         t = np.asarray(t)
-        require_shape(system.input(t), (*batch, nu), f"input(t) at t {batch}")
-        _check_rate_shapes(system, t, x, u)
-        require_shape(system.h(x), (*batch, ny), f"h at x {x.shape}")
-        require_shape(system.h_jacobian(x), (*batch, ny, nx), f"h_jacobian at x {x.shape}")
+        require_shape(system.input(t), (*batch, system.nu), f"input(t) at t {batch}")
+        _check_equation_shapes(system, t, x, u)
         for name, shape in (("admissible", batch), ("observable", x.shape)):
             marks = np.asarray(getattr(system, name)(x))
             require_shape(marks, shape, f"{name} at x {x.shape}")
@@ -124,18 +133,27 @@ def _system_shapes(cls: type[System]) -> None:
             require_shape(other, x.shape, f"indistinguishable at x {x.shape}")
 
 
-def _check_rate_shapes(system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray) -> None:
-    """F and its Jacobian with a time per state, with one for all, and with one per leading row."""
-    now = np.asarray(0.1)
-    times = [(t, u), (now, np.asarray(system.input(now)))]
+def _check_equation_shapes(system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray) -> None:
+    """The equations and their Jacobians with a time per state, with one for all, and with one per
+    leading row; those of the output also with a time that is a plain number."""
+    now, nx = np.asarray(0.1), system.nx
+    u_now = _inputs(system, now)
+    times = [(t, u), (now, u_now)]
     if t.ndim == 2:
         column = t[:, :1]
-        times.append((column, np.asarray(system.input(column))))
+        times.append((column, _inputs(system, column)))
     for t, u in times:
         where = f"at t {t.shape}, x {x.shape}, u {u.shape}"
         require_shape(system.f(t, x, u), x.shape, f"f {where}")
-        expected = (*x.shape, system.nx)
-        require_shape(system.f_jacobian(t, x, u), expected, f"f_jacobian {where}")
+        require_shape(system.f_jacobian(t, x, u), (*x.shape, nx), f"f_jacobian {where}")
+        _check_output_shapes(system, t, x, u, where)
+    _check_output_shapes(system, 0.1, x, u_now, f"at t 0.1, x {x.shape}, u {u_now.shape}")
+
+
+def _check_output_shapes(system: System, t: Any, x: np.ndarray, u: np.ndarray, where: str) -> None:
+    y = (*x.shape[:-1], system.ny)
+    require_shape(system.h(t, x, u), y, f"h {where}")
+    require_shape(system.h_jacobian(t, x, u), (*y, system.nx), f"h_jacobian {where}")
 
 
 @into(SYSTEM_CHECKS, "rows_independent")
@@ -155,10 +173,10 @@ def _functions(system: System) -> dict[str, Callable[[Any, Any, Any], Any]]:
     """What a system computes, as functions of (t, x, u)."""
     return {
         "f": system.f,
-        "h": lambda t, x, u: system.h(x),
+        "h": system.h,
         "input": lambda t, x, u: system.input(t),
         "f_jacobian": system.f_jacobian,
-        "h_jacobian": lambda t, x, u: system.h_jacobian(x),
+        "h_jacobian": system.h_jacobian,
     }
 
 
@@ -220,8 +238,9 @@ def _system_f_jacobian(cls: type[System]) -> None:
 def _system_h_jacobian(cls: type[System]) -> None:
     """h_jacobian is ∂h/∂x, by central differences."""
     system = cls()
-    _, x, _ = _points(system, 20)
-    _check_jacobian(system, system.h, system.h_jacobian(x), x, "h_jacobian")
+    t, x, u = _points(system, 20)
+    found = system.h_jacobian(t, x, u)
+    _check_jacobian(system, lambda x: system.h(t, x, u), found, x, "h_jacobian")
 
 
 def _check_jacobian(
@@ -257,9 +276,9 @@ def _system_initial_states(cls: type[System]) -> None:
     for name, system, setup in _setups(cls):
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
         require(np.isfinite(x0).all(), f"setup {name!r} starts from {x0}; expected finite states")
-        x = _trajectories(system, setup, x0)
+        x, y = _trajectories(system, setup, x0)
         require_shape(x, (len(x), *x0.shape), f"the truth of setup {name!r}")
-        require(np.isfinite(system.h(x)).all(), f"outputs of setup {name!r} leave the finite ones")
+        require(np.isfinite(y).all(), f"outputs of setup {name!r} leave the finite ones")
 
 
 @into(SYSTEM_CHECKS, "invariants")
@@ -269,7 +288,7 @@ def _system_invariants(cls: type[System]) -> None:
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
         values = system.invariants(x0)
         if values is not None:
-            along: Any = system.invariants(_trajectories(system, setup, x0))
+            along: Any = system.invariants(_trajectories(system, setup, x0)[0])
             size = abs(np.asarray(values)).max(axis=0)
             expected = np.broadcast_to(values, np.shape(along))
             what = f"invariants at the start and along the truth of setup {name!r}"
@@ -282,7 +301,7 @@ def _system_indistinguishable(cls: type[System]) -> None:
     for name, system, setup in _setups(cls):
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
         for other in system.indistinguishable(x0):
-            y = np.asarray(system.h(_trajectories(system, setup, x0)))
-            like = system.h(_trajectories(system, setup, np.asarray(other)))
+            _, y = _trajectories(system, setup, x0)
+            _, like = _trajectories(system, setup, np.asarray(other))
             what = f"outputs of indistinguishable states of setup {name!r}"
             require_close(like, y, TRUTH_TOLERANCE, abs(y).max(), what)

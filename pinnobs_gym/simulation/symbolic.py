@@ -20,7 +20,7 @@ from pinnobs_gym.simulation.system import System
 
 @dataclass(frozen=True)
 class Equations:
-    """ẋ = f(t, x, u), y = h(x) and u(t) of a system, its parameters being symbols."""
+    """ẋ = f(t, x, u), y = h(t, x, u) and u(t) of a system, its parameters being symbols."""
 
     t: sympy.Symbol
     x: tuple[sympy.Symbol, ...]
@@ -91,7 +91,7 @@ def _traced(system: System, parameters: Mapping[str, sympy.Symbol]) -> Equations
         parameters,
         definitions,
         _column(traced.f(now, state, inputs), system.nx),
-        _column(traced.h(state), system.ny),
+        _column(traced.h(now, state, inputs), system.ny),
         _column(traced.input(now), system.nu),
     )
 

@@ -81,7 +81,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class System(ABC):
-    """A plant ẋ = f(t, x, u), y = h(x), written once and used by everything else.
+    """A plant ẋ = f(t, x, u), y = h(t, x, u), written once and used by everything else.
 
     To add one, subclass it in one file: the dataclass fields are the physical parameters, the class
     attributes below say the names, sizes and setups, and `f` and `h` are the equations. Both act on
@@ -134,8 +134,12 @@ class System(ABC):
         """The state's rate of change, (..., nx), at time t (s), state x (..., nx), input u."""
 
     @abstractmethod
-    def h(self, x: Array) -> Array:
-        """The noise-free output, (..., ny), at state x (..., nx)."""
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        """The noise-free output, (..., ny), at time t (s), state x (..., nx), input u (..., nu).
+
+        The time is a number or an array (...), and t and u broadcast against the batch of x as in
+        `f`. At a sample they are the sample's own time and input.
+        """
 
     def input(self, t: Array) -> Array:
         """The known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
@@ -146,9 +150,9 @@ class System(ABC):
         """∂f/∂x, (..., nx, nx); by forward-mode automatic differentiation unless overridden."""
         return _jacobian(lambda x, t, u: self.f(t, x, u), x, t, u)
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         """∂h/∂x, (..., ny, nx); by forward-mode automatic differentiation unless overridden."""
-        return _jacobian(self.h, x)
+        return _jacobian(lambda x, t, u: self.h(t, x, u), x, t, u)
 
     def admissible(self, x0: Array) -> Array:
         """Which initial states (..., nx) of the benchmark's box belong to its set: bool (...)."""
@@ -302,7 +306,12 @@ def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array
     import torch
 
     given = torch.as_tensor(x)
-    tensors = [torch.as_tensor(other, device=given.device) for other in others]
+    tensors = [
+        other
+        if isinstance(other, torch.Tensor)
+        else torch.tensor(other, dtype=given.dtype, device=given.device)
+        for other in others
+    ]
     nx = given.shape[-1]
     directions = torch.eye(nx, dtype=given.dtype, device=given.device)
     directions = directions.reshape(nx, *([1] * (given.ndim - 1)), nx)
@@ -317,10 +326,17 @@ NOISE_FLOOR = 1e-3
 """Least standard deviation of output noise in R, over the output's scale."""
 
 
+_TIMES = 9
+"""Times of an episode, evenly spread from the first sample on, at which `output_scale` looks."""
+
+
 def output_scale(system: System) -> np.ndarray:
     """The scale of each output, (ny,), in its unit: that of the state with the largest influence on
-    it at the benchmark's x̂₀, or one if none has any there."""
-    scale = vector(system.scale, system.nx, "scale")
-    H = system.h_jacobian(vector(system.setups["benchmark"].xhat0, system.nx, "xhat0"))
-    size = abs(H * scale).max(axis=-1)
+    it at the benchmark's x̂₀, at some times of its episode and the inputs then, or one if none has
+    any there."""
+    setup, scale = system.setups["benchmark"], vector(system.scale, system.nx, "scale")
+    t = np.linspace(0.0, setup.duration, _TIMES)
+    x = np.tile(vector(setup.xhat0, system.nx, "xhat0"), (_TIMES, 1))
+    H = system.h_jacobian(t, x, np.asarray(system.input(t)))
+    size = abs(H * scale).max(axis=(0, -1))
     return np.where(size > 0, size, 1.0)

@@ -53,7 +53,7 @@ class Academic(System):
         root = array_namespace(x).sqrt(1 + x1 * x1)
         return stack(x, x2 * root, -x1 * x2 * x2 / root)
 
-    def h(self, x: Array) -> Array:
+    def h(self, t: Array, x: Array, u: Array) -> Array:
         return x[..., :1]
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
@@ -62,7 +62,7 @@ class Academic(System):
         slope = x1 * x2 / root
         return matrix(x, [[slope, root], [-x2 * x2 / (root * root * root), -2 * slope]])
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:

@@ -53,14 +53,14 @@ class HarmonicOscillator(System):
         x1, x2, x3 = x[..., 0], x[..., 1], x[..., 2]
         return stack(x, x2, -x3 * x1, 0.0)
 
-    def h(self, x: Array) -> Array:
+    def h(self, t: Array, x: Array, u: Array) -> Array:
         return x[..., :1]
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         x1, x3 = x[..., 0], x[..., 2]
         return matrix(x, [[0.0, 1.0, 0.0], [-x3, 0.0, -x1], [0.0, 0.0, 0.0]])
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         return matrix(x, [[1.0, 0.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:

@@ -141,7 +141,7 @@ class InductionMotor(System):
         after = t >= self.load_step_time
         return self.T_L + after * (self.load_step_torque - self.T_L)
 
-    def h(self, x: Array) -> Array:
+    def h(self, t: Array, x: Array, u: Array) -> Array:
         return x[..., :2]
 
     def input(self, t: Array) -> Array:
@@ -163,7 +163,7 @@ class InductionMotor(System):
         ]
         return matrix(x, rows)
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         return matrix(x, [[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def observable(self, x: Array) -> Array:

@@ -53,7 +53,7 @@ class ModifiedAcademic(System):
         root = array_namespace(x).sqrt(1 + x2 * x2)
         return stack(x, x2 * root, -x1 * x2 * x2 / root)
 
-    def h(self, x: Array) -> Array:
+    def h(self, t: Array, x: Array, u: Array) -> Array:
         return x[..., :1]
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
@@ -63,7 +63,7 @@ class ModifiedAcademic(System):
         slope = -x1 * x2 * (2 + square) / (root * root * root)
         return matrix(x, [[0.0, root + square / root], [-square / root, slope]])
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:

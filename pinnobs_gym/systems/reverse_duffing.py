@@ -49,14 +49,14 @@ class ReverseDuffing(System):
         x1, x2 = x[..., 0], x[..., 1]
         return stack(x, x2 * x2 * x2, -x1)
 
-    def h(self, x: Array) -> Array:
+    def h(self, t: Array, x: Array, u: Array) -> Array:
         return x[..., :1]
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         x2 = x[..., 1]
         return matrix(x, [[0.0, 3 * x2 * x2], [-1.0, 0.0]])
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:

@@ -75,7 +75,7 @@ class Satellite(System):
         x1, x2, x3 = x[..., 0], x[..., 1], x[..., 2]
         return stack(x, self.a1 * x2 * x3, self.a2 * x1 * x3, self.a3 * x1 * x2)
 
-    def h(self, x: Array) -> Array:
+    def h(self, t: Array, x: Array, u: Array) -> Array:
         return x[..., ::2] if self.measure_x3 else x[..., :1]
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
@@ -84,7 +84,7 @@ class Satellite(System):
         rows = [[0.0, a1 * x3, a1 * x2], [a2 * x3, 0.0, a2 * x1], [a3 * x2, a3 * x1, 0.0]]
         return matrix(x, rows)
 
-    def h_jacobian(self, x: Array) -> Array:
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         rows = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
         return matrix(x, rows if self.measure_x3 else rows[:1])
 

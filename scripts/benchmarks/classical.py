@@ -97,11 +97,14 @@ def filterpy_sigma_points(own: GaussianEstimator, record: Record) -> np.ndarray:
     def step(x: np.ndarray, dt: float) -> np.ndarray:
         return model_step(system, 0.0, dt, x)
 
+    def output(x: np.ndarray) -> np.ndarray:
+        return system.h(0.0, x, np.empty(0))
+
     if isinstance(own, UKF):
         points = MerweScaledSigmaPoints(2, alpha=1.0, beta=own.beta, kappa=1.0)
-        filter = UnscentedKalmanFilter(2, 1, dt, system.h, step, points)
+        filter = UnscentedKalmanFilter(2, 1, dt, output, step, points)
     else:
-        filter = CubatureKalmanFilter(2, 1, dt, system.h, step)
+        filter = CubatureKalmanFilter(2, 1, dt, output, step)
     Q, R = (matrix[..., 0] for matrix in own.tuning())
     filter.x, filter.P = record.prior.mean[0].copy(), record.prior.cov[0].copy()
     filter.Q, filter.R = np.zeros((2, 2)), R

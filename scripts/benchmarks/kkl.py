@@ -181,9 +181,10 @@ def played(x0: np.ndarray, noise_std: float) -> Record:
 def _with_states(x0: np.ndarray, noise_std: float) -> tuple[Record, np.ndarray]:
     system = ReverseDuffing()
     x = truth(system, x0, TIMES).swapaxes(0, 1)
-    y = system.h(x) + noise_std * np.random.default_rng(54321).standard_normal((*x.shape[:2], 1))
-    setup = system.setups["benchmark"]
-    return Record(TIMES, y, np.empty((*x.shape[:2], 0)), Prior.of(system, setup, len(x0))), x
+    u = np.empty((*x.shape[:2], 0))
+    noise = noise_std * np.random.default_rng(54321).standard_normal((*x.shape[:2], 1))
+    prior = Prior.of(system, system.setups["benchmark"], len(x0))
+    return Record(TIMES, system.h(TIMES, x, u) + noise, u, prior), x
 
 
 def mse(trained: TrainedKKL, x0: np.ndarray, noise_std: float) -> float:

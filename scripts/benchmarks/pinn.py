@@ -59,7 +59,8 @@ class Case:
         record = self.record
         x = truth(self.system, np.array([x0]), record.t, None)[:, 0]
         prior = Prior(np.array([xhat0]), record.prior.cov)
-        return Case(self.system, replace(record, y=self.system.h(x)[None], prior=prior), x)
+        y = self.system.h(record.t, x, record.u[0])
+        return Case(self.system, replace(record, y=y[None], prior=prior), x)
 
     def noisy(self, std: float, seed: int) -> Case:
         """The same episode with noise on its outputs."""
@@ -132,7 +133,7 @@ def plain_iteration(case: Case) -> Callable[[], None]:
         rates = [
             torch.autograd.grad(xhat[:, i].sum(), t, create_graph=True)[0] for i in range(system.nx)
         ]
-        innovation = y - system.h(xhat)
+        innovation = y - system.h(t, xhat, u)
         residual = torch.stack(rates, -1) - system.f(t, xhat, u)
         residual = residual - (L @ innovation[..., None])[..., 0]
         loss = ((network(start)[0] - xhat0) ** 2).sum() + (residual**2).sum(-1).mean()

@@ -403,7 +403,7 @@ class Pendulum(System):
         theta, omega = x[..., 0], x[..., 1]
         return stack(x, omega, -64.22 * array_namespace(x).sin(theta) - 0.0672 * omega)
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x[..., :1]
 '''
 

@@ -75,7 +75,7 @@ class Branching(System):
     def f(self, t, x, u):
         return stack(x, 1.0 if x[..., 0] < 0 else -1.0)
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x
 
 

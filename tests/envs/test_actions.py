@@ -74,7 +74,7 @@ def test_gain_is_the_observer_written_out(name: str) -> None:
         if k:
             xhat = model_step(system, setup.times[k - 1], setup.times[k], xhat[None])[0]
         y = sample[: system.ny].astype(float)
-        e = y - system.h(xhat)
+        e = y - system.h(setup.times[k], xhat, raw.unwrapped.source.inputs[k])
         scale = np.array(system.scale)
         assert observation[: system.ny] == pytest.approx(np.arcsinh(e / root_S[k]), rel=1e-5)
         middle = observation[system.ny : system.ny + system.nx]

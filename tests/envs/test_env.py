@@ -10,12 +10,15 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from linear import FeedThrough, Linear, Modulated
 from made_envs import ALLOWED_WARNINGS, DUFFING, IDS, MOTOR, make, make_vec, short
 
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.envs.env import EstimationEnv
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.envs.figures import measured_states
 from pinnobs_gym.envs.vector_env import EstimationVectorEnv
+from pinnobs_gym.simulation.system import output_scale
 from pinnobs_gym.systems import SYSTEMS
 
 
@@ -723,3 +726,17 @@ def test_episodes_that_wait_for_their_row_are_its_next(monkeypatch: pytest.Monke
         else:
             expected = single.reset()[0]
         np.testing.assert_allclose(observation, expected, atol=1e-7)
+
+
+def test_a_state_is_measured_alone_if_the_output_is_that_state_at_any_time_and_input() -> None:
+    assert measured_states(SYSTEMS.resolve("InductionMotor")()) == {0: 0, 1: 1}
+    assert measured_states(Linear()) == {0: 0}  # y2 is twice the state
+    assert measured_states(FeedThrough()) == {}
+    assert measured_states(Modulated()) == {}
+
+
+def test_the_scale_of_an_output_is_the_largest_over_an_episode() -> None:
+    assert np.array_equal(output_scale(FeedThrough()), [1.0, 2.0])
+    t = np.linspace(0.0, 2.0, 9)
+    gain = 1 + 0.4 * (np.sin(t) + 0.5 * (np.cos(5 * t) + 0.3))
+    assert output_scale(Modulated()) == pytest.approx([gain.max(), 2.0])

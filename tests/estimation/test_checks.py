@@ -75,7 +75,7 @@ class Pendulum(System):
         angle, rate = x[..., 0], x[..., 1]
         return stack(x, rate, -array_namespace(x).sin(angle) - self.damping * rate)
 
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return array_namespace(x).sin(x[..., :1])
 
 
@@ -86,7 +86,7 @@ class QuickPendulum(Pendulum):
     def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -self.damping]])
 
-    def h_jacobian(self, x: Any) -> Any:
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[np.cos(x[..., 0]), 0.0]])
 
 
@@ -98,8 +98,58 @@ class WrongJacobian(Pendulum):
 
 @dataclass(frozen=True)
 class WrongOutputJacobian(Pendulum):
-    def h_jacobian(self, x: Any) -> Any:
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Shaken(Pendulum):
+    """A pendulum of which a sensor that is moved with time, and by an input, tells the angle."""
+
+    input_names = ("u1",)
+
+    def h(self, t: Any, x: Any, u: Any) -> Any:
+        return self.gain(t, u) * array_namespace(x).sin(x[..., :1]) + u
+
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        gain = self.gain(t, u)[..., 0]
+        return matrix(x, [[gain * array_namespace(x).cos(x[..., 0]), 0.0]])
+
+    def gain(self, t: Any, u: Any) -> Any:
+        return 1.0 + 0.1 * (t + 0.0 * u[..., 0])[..., None] + 0.2 * u
+
+
+@dataclass(frozen=True)
+class DrivenShaken(Shaken):
+    """The same with a known input."""
+
+    def input(self, t: Any) -> Any:
+        xp = array_namespace(t)
+        return xp.cos(xp.stack([t], axis=-1))
+
+
+@dataclass(frozen=True)
+class BlindToTime(Shaken):
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return super().h_jacobian(0.0, x, u)
+
+
+@dataclass(frozen=True)
+class BlindToInput(Shaken):
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return super().h_jacobian(t, x, 0.0 * u)
+
+
+@dataclass(frozen=True)
+class BlindToKnownInput(DrivenShaken):
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return super().h_jacobian(t, x, 0.0 * u)
+
+
+@dataclass(frozen=True)
+class ArraysOfTimeOnly(Shaken):
+    def h(self, t: Any, x: Any, u: Any) -> Any:
+        return super().h(t.reshape(t.shape), x, u)
 
 
 @dataclass(frozen=True)
@@ -132,10 +182,10 @@ class NumPyOnly(Pendulum):
 class NumPyFunction(Pendulum):
     """np.sin takes a torch tensor without a word, and returns one, unless it needs a gradient."""
 
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return np.sin(x[..., :1])
 
-    def h_jacobian(self, x: Any) -> Any:
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[np.cos(x[..., 0]), 0.0]])
 
 
@@ -151,7 +201,7 @@ class OneRowOnly(Pendulum):
 
 @dataclass(frozen=True)
 class NoLastAxis(Pendulum):
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return array_namespace(x).sin(x[..., 0])
 
 
@@ -199,7 +249,7 @@ class WithoutParameters(Pendulum):
     pass
 
 
-@pytest.mark.parametrize("cls", [Pendulum, QuickPendulum, WithoutParameters])
+@pytest.mark.parametrize("cls", [Pendulum, QuickPendulum, Shaken, DrivenShaken, WithoutParameters])
 def test_sound_system_passes(cls: type[System]) -> None:
     check_system(cls)
 
@@ -209,6 +259,10 @@ def test_sound_system_passes(cls: type[System]) -> None:
     [
         (WrongJacobian, "f_jacobian", r"entry \[1, 1\] .* central differences"),
         (WrongOutputJacobian, "h_jacobian", r"entry \[0, 0\]"),
+        (BlindToTime, "h_jacobian", r"entry \[0, 0\]"),
+        (BlindToInput, "h_jacobian", r"entry \[0, 0\]"),
+        (BlindToKnownInput, "h_jacobian", r"entry \[0, 0\]"),
+        (ArraysOfTimeOnly, "shapes", "AttributeError: 'float' object has no attribute 'reshape'"),
         (Impure, "purity", "f gives another result when called again"),
         (Overwriting, "purity", "f modifies its argument x"),
         (NumPyOnly, "array_api", "f of torch tensors .*array_namespace"),

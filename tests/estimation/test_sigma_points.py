@@ -95,7 +95,7 @@ class Walk(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], 0.0)
 
-    def h(self, x):
+    def h(self, t, x, u):
         return 0.5 * x[..., :1] - 0.3 * x[..., 1:]
 
 

@@ -1,8 +1,10 @@
 """A linear system, on which filters have closed forms, and records of episodes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+from array_api_compat import array_namespace
 from filterpy.kalman import KalmanFilter
 
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
@@ -25,7 +27,7 @@ class Linear(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], -2.0 * x[..., 0] - 0.3 * x[..., 1])
 
-    def h(self, x):
+    def h(self, t, x, u):
         return stack(x, x[..., 0], 2 * x[..., 1])
 
 
@@ -48,8 +50,58 @@ def linear_record(batch=3):
     return record_of(EpisodeSource(Linear), batch)
 
 
-def kalman_filter(record, row, process_noise, noise_std):
-    """filterpy's Kalman filter on an episode of the linear system, yielded after every sample."""
+@dataclass(frozen=True)
+class FeedThrough(Linear):
+    """The same with outputs y = C(t, u)x + Du + (sin 3t, 0)/2, where C is `H` with its first row
+    times 1 + m(sin t + u/2)."""
+
+    modulation: ClassVar[float] = 0.0
+    """m."""
+    input_names = ("u1",)
+
+    def h(self, t, x, u):
+        xp, u1 = array_namespace(x), u[..., 0]
+        t = t + 0 * u1  # a number has no namespace
+        gain = 1 + self.modulation * (xp.sin(t) + 0.5 * u1)
+        first = gain * x[..., 0] + D[0] * u1 + 0.5 * xp.sin(3 * t)
+        return stack(x, first, 2 * x[..., 1] + D[1] * u1)
+
+    def input(self, t):
+        return array_namespace(t).stack([array_namespace(t).cos(5 * t) + 0.3], axis=-1)
+
+
+@dataclass(frozen=True)
+class Modulated(FeedThrough):
+    """The same with an output Jacobian that changes with time and input."""
+
+    modulation = 0.4
+
+
+D = (0.7, -1.1)
+
+
+def jacobians(system, t, u):
+    """C(t, u) of `FeedThrough`, (num_samples, 2, 2), at times (num_samples,), inputs (..., 1)."""
+    C = np.repeat(H[None], len(t), axis=0)
+    C[:, 0] *= (1 + system.modulation * (np.sin(t) + 0.5 * u[:, 0]))[:, None]
+    return C
+
+
+def fed_through(record, measured, seed=0):
+    """`FeedThrough` and a record of it, from one of `Linear`: Du + (sin 3t, 0)/2 is added to the
+    outputs. The input is the system's own or, if measured, random."""
+    t, system = record.t, FeedThrough(measured_input=measured)
+    if measured:
+        u = np.random.default_rng(seed).standard_normal((*record.y.shape[:2], 1))
+    else:
+        u = np.repeat(system.input(t)[None], record.batch, axis=0)
+    known = D * u + 0.5 * np.stack([np.sin(3 * t), 0 * t], axis=-1)
+    return system, replace(record, y=record.y + known, u=u)
+
+
+def kalman_filter(record, row, process_noise, noise_std, C=None):
+    """filterpy's Kalman filter on an episode of the linear system, yielded after every sample. The
+    output matrix C (num_samples, 2, 2) is `H` if None."""
     peer = KalmanFilter(dim_x=2, dim_z=2)
     peer.x, peer.P = record.prior.mean[row].copy(), record.prior.cov[row].copy()
     peer.F, peer.H = runge_kutta_matrix(0.1), H
@@ -57,5 +109,7 @@ def kalman_filter(record, row, process_noise, noise_std):
     for k in range(record.num_samples):
         if k:
             peer.predict()
+        if C is not None:
+            peer.H = C[k]
         peer.update(record.y[row, k])
         yield peer

@@ -29,7 +29,7 @@ class NoisyPendulum(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], -9.8 * array_namespace(x).sin(x[..., 0]))
 
-    def h(self, x):
+    def h(self, t, x, u):
         return array_namespace(x).sin(x[..., :1])
 
 
@@ -44,6 +44,6 @@ def pendulum_record(batch):
     for k in range(1, len(t)):
         noise = rng.multivariate_normal(np.zeros(2), Q, batch)
         x[k] = model_step(system, t[k - 1], t[k], x[k - 1]) + noise
-    y = system.h(x) + 0.3 * rng.standard_normal((len(t), batch, 1))
     u = np.zeros((batch, len(t), 0))
+    y = system.h(t[:, None], x, u.swapaxes(0, 1)) + 0.3 * rng.standard_normal((len(t), batch, 1))
     return x.swapaxes(0, 1), Record(t, y.swapaxes(0, 1), u, prior)

@@ -39,16 +39,16 @@ class Spring(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], -self.stiffness * x[..., 0] - 0.3 * x[..., 1] + u[..., 0])
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x[..., :1]
 
-    def h_jacobian(self, x):
+    def h_jacobian(self, t, x, u):
         return matrix(x, [[1.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class Mixer(System):
-    """Three states, two nonlinear outputs, two inputs and time in f: nothing the paper has."""
+    """Three states, two nonlinear outputs, two inputs, time in f and h: nothing the paper has."""
 
     state_names = ("a", "b", "c")
     output_names = ("y1", "y2")
@@ -61,8 +61,9 @@ class Mixer(System):
         a, b, c = x[..., 0], x[..., 1], x[..., 2]
         return stack(x, b * c + u[..., 0], xp.sin(a) * t - b, u[..., 1] * a - c)
 
-    def h(self, x):
-        return stack(x, x[..., 0] * x[..., 1], x[..., 2] ** 2)
+    def h(self, t, x, u):
+        a, b, c = x[..., 0], x[..., 1], x[..., 2]
+        return stack(x, a * b + t * u[..., 1], c**2 + t * b + u[..., 0] * a)
 
     def input(self, t):
         xp = array_namespace(t)
@@ -73,8 +74,10 @@ def played(system, setup, noise_std=0.0):
     """A record of one episode, with the setup's fixed initial state."""
     t = setup.times
     x = truth(system, np.array([setup.x0_low], dtype=float), t)[:, 0]
-    y = system.h(x) + noise_std * np.random.default_rng(5).standard_normal((len(t), system.ny))
-    return Record(t, y[None], np.asarray(system.input(t))[None], Prior.of(system, setup, 1))
+    u = np.asarray(system.input(t))
+    noise = noise_std * np.random.default_rng(5).standard_normal((len(t), system.ny))
+    y = system.h(t, x, u) + noise
+    return Record(t, y[None], u[None], Prior.of(system, setup, 1))
 
 
 def duffing(**changes):

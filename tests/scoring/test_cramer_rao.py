@@ -4,7 +4,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from linear import A, H, Linear, linear_record, record_of, runge_kutta_matrix
+from linear import (
+    A,
+    H,
+    Linear,
+    Modulated,
+    jacobians,
+    linear_record,
+    record_of,
+    runge_kutta_matrix,
+)
 from scipy.linalg import expm
 
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
@@ -37,7 +46,7 @@ def test_it_is_the_information_of_all_outputs(name):
                 step = (float(t[k - 1]), float(t[k]), x[row : row + 1, k - 1])
                 F = model_step_jacobian(system, *step, u[:1, k - 1], u[:1, k])[1][0]
                 Phi = F @ Phi
-            G = system.h_jacobian(x[row, k][None])[0] @ Phi
+            G = system.h_jacobian(t[k], x[row, k][None], u[:1, k])[0] @ Phi
             information = information + G.T @ np.linalg.solve(R, G)
         expected = Phi @ np.linalg.inv(information) @ Phi.T
         size = np.sqrt(np.diag(expected))
@@ -46,6 +55,22 @@ def test_it_is_the_information_of_all_outputs(name):
             information * np.outer(np.sqrt(np.diag(P0)), np.sqrt(np.diag(P0)))
         )
         assert off.max() < max(1e-12, 1e-15 * condition)
+
+
+def test_outputs_that_change_with_time_and_input_tell_what_they_do_then():
+    """Φ(P₀⁻¹ + ΣΦᵀC(t, u)ᵀR⁻¹C(t, u)Φ)⁻¹Φᵀ of a linear system, sample by sample."""
+    t, P0, R = 0.3 + np.arange(20) * 0.1, np.diag([2.0, 3.0]), np.diag([0.1, 0.2])
+    x = np.random.default_rng(0).standard_normal((2, 20, 2))
+    found = cramer_rao(Modulated(), t, x, P0, R)
+    C = jacobians(Modulated(), t, np.cos(5 * t)[:, None] + 0.3)
+    assert np.ptp(C[:, 0, 0]) > 0.3
+    Phi, information = np.eye(2), np.linalg.inv(P0)
+    for k in range(20):
+        G = C[k] @ Phi
+        information = information + G.T @ np.linalg.solve(R, G)
+        expected = Phi @ np.linalg.inv(information) @ Phi.T
+        np.testing.assert_allclose(found[:, k], [expected, expected], rtol=1e-10)
+        Phi = runge_kutta_matrix(0.1) @ Phi
 
 
 def test_missing_outputs_tell_nothing_and_process_noise_is_added():
@@ -104,18 +129,29 @@ def test_the_error_of_a_step_is_the_runge_kutta_methods():
     assert not found[:, 0].any()
 
 
-def test_on_a_linear_system_exact_bayes_is_least_squares():
+@dataclass(frozen=True)
+class WideModulated(Modulated):
+    setups = WideLinear.setups
+
+
+@pytest.mark.parametrize("cls", [WideLinear, WideModulated])
+def test_on_a_linear_system_exact_bayes_is_least_squares(cls):
     """With a uniform prior much wider than what one output leaves open."""
-    record = record_of(EpisodeSource(WideLinear), 3)
-    setup: Setup = WideLinear.setups["benchmark"]
-    posterior = exact_bayes(WideLinear(), setup, record, np.full(2, 0.01), draws=4000)
+    record = record_of(EpisodeSource(cls), 3)
+    setup: Setup = cls.setups["benchmark"]
+    posterior = exact_bayes(cls(), setup, record, np.full(2, 0.01), draws=4000)
+    C, y = np.repeat(H[None], record.num_samples, axis=0), record.y
+    if cls is WideModulated:
+        C = jacobians(cls(), record.t, record.u[0])
+        sine = 0.5 * np.stack([np.sin(3 * record.t), 0 * record.t], axis=-1)
+        y = y - record.u * (0.7, -1.1) - sine
     assert posterior.ess[:, 2:].min() > 400
     F, Phi = runge_kutta_matrix(0.1), np.eye(2)
     information, right = np.zeros((2, 2)), np.zeros((2, 3))
     for k in range(record.num_samples):
-        G = H @ Phi
+        G = C[k] @ Phi
         information += G.T @ G / 0.01
-        right += G.T @ record.y[:, k].T / 0.01
+        right += G.T @ y[:, k].T / 0.01
         if k >= 2:
             cov = Phi @ np.linalg.inv(information) @ Phi.T
             off = posterior.mean[:, k] - (Phi @ np.linalg.solve(information, right)).T

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from linear import A, Linear
+from linear import A, FeedThrough, Linear, Modulated, jacobians
 from scipy.linalg import expm
 
 from pinnobs_gym import evaluate
@@ -32,6 +32,20 @@ def test_every_condition_can_be_played_on_every_system(name, condition):
     assert np.isfinite(episodes.x).all()
     assert not np.isnan(episodes.y).all(axis=(0, 2)).any()
     assert source.system == SYSTEMS.resolve(name)()  # what estimators are given
+
+
+@pytest.mark.parametrize("condition", ["noise0", "noise0+mismatch10", "noise0+process_noise1e-2"])
+@pytest.mark.parametrize("cls", [FeedThrough, Modulated])
+def test_outputs_are_h_at_the_samples_own_time_and_input(cls, condition):
+    """y_k = C(t_k, u_k)x_k + Du_k + (sin 3t_k, 0)/2, written out, at the states of the plant."""
+    source, episodes = played(cls, condition, batch=3)
+    t, u = source.times, np.cos(5 * source.times)[:, None] + 0.3
+    np.testing.assert_allclose(source.inputs, u, rtol=1e-14)
+    C = jacobians(source.system, t, u)
+    expected = np.einsum("kij,kbj->kbi", C, episodes.x)
+    expected += (u * (0.7, -1.1) + 0.5 * np.stack([np.sin(3 * t), 0 * t], axis=-1))[:, None]
+    np.testing.assert_allclose(episodes.y, expected, atol=1e-13)
+    np.testing.assert_allclose(episodes.observations[..., :2], expected, atol=1e-6)
 
 
 def signs(count):

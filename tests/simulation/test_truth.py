@@ -205,7 +205,7 @@ class VanDerPol(System):
         x1, x2 = x[..., 0], x[..., 1]
         return stack(x, x2, self.mu * (1 - x1 * x1) * x2 - x1)
 
-    def h(self, x: Any) -> Any:
+    def h(self, t: Any, x: Any, u: Any) -> Any:
         return x[..., :1]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from linear import A as PLANT
-from linear import H, Linear, linear_record
+from linear import FeedThrough, H, Linear, linear_record
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_lyapunov, solve_sylvester
 
@@ -30,7 +30,7 @@ from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import trainer
 from trainers.kkl.fitting import Equations, Fit, Term
-from trainers.kkl.labels import frequency, initial_states, noise_in_z, simulated, steady
+from trainers.kkl.labels import driven, frequency, initial_states, noise_in_z, simulated, steady
 from trainers.kkl.learned_poles import _response
 from trainers.kkl.run import Run, kept_samples
 
@@ -55,14 +55,12 @@ def trained_on(name, system="ReverseDuffing", noise_std=None, part=1.0, **settin
     return module.train(plant, config, record=record, noise_std=told), plant, setup, record
 
 
-def trained_on_linear(name, **settings):
+def trained_on_linear(name, cls=Linear, **settings):
     module = trainer(name)
     config = module.Config(**{**SMALL, "cutoff": 1.0, **settings})
-    t = 0.1 * np.arange(80)
-    record = Record(
-        t, np.zeros((1, 80, 2)), np.zeros((1, 80, 0)), Prior(np.zeros((1, 2)), np.eye(2)[None])
-    )
-    return module.train(Linear(), config, record=record, noise_std=0.0)
+    t, u = 0.1 * np.arange(80), np.zeros((1, 80, cls().nu))
+    record = Record(t, np.zeros((1, 80, 2)), u, Prior(np.zeros((1, 2)), np.eye(2)[None]))
+    return module.train(cls(), config, record=record, noise_std=0.0)
 
 
 # --- the dynamics of z
@@ -188,6 +186,56 @@ def test_episodes_satisfy_T_and_forget_how_z_began(start):
     np.testing.assert_allclose(found.x, truth(Linear(), x0, t)[kept], atol=1e-9)
 
 
+class Clocked(Linear):
+    """y = Hx + (sin 3t, 0)/2, without an input."""
+
+    def h(self, t, x, u):
+        y = super().h(t, x, u)
+        return stack(x, y[..., 0] + 0.5 * np.sin(3 * t), y[..., 1])
+
+
+@pytest.mark.parametrize("cls", [FeedThrough, Clocked])
+def test_z_is_driven_by_outputs_of_the_samples_own_time_and_input(cls):
+    dynamics, t = realised((-1.0, -2.0, -4.0), 2), 0.2 + 0.01 * np.arange(300)
+    x0 = np.random.default_rng(0).uniform(-1, 1, (4, 2))
+    kept = np.array([0, 5, 299])
+    found = simulated(cls(), dynamics, t, x0, kept, "output")
+    known = np.stack([0.5 * np.sin(3 * t), 0 * t], axis=-1)
+    if cls is FeedThrough:
+        known += (np.cos(5 * t)[:, None] + 0.3) * (0.7, -1.1)
+    y = truth(Linear(), x0, t) @ H.T + known[:, None]
+    z = dynamics.filtered(t, y, y[0] @ at_rest(dynamics, "output").T)
+    np.testing.assert_allclose(found.z, z[kept], atol=1e-9)
+    assert found.T is None
+
+
+def test_T_changes_with_time_if_the_equations_do():
+    assert not driven(Linear())
+    assert driven(Clocked())
+    assert driven(FeedThrough())
+
+
+@pytest.mark.parametrize("name", ["kkl_supervised", "kkl_pinn"])
+@pytest.mark.parametrize("cls", [FeedThrough, Clocked])
+def test_states_are_found_behind_outputs_that_change_with_time(name, cls, tmp_path):
+    system = cls()
+    trained = trained_on_linear(name, cls, iterations=150, share=1.0, start="zero", samples=80)
+    observer = ESTIMATORS.resolve(name)(system, 0.1, trained=trained)
+    t = 0.1 * np.arange(80)
+    x = truth(system, np.random.default_rng(1).uniform(-1, 1, (20, 2)), t).swapaxes(0, 1)
+    u = np.repeat(system.input(t)[None], 20, axis=0)
+    prior = Prior(np.zeros((20, 2)), np.repeat(np.eye(2)[None], 20, axis=0))
+    xhat = observer.run(Record(t, system.h(t, x, u), u, prior)).xhat
+    late = slice(20, None)
+    assert np.sqrt(((xhat - x)[:, late] ** 2).mean()) < 0.15 * np.sqrt((x[:, late] ** 2).mean())
+    path = tmp_path / "trained.pt"
+    observer.save(path)
+    again = type(observer).load(path, system)
+    np.testing.assert_array_equal(
+        again.trained.T(x[0], 1.0, u[0, 0]), trained.T(x[0], 1.0, u[0, 0])
+    )
+
+
 class Cubic(System):
     """ẋ = −x³ + x runs to infinity backward in finite time from abs x > 1."""
 
@@ -199,7 +247,7 @@ class Cubic(System):
     def f(self, t, x, u):
         return stack(x, x[..., 0] - x[..., 0] ** 3)
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x
 
 

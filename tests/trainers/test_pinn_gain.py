@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from linear import Linear
+from linear import Linear, Modulated, fed_through
 
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.envs.game import Game
@@ -76,7 +76,7 @@ def test_a_network_that_changes_nothing_is_the_ekf(name):
 
 
 @pytest.mark.parametrize("variant", ["kalman", "gru"])
-@pytest.mark.parametrize("name", ["HarmonicOscillator", "InductionMotor"])
+@pytest.mark.parametrize("name", ["HarmonicOscillator", "InductionMotor", Modulated])
 def test_online_and_training_compute_the_same(name, variant):
     source, record, _ = played(name, range(4), 20 * EpisodeSource(name).setup.dt)
     system = source.system
@@ -97,13 +97,28 @@ def test_online_and_training_compute_the_same(name, variant):
         if k:
             t = np.full(4, record.t[k - 1]), np.full(4, record.t[k])
             moment = predict(model, moment, t, (record.u[:, k - 1], record.u[:, k]))
-        moment = update(model, weights, moment, torch.tensor(record.y[:, k].T), R * torch.ones(4))
+        now = np.full(4, record.t[k]), record.u[:, k]
+        y, R_rows = torch.tensor(record.y[:, k].T), R * torch.ones(4)
+        moment = update(model, weights, moment, now, y, R_rows)
         error = abs(moment.xhat.numpy().T - found.xhat[:, k]) / np.array(system.scale)
         assert error.max() < 1e-10
         if found.P is not None:
             P = moment.P.numpy().transpose(2, 0, 1)
             assert abs(P - found.P[:, k]).max() < 1e-10 * abs(P).max()
     assert (found.P is None) == (variant == "gru")
+
+
+def test_a_known_part_of_the_outputs_changes_no_training():
+    """Smoothing, streams and held-out episodes see h at each sample's own time and input."""
+    _, record, _ = played(Linear, range(10), 2.0)
+    system, fed = fed_through(record, measured=True)
+    smoothed = [smooth(r, EKF(s, 0.1)).xhat for s, r in ((Linear(), record), (system, fed))]
+    np.testing.assert_allclose(*smoothed, atol=1e-9)
+    plain, own = (train(s, SMALL, record=r) for s, r in ((Linear(), record), (system, fed)))
+    assert plain.iterations == own.iterations == 6
+    assert own.loss == pytest.approx(plain.loss, rel=1e-6)
+    for ours, theirs in zip(own.layers, plain.layers, strict=True):
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-6)
 
 
 def test_rows_may_have_times_of_their_own():
@@ -140,7 +155,8 @@ def test_the_gradient_is_that_of_the_linearised_rollout():
             u = (np.zeros((count, 0)),) * 2
             moment = predict(model, moment, t, u)
             network = [*layers[:2], (weights, layers[2][1])]
-            moment = update(model, network, moment, y[k], R * torch.ones(count))
+            now = np.full(count, 0.1 * k), np.zeros((count, 0))
+            moment = update(model, network, moment, now, y[k], R * torch.ones(count))
         return moment.xhat.square().sum() + moment.P.sum()
 
     (gradient,) = torch.autograd.grad(loss(last), last)
@@ -163,7 +179,7 @@ def test_on_a_linear_system_P_is_the_covariance_of_any_gain(monkeypatch):
     gain = gain_of(system, 1.0, noise_std=(0.1, 0.1))
     gain = replace(gain, process_noise=0.0)
     found = gain.run(record)
-    H = system.h_jacobian(np.zeros(2))
+    H = system.h_jacobian(0.0, np.zeros(2), np.empty(0))
     F = model_step_jacobian(system, 0.0, 0.1, np.zeros((1, 2)))[1][0]
     roots = np.linalg.cholesky(record.prior.cov[0])  # the error is roots @ unit noises
     for k, K in enumerate(gains):

@@ -20,6 +20,8 @@ MOST_ESCAPED = 0.1
 """Largest part of the initial states that may be dropped."""
 FAR = 1e3
 """Size of a state, over its scale, from which on it has escaped."""
+_TIMES = 9
+"""Times of an episode at which the equations are compared."""
 _DRAWS = 100
 """Latin hypercubes without enough admissible states before the initial set is taken as empty."""
 
@@ -49,8 +51,8 @@ class _Reversed(System):
     def f(self, t: Array, x: Array, u: Array) -> Array:
         return -self.plant.f(-t, x, u)
 
-    def h(self, x: Array) -> Array:
-        return self.plant.h(x)
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        return self.plant.h(-t, x, u)
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,25 @@ class _Joint(System):
     def f(self, t: Array, x: Array, u: Array) -> Array:
         nx = self.plant.nx
         state, z = x[..., :nx], x[..., nx:]
-        rate = z @ self.dynamics.A.T + self.plant.h(state) @ self.dynamics.B.T
+        rate = z @ self.dynamics.A.T + self.plant.h(t, state, u) @ self.dynamics.B.T
         return np.concatenate([self.plant.f(t, state, u), rate], axis=-1)
 
-    def h(self, x: Array) -> Array:
-        return self.plant.h(x[..., : self.plant.nx])
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        return self.plant.h(t, x[..., : self.plant.nx], u)
+
+
+def driven(system: System) -> bool:
+    """Whether T changes with time: the plant has inputs, or its equations are not the same at all
+    times of a benchmark episode."""
+    if system.nu:
+        return True
+    setup, u = system.setups["benchmark"], np.empty(0)
+    x = initial_states(system, None, None, 20, seed=0)
+    times = np.linspace(0.0, setup.duration, _TIMES)
+    first, *others = ((system.f(t, x, u), system.h(t, x, u)) for t in times)
+    return not all(
+        np.array_equal(a, b) for pair in others for a, b in zip(first, pair, strict=True)
+    )
 
 
 def steady(
@@ -111,7 +127,8 @@ def steady(
     if dynamics.mode == "discrete":
         t = np.arange(round(duration / h) + 1) * h
         path = truth(backward, x[stays], t, step)[::-1]
-        z[stays] = dynamics.filtered(t, system.h(path))[-1]
+        y = system.h(t[:, None] - duration, path, np.empty((len(t), 1, 0)))
+        z[stays] = dynamics.filtered(t, y)[-1]
         return z, stays
     start = truth(backward, x[stays], np.array([0.0, duration]), step)[-1]
     begin = np.concatenate([start, np.zeros((len(start), dynamics.size))], axis=1)
@@ -144,7 +161,8 @@ def frequency(system: System) -> float:
     over that of their departures from the mean, in Hz."""
     setup = system.setups["benchmark"]
     x0 = initial_states(system, None, None, 20, seed=0)
-    y = system.h(truth(system, x0, setup.times, setup.truth_step))
+    t, x = setup.times, truth(system, x0, setup.times, setup.truth_step)
+    y = system.h(t[:, None], x, np.asarray(system.input(t))[:, None])
     rate = (np.diff(y, axis=0) ** 2).mean() / setup.dt**2
     spread = ((y - y.mean(axis=(0, 1))) ** 2).mean()
     return float(np.sqrt(rate / spread) / (2 * np.pi)) if spread > 0 else 0.0
@@ -199,7 +217,8 @@ class Episodes:
     flow: np.ndarray
     """Φ from the first sample on, (kept, nz, nz)."""
     T: np.ndarray | None
-    """T(x) along the episodes, (kept, batch, nz): z from T(x₀) at the first. None if driven."""
+    """T(x) along the episodes, (kept, batch, nz): z from T(x₀) at the first. None if T changes with
+    time."""
     dropped: int
     """Initial states that escaped backward."""
     drawn: int
@@ -218,15 +237,15 @@ def simulated(
     """Simulate episodes from x0 (batch, nx) on the sample times t (num_samples,) in s; of the
     samples ``kept`` (kept,) are returned. z begins as ``start`` says, x̂₀ (1, nx) being the prior's.
 
-    A plant with inputs is driven by u(t) from the first sample on, and T(t, x) begins there at
-    what z begins with (Bernard & Andrieu 2019): nothing is integrated backward.
+    T of a plant that is `driven` changes with time: T(t, x) begins at the first sample at what z
+    begins with (Bernard & Andrieu 2019), and nothing is integrated backward.
 
     Raises:
         ValueError: in one line, if over `MOST_ESCAPED` of the initial states escape backward.
     """
-    driven, drawn = system.nu > 0, len(x0)
-    T0, h = None, float(np.diff(t).mean())
-    if not driven:
+    varying, drawn = driven(system), len(x0)
+    T0, h, u = None, float(np.diff(t).mean()), np.asarray(system.input(t))
+    if not varying:
         T0, stays = steady(system, dynamics, x0, h)
         escaped = drawn - int(stays.sum())
         if escaped > MOST_ESCAPED * drawn:
@@ -236,8 +255,8 @@ def simulated(
                 f"{MOST_ESCAPED:.0%}: take faster poles, or a smaller box"
             )
         x0, T0 = x0[stays], T0[stays]
-    z0 = system.h(x0) @ at_rest(dynamics, start).T
-    if start == "prior" and not driven:
+    z0 = system.h(t[0], x0, u[0]) @ at_rest(dynamics, start).T
+    if start == "prior" and not varying:
         assert xhat0 is not None
         z0 = z0 + steady(system, dynamics, xhat0, h)[0]
     setup = system.setups["benchmark"]
@@ -247,13 +266,12 @@ def simulated(
     for first in range(0, len(x0), _AT_ONCE):  # whole paths of all would take too much memory
         rows = slice(first, first + _AT_ONCE)
         path = truth(system, x0[rows], t, setup.truth_step)
-        y = system.h(path)
+        y = system.h(t[:, None], path, u[:, None])
         x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows])[kept]
         if T is not None and T0 is not None:
             T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
-    u = np.asarray(system.input(t))[kept]
     flow = dynamics.flows(t)[kept]
-    return Episodes(t[kept] - t[0], u, x, z, x0, flow, T, drawn - len(x0), drawn)
+    return Episodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, drawn - len(x0), drawn)
 
 
 _AT_ONCE = 256

@@ -55,7 +55,7 @@ def learn(
     x = truth(system, x0[:EPISODES], t, system.setups["benchmark"].truth_step)
     scale = vector(system.scale, system.nx, "scale")
     states = torch.tensor((x - x.mean(axis=(0, 1))) / scale)
-    y = torch.tensor(system.h(x))
+    y = torch.tensor(system.h(t[:, None], x, np.asarray(system.input(t))[:, None]))
     generator = torch.Generator().manual_seed(seed)
     ny, number = system.ny, len(sizes)
     logs = torch.tensor(np.log(sizes), requires_grad=True)

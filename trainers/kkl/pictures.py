@@ -10,7 +10,7 @@ from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import truth
-from trainers.kkl.labels import initial_states, steady
+from trainers.kkl.labels import driven, initial_states, steady
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,10 +26,10 @@ _FLOOR = 1e-6
 
 def figures(system: System, trained: TrainedKKL, record: Record) -> dict[str, Figure]:
     """All pictures by name: ``error`` over the state space, error against initial ``radius``, the
-    ``maps`` T and T*, and the ``sweep`` if there was one. A driven plant has no ``error`` and
-    ``maps``: its T changes with time."""
+    ``maps`` T and T*, and the ``sweep`` if there was one. A plant whose T changes with
+    time has no ``error`` and ``maps``."""
     found = {"radius": radius_figure(system, trained, record)}
-    if system.nu == 0:
+    if not driven(system):
         found["error"] = error_figure(system, trained, record)
         found["maps"] = maps_figure(system, trained)
     if trained.facts.get("sweep"):
@@ -135,7 +135,8 @@ def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) 
     mean = np.broadcast_to(record.prior.mean[:1], states.shape)
     cov = np.broadcast_to(record.prior.cov[:1], (len(states), system.nx, system.nx))
     u = np.broadcast_to(system.input(record.t), (len(states), len(record.t), system.nu))
-    xhat = KKL(system, trained=trained).run(Record(record.t, system.h(x), u, Prior(mean, cov))).xhat
+    episodes = Record(record.t, system.h(record.t, x, u), u, Prior(mean, cov))
+    xhat = KKL(system, trained=trained).run(episodes).xhat
     late = slice(3 * len(record.t) // 4, None)
     scale = vector(system.scale, system.nx, "scale")
     square = (((xhat - x)[:, late] / scale) ** 2).mean(axis=(1, 2))

@@ -23,7 +23,7 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, output_scale, vector
 from trainers.kkl.config import KKLConfig
 from trainers.kkl.fitting import Equations, Fit, Objective, Term
-from trainers.kkl.labels import initial_states, noise_in_z, simulated
+from trainers.kkl.labels import driven, initial_states, noise_in_z, simulated
 from trainers.kkl.learned_poles import EPISODES, learn
 
 _FREE = ("checkpoint_every", "log_every", "device", "budget")
@@ -81,7 +81,7 @@ class Run:
         self._earlier, self._start = 0.0, time.process_time()
         self.method, self.system, self.config = method, system, config
         self.noise_std, self.gap = noise_std, gap
-        self.driven = system.nu > 0
+        self.driven = driven(system)
         self.t, self.prior = record.t, record.prior.mean[:1]
         if config.design == "learned":
             x0 = initial_states(system, config.low, config.high, EPISODES, config.seed)
@@ -182,6 +182,12 @@ class Run:
         )
         return k.to(self.device), episodes.to(self.device)
 
+    def outputs(self) -> np.ndarray:
+        """The noise-free outputs at the kept samples, (kept, batch, ny)."""
+        return np.asarray(
+            self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u[:, None])
+        )
+
     def encoded(self, k: Tensor, i: Tensor) -> Tensor:
         """What T is given at samples k of episodes i."""
         x = self.x[k, i]
@@ -240,7 +246,9 @@ class Run:
             )
             return evaluate(map_of, self.config.activation, x)
         T, T0 = (evaluate(map_of, self.config.activation, x) for x in (data.x, data.x0))
-        z0 = self.system.h(data.x0) @ at_rest(self.dynamics, self.config.start).T
+        first = self.t[0]
+        y0 = self.system.h(first, data.x0, np.asarray(self.system.input(first)))
+        z0 = y0 @ at_rest(self.dynamics, self.config.start).T
         if self.config.start == "prior":
             z0 = z0 + evaluate(map_of, self.config.activation, self.prior)
         return T + np.einsum("kij,bj->kbi", data.flow, z0 - T0)

@@ -66,15 +66,22 @@ def predict(
     return Moment(xhat, P, moment.memory)
 
 
-def update(model: Model, weights: Weights, moment: Moment, y: Tensor, R: Tensor) -> Moment:
-    """The estimates after outputs y (ny, batch), with noise of covariance R (ny, ny, batch); none
-    is missing."""
+def update(
+    model: Model,
+    weights: Weights,
+    moment: Moment,
+    now: tuple[np.ndarray, np.ndarray],
+    y: Tensor,
+    R: Tensor,
+) -> Moment:
+    """The estimates after outputs y (ny, batch), with noise of covariance R (ny, ny, batch), at
+    times ``now[0]`` (batch,) in s and inputs ``now[1]`` (batch, nu); no output is missing."""
     xhat, P = moment.xhat, moment.P
     at = xhat.detach()
-    x = at.numpy().T
-    H = np.broadcast_to(model.system.h_jacobian(x), (len(x), len(y), len(xhat)))
+    (t, u), x = now, at.numpy().T
+    H = np.broadcast_to(model.system.h_jacobian(t, x, u), (len(x), len(y), len(xhat)))
     H = torch.from_numpy(np.array(H.transpose(1, 2, 0), order="C"))
-    predicted = torch.from_numpy(np.array(model.system.h(x).T, order="C"))
+    predicted = torch.from_numpy(np.array(model.system.h(t, x, u).T, order="C"))
     innovation = y - predicted - (H * (xhat - at)[None]).sum(1)
     if model.variant == "gru":
         std = torch.diagonal(R).T.sqrt()

@@ -91,7 +91,8 @@ def smooth_once(record: Record, ekf: EKF, points: np.ndarray | None = None) -> S
 def _explains(ekf: EKF, record: Record, xhat: np.ndarray) -> np.ndarray:
     """Whether outputs are where they should be, over the whole record and every window of it."""
     there = ~np.isnan(record.y)
-    square = np.where(there, (record.y - ekf.system.h(xhat)) ** 2 / ekf.output_variance, 0.0)
+    error = record.y - ekf.system.h(record.t, xhat, record.u)
+    square = np.where(there, error**2 / ekf.output_variance, 0.0)
     window = min(_WINDOW, record.num_samples)
     good = np.isfinite(xhat).all(axis=(1, 2))
     for length in (window, record.num_samples):

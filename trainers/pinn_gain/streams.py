@@ -48,7 +48,9 @@ class Data:
         """Those of some rows."""
         x = smoothed.xhat[rows]
         prior = record.prior
-        return Data(record.t, x, system.h(x), record.u[rows], prior.mean[rows], prior.cov[rows])
+        u = record.u[rows]
+        y = system.h(record.t, x, u)
+        return Data(record.t, x, y, u, prior.mean[rows], prior.cov[rows])
 
 
 class Streams:
@@ -110,7 +112,8 @@ class Streams:
             now = self.position + k
             moment = self._advance(moment, now, k == 0)
             y = self.data.y[self.record, now].T + noise[k]
-            moment = update(self.model, weights, moment, torch.from_numpy(y), R)
+            at = self.data.t[now], self.data.u[self.record, now]
+            moment = update(self.model, weights, moment, at, torch.from_numpy(y), R)
             moments.append(moment)
             x = torch.from_numpy(np.ascontiguousarray(self.data.x[self.record, now].T))
             errors.append((moment.xhat - x) / self.model.scale)

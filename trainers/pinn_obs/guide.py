@@ -85,7 +85,7 @@ def guide_of(
         return None
     smoothed, P = path.xhat[:, 0], path.P[..., 0]
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
-    first = abs(points.y[0] - system.h(points.xhat0)) * points.there[0]
+    first = abs(points.y[0] - system.h(t[0], points.xhat0, points.u[0])) * points.there[0]
     if transfer or not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
         L = on_lines(t, samples.t, observer_gain(samples.t, along))
         return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
@@ -98,7 +98,7 @@ def guide_of(
     goal = on_lines(t, samples.t, smoothed)
     xhat = left * points.xhat0 + (1 - left) * goal
     rate = (1 - left) * np.gradient(goal, t, axis=0) + left / tau * (goal - points.xhat0)
-    innovation = (points.y - system.h(xhat)) * points.there / y_scale
+    innovation = (points.y - system.h(t, xhat, points.u)) * points.there / y_scale
     residual = rate - system.f(t, xhat, points.u)
     residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
     floor = max(_CLEAR, float((noise / y_scale).max()))

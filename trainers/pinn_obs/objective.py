@@ -64,15 +64,16 @@ class Lead:
 class Objective:
     """The weighted loss as a function of all weights of a network in one vector.
 
-    w₀·(x̂(t₀) − x̂₀)² + w_ode·mean (dx̂/dt − f(t, x̂, u) − L(y − h(x̂)))² + w_y·mean (h(x̂) − y)²
-    summed over components, with the points' quadrature for means. These are the paper's terms:
+    w₀·(x̂(t₀) − x̂₀)² + w_ode·mean (dx̂/dt − f − L(y − h))² + w_y·mean (h − y)² with f and h at
+    (t, x̂, u), summed over components, with the points' quadrature for means. These are the paper's
+    terms:
 
     - MSE₀ = ‖x̂(t₀) − x̂₀‖². Equation (7) writes the norm without the square. The square is taken
       because the paper names it a mean squared error, and because a bare norm has a gradient of
       length one however small the error, so that a constant step never settles on x̂₀.
-    - MSE_g = mean ‖dx̂/dt − f(t, x̂, u) − L(t)(y − h(x̂))‖², equations (e55) and (8), with h(x̂) for
-      the paper's Cx̂.
-    - MSE_y = mean ‖h(x̂) − y‖², equation (9).
+    - MSE_g = mean ‖dx̂/dt − f(t, x̂, u) − L(t)(y − h(t, x̂, u))‖², equations (e55) and (8), with
+      h(t, x̂, u) for the paper's Cx̂.
+    - MSE_y = mean ‖h(t, x̂, u) − y‖², equation (9).
 
     A missing output counts as a zero innovation. To them come the weighted squares of x̂ and L less
     those of the lead, if there is one. Everything is computed in the network's precision.
@@ -158,7 +159,7 @@ class Objective:
         """Innovations (..., num_points, ny), zero where missing, and residuals
         (..., num_points, nx)."""
         points = self.points
-        innovation = (points.y - self.system.h(xhat)) * points.there
+        innovation = (points.y - self.system.h(points.t, xhat, points.u)) * points.there
         correction = (L * innovation[..., None, :]).sum(-1)
         return innovation, rate - self.system.f(points.t, xhat, points.u) - correction
 
@@ -175,7 +176,8 @@ class Objective:
         by_innovation -= _through(by_rate, L)
         by_innovation *= points.there
         by_L = by_rate[..., None] * -innovation[..., None, :]
-        A, H = system.f_jacobian(points.t, xhat, points.u), system.h_jacobian(xhat)
+        at = points.t, xhat, points.u
+        A, H = system.f_jacobian(*at), system.h_jacobian(*at)
         by_xhat = _through(by_rate, -A) - _through(by_innovation, H)
         by_xhat[..., 0, :] += by_initial
         if (lead := self.lead) is not None:

@@ -14,6 +14,8 @@ _APART = 100
 """Samples that lie ever further apart."""
 _LAYER = (0.02, 2.0, 24)
 """First and last of the points right after t₀, over the first interval, and their number."""
+_LOOKS = 9
+"""Samples whose times and inputs tell how large the outputs' Jacobian is."""
 _PERIODS = 20
 """Periods in a record over which a frequency becomes an input of the network."""
 
@@ -84,10 +86,14 @@ def on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray
 
 
 def output_scale(system: System, record: Record) -> np.ndarray:
-    """The size of each output (ny,): what the states' scale does to it, or else its own spread."""
+    """The size of each output (ny,): what the states' scale does to it at some of the samples, or
+    else its own spread."""
     scale, mean = np.asarray(system.scale, float), record.prior.mean[0]
     x = mean + scale * np.array([[-1.0], [0.0], [1.0]])
-    by_model = abs(system.h_jacobian(x) * scale).max(axis=(0, 2))
+    some = np.linspace(0, record.num_samples - 1, min(record.num_samples, _LOOKS)).astype(int)
+    x = np.repeat(x[:, None], len(some), axis=1)
+    H = np.asarray(system.h_jacobian(record.t[some], x, record.u[0, some]))
+    by_model = abs(H * scale).max(axis=(0, 1, 3))
     y = np.where(np.isnan(record.y[0]), 0.0, record.y[0])
     size = np.maximum(by_model, np.ptp(y, axis=0) * 1e-3)
     return np.where(size > 0, size, 1.0)

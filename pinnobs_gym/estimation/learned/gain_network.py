@@ -66,7 +66,7 @@ def corrected_gain(
         scale: the system's, shape (nx, 1).
         xhat: predictions, shape (nx, batch).
         P: their covariances, shape (nx, nx, batch).
-        innovation: y − h(x̂), shape (ny, batch).
+        innovation: y − h(t, x̂, u), shape (ny, batch).
         S: variances of the innovations, shape (ny, batch).
         K: Kalman gains, shape (nx, ny, batch).
         share: diagonal of HPHᵀ over that of S, shape (ny, batch); zero where y is missing.
@@ -122,7 +122,7 @@ def recurrent_gain(
         scale: the system's, shape (nx, 1).
         output_scale: the outputs' scale, shape (ny, 1).
         xhat: predictions, shape (nx, batch).
-        innovation: y − h(x̂), zero where y is missing, shape (ny, batch).
+        innovation: y − h(t, x̂, u), zero where y is missing, shape (ny, batch).
         std: standard deviation of the output noise, shape (ny, batch).
         memory: shape (width, batch).
     """

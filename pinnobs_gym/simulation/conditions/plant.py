@@ -63,8 +63,8 @@ class OtherRates(System):
     def f(self, t: Array, x: Array, u: Array) -> Array:
         return self.factors * self.plant.f(t, x, u)
 
-    def h(self, x: Array) -> Array:
-        return self.plant.h(x)
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        return self.plant.h(t, x, u)
 
     def input(self, t: Array) -> Array:
         return self.plant.input(t)

@@ -36,7 +36,7 @@ def by_autograd(network, system, points, weights, lead):
     xhat, L = network(t)
     options = {"create_graph": True, "retain_graph": True}
     rate = [torch.autograd.grad(xhat[:, i].sum(), t, **options)[0] for i in range(system.nx)]
-    innovation = (y - system.h(xhat)) * there
+    innovation = (y - system.h(t, xhat, u)) * there
     residual = torch.stack(rate, -1) - system.f(t, xhat, u) - (L @ innovation[..., None])[..., 0]
     initial = xhat[0] - torch.tensor(points.xhat0)
     w = {n: torch.tensor(getattr(weights, n)) for n in ("initial", "equation", "output")}
@@ -126,7 +126,7 @@ def test_noise_is_not_fitted():
     game = Game.of("Academic")
     system, setup, record = game.source.system, game.source.setup, game.record([3])
     trained = train(system, Config(), record=record, noise_std=setup.noise_std)
-    output = system.h(trained.xhat(record.t)) - record.y[0]
+    output = system.h(record.t, trained.xhat(record.t), record.u[0]) - record.y[0]
     later = record.t > 5
     assert output[later].std() == pytest.approx(0.02, rel=0.15)
 

@@ -34,7 +34,7 @@ class Spring(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], -4 * x[..., 0] - 0.3 * x[..., 1])
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x[..., :1]
 
 
@@ -55,7 +55,7 @@ def weighted_squares(system, record, noise):
     def residuals(flat):
         x = flat.reshape(n, -1)
         ends = flows(system, record.t, x[:, None], record.u.swapaxes(0, 1))[0][:, 0]
-        innovation = (record.y[0] - system.h(x)) / noise
+        innovation = (record.y[0] - system.h(record.t, x, record.u[0])) / noise
         parts = (root @ (x[0] - record.prior.mean[0]), (x[1:] - ends) / (DRIFT * scale))
         return np.concatenate([p.ravel() for p in parts] + [innovation[~np.isnan(innovation)]])
 
@@ -184,7 +184,7 @@ def test_a_gain_meant_for_other_records_beats_one_that_is_not():
     system = ReverseDuffing()
     x = truth(system, np.array([[1.0, 1.5]]), record.t)[:, 0]
     prior = Prior(np.zeros((1, 2)), record.prior.cov)
-    other = replace(record, y=system.h(x)[None], prior=prior)
+    other = replace(record, y=system.h(record.t, x, record.u[0])[None], prior=prior)
     rmse = []
     for transfer in (False, True):
         trained = train(system, Config(iterations=1000, transfer=transfer), record=record)
