@@ -63,6 +63,27 @@ _BEGINNING = b'{"schema": '
 """What every line begins with."""
 
 
+class GameName(NamedTuple):
+    """What was played, as rows name it."""
+
+    env_id: str
+    """Such as ``pinnobs/InductionMotor-v0``."""
+    setup: str
+    """Such as ``benchmark``."""
+    condition: str
+    """Such as ``nominal``."""
+
+    @property
+    def system(self) -> str:
+        """The env id without its namespace."""
+        return self.env_id.removeprefix("pinnobs/")
+
+
+def game_of(row: Row) -> GameName:
+    """What a row, of a scored episode or of a job that failed, was played on."""
+    return GameName(row["env_id"], row["setup"], row["condition"])
+
+
 class Stored(NamedTuple):
     """What a rows file holds."""
 

@@ -13,7 +13,8 @@ import numpy as np
 from pinnobs_gym.leaderboard import ranks, standings_table
 from pinnobs_gym.scoring import curves
 from pinnobs_gym.scoring.curves import Curves
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.rows import GameName, Row
+from pinnobs_gym.scoring.thinning import kept
 
 POINTS = 120
 """Most times that a curve is drawn at."""
@@ -118,7 +119,7 @@ def _curves(
     """Each estimator's curves of the episodes that have rows."""
     parts: dict[tuple[str, str], list[Curves]] = defaultdict(list)
     for folder in folders:
-        for name, listed in curves.read(folder, *key).items():
+        for name, listed in curves.read(folder, GameName(*key)).items():
             parts[name] += listed
     found = {}
     for name, rows in players.items():
@@ -179,7 +180,7 @@ def errors(found: Mapping[str, Curves]) -> Columns:
     """Median and 10-90 % band over episodes of each estimator's error over time."""
     table: Columns = {"estimator": [], "t": [], "median": [], "q10": [], "q90": []}
     for name, own in found.items():
-        k = curves.kept(len(own.t), POINTS)
+        k = kept(len(own.t), POINTS)
         k = k[~np.isnan(own.error[:, k]).all(axis=0)]
         error = own.error[:, k].astype(float)
         quantiles = _quantiles(error)
@@ -206,7 +207,7 @@ def reference(found: Iterable[Curves]) -> Columns:
             episodes.setdefault(seed, line)
     if not episodes:
         return {"t": [], "median": []}
-    k = curves.kept(len(t), POINTS)
+    k = kept(len(t), POINTS)
     lines = np.stack(list(episodes.values()))[:, k].astype(float)
     some = ~np.isnan(lines).all(axis=0)
     return {"t": numbers(t[k][some]), "median": numbers(_median(lines[:, some]))}
