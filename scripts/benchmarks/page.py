@@ -12,7 +12,8 @@ import numpy as np
 
 from benchmarks import Figure, at_most
 from pinnobs_gym.envs.registration import env_id
-from pinnobs_gym.leaderboard.site import page
+from pinnobs_gym.leaderboard.site.model import page_model
+from pinnobs_gym.leaderboard.site.page import draw
 from pinnobs_gym.scoring import curves, rows
 from pinnobs_gym.scoring.curves import Example
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
@@ -34,7 +35,7 @@ def figures(repeats: int) -> Iterator[Figure]:
         start = time.process_time()
         stored = rows.load_all([path])
         reading = time.process_time() - start
-        text = page.build(stored.rows, stored.failures, [curves.folder_of(path)])
+        text = draw(page_model(stored, [curves.folder_of(path)]))
         spent = time.process_time() - start
     yield Figure("page: rows", count, "", "", None)
     yield Figure("page: reading the rows, CPU time", reading, "s", "", None)
