@@ -36,17 +36,16 @@ class Line:
     """Median over games."""
 
     @property
-    def place(self) -> tuple[bool, int, float]:
-        """What lines are sorted by: online first, then those that played more, then the ratio."""
-        ratio = np.inf if self.ratio is None or np.isnan(self.ratio.value) else self.ratio.value
-        return self.track != "online", -len(self.games), ratio
+    def known_ratio(self) -> float:
+        """The ratio; infinite where there is none or it is undefined."""
+        return np.inf if self.ratio is None or np.isnan(self.ratio.value) else self.ratio.value
 
 
 def lines(contenders: Iterable[Contender]) -> list[Line]:
-    """Every contender on the systems under the conditions that these are ranked under, best first,
-    online before offline."""
+    """Every contender on the systems under the conditions that these are ranked under: online
+    before offline, then those that played more, then those with the smaller ratio."""
     found = [_line(contender) for contender in among(contenders, lambda run: run.ranked)]
-    return sorted(found, key=lambda line: line.place)
+    return sorted(found, key=lambda x: (x.track != "online", -len(x.games), x.known_ratio))
 
 
 def _line(contender: Contender) -> Line:

@@ -55,11 +55,6 @@ class Curves:
     measured: dict[int, int]
     """States that an output measures alone, and which."""
 
-    @property
-    def num_episodes(self) -> int:
-        """How many episodes."""
-        return len(self.seeds)
-
 
 def labels(system: System) -> tuple[str, ...]:
     """Names of the states, with their units in brackets."""
@@ -106,7 +101,7 @@ def curves_of(
 
 
 def folder_of(rows: Path) -> Path:
-    """Where the curves of a rows file lie."""
+    """The folder of the curves of a rows file."""
     return rows.parent / "curves"
 
 
@@ -124,10 +119,9 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
         "measured": list(curves.measured.items()),
         "example_seed": int(curves.example.seed),
     }
+    example, optional = curves.example, {"reference": curves.reference, "std": curves.example.std}
     arrays: dict[str, Any] = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
-    optional = {"reference": curves.reference, "std": curves.example.std}
-    arrays |= {name: getattr(curves.example, name) for name in ("x", "xhat", "y")}
-    arrays["example_t"] = curves.example.t
+    arrays |= {"x": example.x, "xhat": example.xhat, "y": example.y, "example_t": example.t}
     arrays |= {name: array for name, array in optional.items() if array is not None}
     name = f"{_plain(row['estimator'])}-{row['config_hash']}-{curves.seeds[0]}.npz"
     path = _folder_of_game(folder, game_of(row)) / name

@@ -63,7 +63,7 @@ def test_files_of_one_estimator_merge_by_episode():
     assert both.error[:, 1].tolist() == [0.2, 0.3, 9.0]
     some = curves.merged([one(), later], [5])
     assert some is not None
-    assert some.num_episodes == 1
+    assert some.seeds.tolist() == [5]
     assert curves.merged([one()], [8]) is None
 
 

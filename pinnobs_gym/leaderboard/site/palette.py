@@ -14,8 +14,9 @@ asks; those that look alike to some differ in lightness."""
 PEER_COLOURS = ("#3b4048", "#d7dbe0")
 """Of the estimator that all are compared with, in light and in the dark."""
 DASHES = ((1, 0), (6, 3), (2, 2), (9, 3, 2, 3))
+"""Lengths of strokes and gaps, in pixels."""
 SHAPES = ("circle", "square", "triangle-up", "diamond")
-"""What tells the second, third and fourth round of the hues from the first."""
+"""These and `DASHES` tell the second, third and fourth round of the hues from the first."""
 
 
 @dataclass(frozen=True)
