@@ -29,6 +29,9 @@ from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.files import replacing
 from pinnobs_gym.leaderboard import ranks, ranks_table
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.standings_table import markdown_table
 from pinnobs_gym.scoring import rows
 
@@ -69,10 +72,10 @@ def summary(scored: list[rows.Row]) -> str:
         f"({processor()}), by `make leaderboard`, which writes the details of each system to "
         "`runs/leaderboard/leaderboard.md`."
     )
-    parts = [told, ranks_table.NOTE, markdown_table(*ranks_table.cells(ranks.lines(scored)))]
-    placed = ranks.ranks(scored)
-    if len(placed) > 2:
-        parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(placed))]
+    found = board(rows.Stored(scored, []))
+    parts = [told, ranks_table.NOTE, markdown_table(*ranks_table.cells(found.lines))]
+    if len(found.ranks) > 2:
+        parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(found.ranks))]
     return "\n\n".join(parts)
 
 
@@ -83,7 +86,8 @@ def under_conditions(scored: list[rows.Row]) -> str:
         "Estimators that need no training under every condition, by `pinnobs leaderboard "
         f"--condition all --episodes {episodes}`."
     )
-    table = markdown_table(*ranks_table.rank_cells(ranks.ranks(scored)))
+    ratios = ranks.log_ratios(contenders(runs_of(scored)))
+    table = markdown_table(*ranks_table.rank_cells(ranks.ranks(ratios)))
     return "\n\n".join([told, ranks_table.RANK_NOTE, table])
 
 

@@ -68,8 +68,7 @@ class Main:
     def _trained(self, name: str, config: Config) -> Estimator:
         """The agent, trained unless its file is there."""
         game = Game.of(name)
-        system = game.name.env_id.removeprefix("pinnobs/")
-        title = f"{system}-{config.algorithm}-{config.action_mode}"
+        title = f"{game.name.system}-{config.algorithm}-{config.action_mode}"
         path = self.out / f"{title}-seed{config.seed}.pt"
         if not path.exists():
             checkpoint = path.with_suffix(".checkpoint.zip")

@@ -58,6 +58,11 @@ def test_an_estimator_is_resolved_alone(name: str) -> None:
     assert not loaded(code, *HEAVY, *others - {f"pinnobs_gym.estimators.{name}"})
 
 
+@pytest.mark.parametrize("name", ["standings_table", "ranks_table", "board"])
+def test_tables_load_no_statistics_before_they_are_computed(name: str) -> None:
+    assert not loaded(f"import pinnobs_gym.leaderboard.{name}", *HEAVY)
+
+
 def test_finding_all_estimators_loads_no_agents_library() -> None:
     code = "from pinnobs_gym.estimators import ESTIMATORS; ESTIMATORS.classes()"
     assert not loaded(code, "stable_baselines3")

@@ -29,9 +29,14 @@ class GameName(NamedTuple):
     """Its canonical name; see `pinnobs_gym.simulation.conditions.canonical_name`."""
 
     @property
+    def system(self) -> str:
+        """The env id without its namespace."""
+        return self.env_id.removeprefix("pinnobs/")
+
+    @property
     def file_stem(self) -> str:
         """The name as the beginning of a file's."""
-        return "-".join([self.env_id.removeprefix("pinnobs/"), self.setup, self.condition])
+        return "-".join([self.system, self.setup, self.condition])
 
 
 @dataclass(frozen=True)

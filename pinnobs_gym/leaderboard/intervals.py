@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import binom, binomtest, trim_mean
 
 CONFIDENCE = 0.95
+"""Of every interval."""
 REPLICATES = 2000
 """Of a bootstrap."""
 
@@ -45,12 +45,17 @@ def median(values: np.ndarray) -> Interval:
 
 @lru_cache(maxsize=1024)
 def _lowest_rank(count: int) -> int:
+    """The index, from either end of so many ordered values, of the bounds of their median."""
+    from scipy.stats import binom  # takes long to import
+
     return max(int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5)) - 1, 0)
 
 
 @lru_cache(maxsize=65536)
 def rate(hits: int, count: int) -> Interval:
     """A proportion with Wilson's interval."""
+    from scipy.stats import binomtest
+
     interval = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
     return Interval(hits / count, float(interval.low), float(interval.high))
 
@@ -66,6 +71,8 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
     """The mean over the last axis of what is left without the lowest and the highest quarter
     (Agarwal et al. 2021). Infinite values are trimmed with the others; it is infinite where more of
     them are on a side than are trimmed there, and not a number where that is so on both."""
+    from scipy.stats import trim_mean
+
     with np.errstate(invalid="ignore"):
         return np.asarray(trim_mean(values, 0.25, axis=-1))
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pinnobs_gym.leaderboard.intervals import (
-    Interval,
-)
+from pinnobs_gym.leaderboard.contenders import label
+from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.ranks import Line
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.leaderboard.standings_table import markdown_table, number
@@ -27,8 +26,8 @@ NOTE = (
 
 def cells(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
     """The overview's header and rows as text."""
-    games = sorted({game for line in found for game in line.games})
-    header = ["estimator", "track", "/ ekf", "better", *games, "µs/step"]
+    games = sorted({game for line in found for game in line.games}, key=label)
+    header = ["estimator", "track", "/ ekf", "better", *map(label, games), "µs/step"]
     rows = []
     for line in found:
         shown = [_cell(line.games.get(game)) for game in games]

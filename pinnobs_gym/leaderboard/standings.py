@@ -16,7 +16,7 @@ from pinnobs_gym.scoring.rows import Row
 
 @dataclass(frozen=True)
 class Standing:
-    """How one estimator did on the episodes of one env, setup and condition."""
+    """How one estimator did on the episodes of one game."""
 
     estimator: str
     track: str

@@ -1,4 +1,4 @@
-"""The tables of a system under a condition, as cells and as Markdown."""
+"""The table of each game, as cells and as Markdown."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.intervals import Interval
-from pinnobs_gym.leaderboard.standings import Standing, standing
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.leaderboard.runs import Run
+from pinnobs_gym.leaderboard.standings import Standing
+from pinnobs_gym.scoring.rows import Row, game_of
 
 
 @dataclass(frozen=True)
 class Table:
-    """The standings on one env, setup and condition, best first, online before offline."""
+    """The standings in one game, best first, online before offline."""
 
-    env_id: str
-    setup: str
-    condition: str
+    game: GameName
     standings: tuple[Standing, ...]
     note: str = ""
     """What to know about it, if anything."""
@@ -27,43 +27,44 @@ class Table:
     @property
     def title(self) -> str:
         """What is played."""
-        return f"{self.env_id}, {self.setup}, {self.condition}"
+        return ", ".join(self.game)
 
 
-def tables(rows: Iterable[Row], failures: Iterable[Row] = ()) -> list[Table]:
-    """A table per env, setup and condition. Within a track estimators stand in the order of their
-    median NRMSE over the whole episode, diverged episodes counting as infinite. What failed is told
-    in the notes."""
-    played: dict[tuple[str, str, str], dict[tuple[str, str], list[Row]]]
-    played = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        game = (row["env_id"], row["setup"], row["condition"])
-        played[game][row["estimator"], row["config_hash"]].append(row)
-    failed: dict[tuple[str, str, str], list[str]] = defaultdict(list)
+def tables(runs: Iterable[Run], failures: Iterable[Row] = ()) -> list[Table]:
+    """A table per game, those with failures alone included; jobs that failed are in the notes."""
+    played: dict[GameName, list[Run]] = defaultdict(list)
+    for run in runs:
+        played[run.game].append(run)
+    failed: dict[GameName, list[str]] = defaultdict(list)
     for row in failures:
-        game = (row["env_id"], row["setup"], row["condition"])
-        many = row["episodes"] > 1
-        which = f"{row['episodes']} episodes" if many else f"episode {row['episode_seed']}"
-        failed[game].append(f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}.")
-    result = []
-    for game in sorted(played.keys() | failed.keys()):
-        groups = played[game]
-        standings = [standing(group) for group in groups.values()]
-        standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
-        note = " ".join(filter(None, [_note(list(groups.values())), *failed[game]]))
-        result.append(Table(*game, tuple(standings), note))
-    return result
+        failed[game_of(row)].append(_failed(row))
+    games = sorted(played.keys() | failed.keys())
+    return [table(game, played[game], failed[game]) for game in games]
 
 
-def _note(groups: Sequence[Sequence[Row]]) -> str:
+def table(game: GameName, runs: Iterable[Run], notes: Sequence[str] = ()) -> Table:
+    """The table of a game's runs, with notes. Within a track estimators stand in the order of their
+    median NRMSE over the whole episode, diverged episodes counting as infinite."""
+    runs = list(runs)
+    standings = [run.standing for run in runs]
+    standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
+    return Table(game, tuple(standings), " ".join(filter(None, [_uneven(runs), *notes])))
+
+
+def _failed(row: Row) -> str:
+    """What failed, in a sentence."""
+    many = row["episodes"] > 1
+    which = f"{row['episodes']} episodes" if many else f"episode {row['episode_seed']}"
+    return f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}."
+
+
+def _uneven(runs: Sequence[Run]) -> str:
     """A warning if estimators of one track were not run on the same episodes."""
-    for track in {group[0]["track"] for group in groups}:
-        played = {
-            frozenset(row["episode_seed"] for row in group)
-            for group in groups
-            if group[0]["track"] == track
+    for track in dict.fromkeys(run.track for run in runs):
+        episodes = {
+            frozenset(row["episode_seed"] for row in run.rows) for run in runs if run.track == track
         }
-        if len(played) > 1:
+        if len(episodes) > 1:
             return f"Not all {track} estimators were run on the same episodes: ranks are uncertain."
     return ""
 
@@ -93,36 +94,38 @@ HEADER = (
 
 def cells(table: Table, intervals: bool = True) -> list[list[str]]:
     """The table's rows as text, a cell per column of `HEADER`, with or without the intervals."""
-    shown = _interval if intervals else lambda interval: number(interval.value)
     lines, ranks = [], defaultdict(int)
-    for s in table.standings:
-        ranks[s.track] += 1
-        tail = shown(s.tail)
-        if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
-            tail += f" [{number(s.tail_modulo)}]"
-        lines.append(
-            [
-                str(ranks[s.track]),
-                s.estimator if s.budget is None else f"{s.estimator}, {s.budget:g} s",
-                s.track,
-                str(s.episodes),
-                shown(s.diverged.percent),
-                number(s.settling.value),
-                shown(s.nrmse),
-                tail,
-                number(s.tail_90),
-                _optional(s.reference_ratio),
-                _optional(s.reference_ratio_tail),
-                _banded(s.anees),
-                _optional(None if s.coverage is None else 100 * s.coverage, 2),
-                _optional(s.nis),
-                _optional(s.innovation_correlation, 2),
-                number(s.us_per_step),
-                s.knows,
-                s.training,
-            ]
-        )
+    for standing in table.standings:
+        ranks[standing.track] += 1
+        lines.append([str(ranks[standing.track]), *_cells(standing, intervals)])
     return lines
+
+
+def _cells(s: Standing, intervals: bool) -> list[str]:
+    """The cells of a standing, but for its rank."""
+    shown = _interval if intervals else lambda interval: number(interval.value)
+    tail = shown(s.tail)
+    if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
+        tail += f" [{number(s.tail_modulo)}]"
+    return [
+        s.estimator if s.budget is None else f"{s.estimator}, {s.budget:g} s",
+        s.track,
+        str(s.episodes),
+        shown(s.diverged.percent),
+        number(s.settling.value),
+        shown(s.nrmse),
+        tail,
+        number(s.tail_90),
+        _optional(s.reference_ratio),
+        _optional(s.reference_ratio_tail),
+        _banded(s.anees),
+        _optional(None if s.coverage is None else 100 * s.coverage, 2),
+        _optional(s.nis),
+        _optional(s.innovation_correlation, 2),
+        number(s.us_per_step),
+        s.knows,
+        s.training,
+    ]
 
 
 def markdown(tables: Iterable[Table]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2, norm
 
 from pinnobs_gym.estimation.estimator import Estimates
 from pinnobs_gym.simulation.matrices import squared_size
@@ -41,6 +40,8 @@ def consistency(
         - ``innovation_correlation``: of the innovations over √S_ii with the next sample's; 0 if
           they are white. Not a number if there are no two to compare.
     """
+    from scipy.stats import norm  # takes long to import
+
     scores: dict[str, np.ndarray | None]
     scores = dict.fromkeys(("anees", "coverage", "nis", "innovation_correlation"))
     with np.errstate(all="ignore"):  # what is not finite is infinite in the scores
@@ -65,6 +66,8 @@ def band(episodes: int, degrees: int, confidence: float = 0.95) -> tuple[float, 
     probability, if errors are Gaussian and covariances right: χ²/(episodes·degrees) of as many
     degrees of freedom. That of one sample is this wide; samples of one episode are taken as wholly
     dependent, because of plants without process noise they nearly are."""
+    from scipy.stats import chi2
+
     count = episodes * degrees
     low, high = chi2.ppf([(1 - confidence) / 2, (1 + confidence) / 2], count) / count
     return float(low), float(high)

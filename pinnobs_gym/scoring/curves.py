@@ -13,16 +13,13 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.envs.figures import measured_states
+from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import replacing
 from pinnobs_gym.scoring.metrics import by_sample
 from pinnobs_gym.scoring.playing import Played
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.rows import Row, game_of
+from pinnobs_gym.scoring.thinning import kept, kept_of_example, rounded
 from pinnobs_gym.simulation.system import System
-
-POINTS = 200
-"""Most sample times at which errors are kept."""
-EARLY, EVEN = 50, 250
-"""Of the example episode: its first samples are kept, and so many spread evenly."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Curves:
-    """The errors of one estimator in some episodes of one env, setup and condition."""
+    """The errors of one estimator in some episodes of one game."""
 
     t: np.ndarray
     """The kept times in s, shape (points,)."""
@@ -61,28 +58,6 @@ class Curves:
     measured: dict[int, int]
     """States that an output measures alone, and which."""
 
-    @property
-    def num_episodes(self) -> int:
-        """How many episodes."""
-        return len(self.seeds)
-
-
-def kept(num_samples: int, points: int = POINTS) -> np.ndarray:
-    """Which samples are kept: all if there are no more than so many points; else half of them
-    evenly and half of them by the logarithm, so that the transient is resolved and the rest is not
-    lost."""
-    if num_samples <= points:
-        return np.arange(num_samples)
-    half = points // 2
-    early = np.geomspace(1, num_samples, half) - 1
-    even = np.linspace(0, num_samples - 1, half)
-    return np.unique(np.round(np.concatenate([early, even])).astype(int))
-
-
-def _kept_of_example(num_samples: int) -> np.ndarray:
-    even = np.linspace(0, num_samples - 1, min(EVEN, num_samples)).round().astype(int)
-    return np.union1d(np.arange(min(EARLY, num_samples)), even)
-
 
 def labels(system: System) -> tuple[str, ...]:
     """Names of the states, with their units in brackets."""
@@ -96,34 +71,27 @@ def curves_of(played: Played) -> Curves:
     system, t, xhat = played.system, played.record.t, played.estimates.xhat
     error = by_sample(xhat - played.truth, system.scale, system.observable(played.truth))
     reference, std = played.reference, played.std
-    k, m = kept(len(t)), _kept_of_example(len(t))
+    k, m = kept(len(t)), kept_of_example(len(t))
     return Curves(
         t=t[k],
         seeds=np.asarray(played.seeds),
-        error=_short(error[:, k]),
-        reference=None if reference is None else _short(reference.by_sample[:, k]),
+        error=rounded(error[:, k]),
+        reference=None if reference is None else rounded(reference.by_sample[:, k]),
         example=Example(
             played.seeds[0],
             t[m],
-            _short(played.truth[0, m]),
-            _short(xhat[0, m]),
-            _short(played.record.y[0, m]),
-            None if std is None else _short(std[0, m]),
+            rounded(played.truth[0, m]),
+            rounded(xhat[0, m]),
+            rounded(played.record.y[0, m]),
+            None if std is None else rounded(std[0, m]),
         ),
         states=labels(system),
         measured=measured_states(system),
     )
 
 
-def _short(values: np.ndarray) -> np.ndarray:
-    """The values in float32, rounded to 12 binary digits, so that they compress well."""
-    with np.errstate(over="ignore"):  # what is too large is infinite
-        bits = np.ascontiguousarray(values, dtype=np.float32).view(np.uint32)
-    return ((bits + np.uint32(0x800)) & np.uint32(0xFFFFF000)).view(np.float32)
-
-
 def folder_of(rows: Path) -> Path:
-    """Where the curves of a rows file lie."""
+    """The folder of the curves of a rows file."""
     return rows.parent / "curves"
 
 
@@ -141,28 +109,25 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
         "measured": list(curves.measured.items()),
         "example_seed": int(curves.example.seed),
     }
+    example, optional = curves.example, {"reference": curves.reference, "std": curves.example.std}
     arrays: dict[str, Any] = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
-    optional = {"reference": curves.reference, "std": curves.example.std}
-    arrays |= {name: getattr(curves.example, name) for name in ("x", "xhat", "y")}
-    arrays["example_t"] = curves.example.t
+    arrays |= {"x": example.x, "xhat": example.xhat, "y": example.y, "example_t": example.t}
     arrays |= {name: array for name, array in optional.items() if array is not None}
     name = f"{_plain(row['estimator'])}-{row['config_hash']}-{curves.seeds[0]}.npz"
-    path = _place(folder, row["env_id"], row["setup"], row["condition"]) / name
+    path = _folder_of_game(folder, game_of(row)) / name
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
 
 
-def read(
-    folder: Path, env_id: str, setup: str, condition: str
-) -> dict[tuple[str, str], list[Curves]]:
-    """The curves of an env, setup and condition, a list per estimator and config hash, each list in
-    the order of first episodes; none if there is no such folder.
+def read(folder: Path, game: GameName) -> dict[tuple[str, str], list[Curves]]:
+    """The curves of a game, a list per estimator and config hash, each list in the order of first
+    episodes; none if there is no such folder.
 
     Raises:
         ValueError: in one line, if a file is damaged.
     """
     found: dict[tuple[str, str], list[Curves]] = {}
-    for path in sorted(_place(folder, env_id, setup, condition).glob("*.npz")):
+    for path in sorted(_folder_of_game(folder, game).glob("*.npz")):
         try:
             with path.open("rb") as file, np.load(file) as data:
                 about = json.loads(str(data["about"]))
@@ -198,27 +163,28 @@ def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
 
 
 def _of(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves:
+    """The curves that a file holds."""
     example = Example(
-        about["example_seed"],
-        arrays["example_t"],
-        arrays["x"],
-        arrays["xhat"],
-        arrays["y"],
-        arrays.get("std"),
+        seed=about["example_seed"],
+        t=arrays["example_t"],
+        x=arrays["x"],
+        xhat=arrays["xhat"],
+        y=arrays["y"],
+        std=arrays.get("std"),
     )
     return Curves(
-        arrays["t"],
-        arrays["seeds"],
-        arrays["error"],
-        arrays.get("reference"),
-        example,
-        tuple(about["states"]),
-        dict(about["measured"]),
+        t=arrays["t"],
+        seeds=arrays["seeds"],
+        error=arrays["error"],
+        reference=arrays.get("reference"),
+        example=example,
+        states=tuple(about["states"]),
+        measured=dict(about["measured"]),
     )
 
 
-def _place(folder: Path, env_id: str, setup: str, condition: str) -> Path:
-    return folder / _plain(env_id.removeprefix("pinnobs/")) / _plain(setup) / _plain(condition)
+def _folder_of_game(folder: Path, game: GameName) -> Path:
+    return folder / _plain(game.system) / _plain(game.setup) / _plain(game.condition)
 
 
 def _plain(name: str) -> str:

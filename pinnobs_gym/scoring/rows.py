@@ -12,6 +12,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import json_line, locked, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
@@ -61,6 +62,11 @@ TOLERANCE = 1e-6
 
 _BEGINNING = b'{"schema": '
 """What every line begins with."""
+
+
+def game_of(row: Row) -> GameName:
+    """What a row, of a scored episode or of a job that failed, was played on."""
+    return GameName(row["env_id"], row["setup"], row["condition"])
 
 
 class Stored(NamedTuple):

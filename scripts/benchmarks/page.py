@@ -13,12 +13,14 @@ import numpy as np
 from benchmarks import Figure, at_most
 from pinnobs_gym.envs.figures import measured_states
 from pinnobs_gym.envs.registration import env_id
-from pinnobs_gym.leaderboard.site import page
+from pinnobs_gym.leaderboard.site.model import page_model
+from pinnobs_gym.leaderboard.site.page import draw
 from pinnobs_gym.scoring import curves, rows
 from pinnobs_gym.scoring.curves import Example
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.scoring.provenance import versions
 from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.thinning import kept as kept_samples
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.systems import SYSTEMS
 
@@ -35,7 +37,7 @@ def figures(repeats: int) -> Iterator[Figure]:
         start = time.process_time()
         stored = rows.load_all([path])
         reading = time.process_time() - start
-        text = page.build(stored.rows, stored.failures, [curves.folder_of(path)])
+        text = draw(page_model(stored, [curves.folder_of(path)]))
         spent = time.process_time() - start
     yield Figure("page: rows", count, "", "", None)
     yield Figure("page: reading the rows, CPU time", reading, "s", "", None)
@@ -103,7 +105,7 @@ def _save_curves(path: Path, group: list[Row], rng: np.random.Generator) -> None
     x = rng.normal(size=(len(t), system.nx))
     y = rng.normal(size=(len(t), system.ny))
     example = Example(0, t, x, x + 0.1, y, np.full(x.shape, 0.1))
-    k = curves.kept(len(t))
+    k = kept_samples(len(t))
     kept = error[:, k].astype(np.float32)
     names, measured = curves.labels(system), measured_states(system)
     own = curves.Curves(t[k], np.arange(EPISODES), kept, kept, example, names, measured)

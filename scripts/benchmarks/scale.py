@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import Figure, at_least, at_most
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.leaderboard import ranks, ranks_table, standings_table
+from pinnobs_gym.leaderboard.board import board, markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
 from pinnobs_gym.leaderboard.suites import Entry, Suite
@@ -181,8 +181,7 @@ def many_rows() -> Iterator[Figure]:
         begun = time.perf_counter()
         stored = rows.load(path)
         read = time.perf_counter()
-        standings_table.markdown(standings_table.tables(stored.rows, stored.failures))
-        ranks_table.markdown(ranks.lines(stored.rows), ranks.ranks(stored.rows))
+        markdown(board(stored))
         end = time.perf_counter()
     yield at_most(f"{ROWS:,} rows read", read - begun, "s", 4)
     yield at_most(f"{ROWS:,} rows read, and all tables", end - begun, "s", 4)

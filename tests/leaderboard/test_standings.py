@@ -3,6 +3,11 @@ import pytest
 from made_rows import rows_of
 
 from pinnobs_gym.leaderboard import standings, standings_table
+from pinnobs_gym.leaderboard.runs import runs_of
+
+
+def tables(rows, failures=()):
+    return standings_table.tables(runs_of(rows), failures)
 
 
 def test_estimators_are_ranked_by_median_within_their_track():
@@ -12,14 +17,14 @@ def test_estimators_are_ranked_by_median_within_their_track():
         *rows_of("offline", [0.01, 0.01, 0.01], track="offline"),
         *rows_of("worst", [0.1, 0.1, 0.1], diverged=[True, True, False]),
     ]
-    (table,) = standings_table.tables(rows)
+    (table,) = tables(rows)
     assert [s.estimator for s in table.standings] == ["better", "worse", "worst", "offline"]
     assert np.isinf(table.standings[2].nrmse.value)
     assert table.standings[2].diverged.value == pytest.approx(2 / 3)
 
 
 def test_markdown_has_a_table_per_game_with_all_columns():
-    text = standings_table.markdown(standings_table.tables(rows_of("ekf", [0.1, 0.2, 0.3])))
+    text = standings_table.markdown(tables(rows_of("ekf", [0.1, 0.2, 0.3])))
     lines = text.splitlines()
     header = next(line for line in lines if line.startswith("| "))
     body = lines[lines.index(header) + 2]
@@ -30,13 +35,13 @@ def test_markdown_has_a_table_per_game_with_all_columns():
 
 
 def test_unequal_episodes_are_pointed_out():
-    same = standings_table.tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1, 0.2])])
+    same = tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1, 0.2])])
     assert same[0].note == ""
-    uneven = standings_table.tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1])])
+    uneven = tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1])])
     assert "Not all online estimators" in uneven[0].note
     assert uneven[0].note in standings_table.markdown(uneven)
     apart = [*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1], track="offline")]
-    assert standings_table.tables(apart)[0].note == ""
+    assert tables(apart)[0].note == ""
 
 
 def test_training_is_told_in_the_row():
@@ -55,9 +60,7 @@ def test_numbers(value, text):
 
 def test_optional_scores_are_shown_where_they_are(tmp_path):
     facts = {"reference_ratio": 1.25, "anees": 1.5, "coverage": 0.876, "nis": 1.04}
-    (table,) = standings_table.tables(
-        [*rows_of("ekf", [0.1] * 50, **facts), *rows_of("bare", [0.2])]
-    )
+    (table,) = tables([*rows_of("ekf", [0.1] * 50, **facts), *rows_of("bare", [0.2])])
     ekf, bare = (
         dict(zip(standings_table.HEADER, line, strict=True))
         for line in standings_table.cells(table)
@@ -69,7 +72,7 @@ def test_optional_scores_are_shown_where_they_are(tmp_path):
     assert ekf["tail / CRR"] == ""
     assert {bare[name] for name in ("/ CRR", "ANEES", "covers %", "NIS", "corr.")} == {""}
     for anees, shown in ((1.29, "1.29"), (0.7, "0.7 ▼"), (np.inf, "∞ ▲")):
-        (table,) = standings_table.tables(rows_of("ekf", [0.1] * 50, anees=anees))
+        (table,) = tables(rows_of("ekf", [0.1] * 50, anees=anees))
         assert shown in standings_table.cells(table)[0]
 
 
@@ -84,9 +87,9 @@ def test_what_failed_is_told_in_the_note_of_its_game():
         "error": "RuntimeError: out of luck.",
     }
     other = failure | {"condition": "noise5", "episodes": 20}
-    second, first = standings_table.tables(rows_of("ekf", [0.1, 0.2]), [failure, other])
+    second, first = tables(rows_of("ekf", [0.1, 0.2]), [failure, other])
     assert first.note == "Failed: mine, episode 3: RuntimeError: out of luck."
     assert [s.estimator for s in first.standings] == ["ekf"]
-    assert (second.condition, second.standings) == ("noise5", ())  # nothing else was played
+    assert (second.game.condition, second.standings) == ("noise5", ())  # nothing else was played
     assert second.note == "Failed: mine, 20 episodes: RuntimeError: out of luck."
     assert second.note in standings_table.markdown([first, second])

@@ -5,22 +5,25 @@ import pytest
 
 from pinnobs_gym import evaluate
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.scoring import curves, rows
+from pinnobs_gym.scoring import curves, rows, thinning
 from pinnobs_gym.scoring.cramer_rao import cramer_rao
 from pinnobs_gym.scoring.curves import Curves, Example
 
 ENV = "pinnobs/ReverseDuffing-v0"
+NOMINAL = GameName(ENV, "benchmark", "nominal")
+NOISY = NOMINAL._replace(condition="noise5+dropout10")
 
 
 @pytest.mark.parametrize("num_samples", [1, 7, 200, 201, 1000, 100_000])
 def test_kept_samples_resolve_the_transient_and_reach_the_end(num_samples):
-    k = curves.kept(num_samples)
-    assert len(k) <= curves.POINTS
+    k = thinning.kept(num_samples)
+    assert len(k) <= thinning.POINTS
     assert k[0] == 0
     assert k[-1] == num_samples - 1
     assert (np.diff(k) > 0).all()
-    if num_samples <= curves.POINTS:
+    if num_samples <= thinning.POINTS:
         assert len(k) == num_samples
     else:
         assert (np.diff(k[:8]) == 1).all()
@@ -37,20 +40,19 @@ def one(**changes):
 
 
 def row(seed=3):
-    played = {"env_id": ENV, "setup": "benchmark", "condition": "noise5+dropout10"}
-    return {**played, "estimator": "a b/c", "config_hash": "0123", "episode_seed": seed}
+    return {**NOISY._asdict(), "estimator": "a b/c", "config_hash": "0123", "episode_seed": seed}
 
 
 def test_what_is_written_is_read_back(tmp_path):
     curves.save(tmp_path, row(), one())
-    found = curves.read(tmp_path, ENV, "benchmark", "noise5+dropout10")
+    found = curves.read(tmp_path, NOISY)
     (back,) = found["a b/c", "0123"]
     np.testing.assert_array_equal(back.error, one().error)
     np.testing.assert_array_equal(back.example.x, one().example.x)
     assert (back.states, back.measured, back.example.seed) == (("a (m)", "b"), {0: 0}, 3)
     assert back.reference is None
     assert back.example.std is None
-    assert curves.read(tmp_path, ENV, "benchmark", "nominal") == {}
+    assert curves.read(tmp_path, NOMINAL) == {}
 
 
 def test_files_of_one_estimator_merge_by_episode():
@@ -61,7 +63,7 @@ def test_files_of_one_estimator_merge_by_episode():
     assert both.error[:, 1].tolist() == [0.2, 0.3, 9.0]
     some = curves.merged([one(), later], [5])
     assert some is not None
-    assert some.num_episodes == 1
+    assert some.seeds.tolist() == [5]
     assert curves.merged([one()], [8]) is None
 
 
@@ -70,7 +72,7 @@ def test_a_damaged_file_is_named(tmp_path):
     (path,) = tmp_path.rglob("*.npz")
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(ValueError, match=re.escape(f"cannot read curves from {path}")) as caught:
-        curves.read(tmp_path, ENV, "benchmark", "noise5+dropout10")
+        curves.read(tmp_path, NOISY)
     assert "\n" not in str(caught.value)
 
 
@@ -78,7 +80,7 @@ def test_scored_episodes_leave_their_errors_and_the_reference(tmp_path):
     """Against the errors of the EKF on episodes that are played here, state by state."""
     path = tmp_path / "rows.jsonl"
     evaluate("ekf", ENV, episodes=3, results=path)
-    ((parts,),) = [list(curves.read(tmp_path / "curves", ENV, "benchmark", "nominal").values())]
+    ((parts,),) = [list(curves.read(tmp_path / "curves", NOMINAL).values())]
     own = curves.merged(parts, range(3))
     assert own is not None
 
@@ -112,7 +114,7 @@ def test_more_episodes_add_a_file(tmp_path):
     path = tmp_path / "rows.jsonl"
     for episodes in (1, 3):
         evaluate("open_loop", ENV, episodes=episodes, results=path)
-    (parts,) = curves.read(tmp_path / "curves", ENV, "benchmark", "nominal").values()
+    (parts,) = curves.read(tmp_path / "curves", NOMINAL).values()
     assert [part.seeds.tolist() for part in parts] == [[0], [1, 2]]
 
 

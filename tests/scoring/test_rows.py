@@ -26,6 +26,13 @@ def test_round_trip_keeps_infinity_as_valid_json(tmp_path):
     assert back[1]["nrmse"] == 0.5
 
 
+def test_the_game_of_a_row_and_of_a_failure():
+    game = rows.game_of(row(0) | {"env_id": "pinnobs/X-v0", "setup": "paper", "condition": "delay"})
+    assert game == ("pinnobs/X-v0", "paper", "delay")
+    assert (game.env_id, game.system) == ("pinnobs/X-v0", "X-v0")
+    assert rows.game_of(dict(zip(rows.JOB, "abcdefg", strict=True))) == ("a", "b", "c")
+
+
 def test_optional_scores_are_absent_infinite_or_a_number(tmp_path):
     path = tmp_path / "rows.jsonl"
     optional = dict.fromkeys(OPTIONAL_SCORES)

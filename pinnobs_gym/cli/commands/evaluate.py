@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
@@ -60,7 +61,7 @@ class Evaluate:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         check_writable(self.out)
         scored = self._score(game, estimator, episodes)
-        for table in standings_table.tables(scored):
+        for table in standings_table.tables(runs_of(scored)):
             print_table(table)
         console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
         if self.video is not None:

@@ -10,7 +10,8 @@ from typing import Literal
 from pinnobs_gym.cli.console import RunView, console, print_grid, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
-from pinnobs_gym.leaderboard import ranks, ranks_table, standings_table, suites
+from pinnobs_gym.leaderboard import ranks_table, standings_table, suites
+from pinnobs_gym.leaderboard.board import board, markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
 from pinnobs_gym.scoring import rows, tensorboard
@@ -109,22 +110,19 @@ class Leaderboard:
 
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
         """Print and write what came of it."""
-        scored = stored.rows
-        lines, placed = ranks.lines(scored), ranks.ranks(scored)
-        tables = standings_table.tables(scored, stored.failures)
-        shown = [table for table in tables if table.condition in conditions]
+        found = board(stored)
+        shown = [table for table in found.tables if table.game.condition in conditions]
         for table in shown if len(conditions) <= 2 else ():
             print_table(table)
         console.print(standings_table.NOTE if len(conditions) <= 2 else "")
-        print_grid("Across systems", *ranks_table.cells(lines))
+        print_grid("Across systems", *ranks_table.cells(found.lines))
         console.print(ranks_table.NOTE)
-        if len(placed) > 1:
-            print_grid("Ranks", *ranks_table.rank_cells(placed))
+        if len(found.ranks) > 1:
+            print_grid("Ranks", *ranks_table.rank_cells(found.ranks))
             console.print(ranks_table.RANK_NOTE)
         path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
-            text = ranks_table.markdown(lines, placed) + "\n" + standings_table.markdown(tables)
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text(markdown(found), encoding="utf-8")
         for what, where in (
             ("tables", path),
             ("rows", self.out / "rows.jsonl"),

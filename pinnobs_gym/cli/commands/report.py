@@ -30,7 +30,8 @@ class Report:
         if not self.rows:
             raise ValueError("no rows file is given; such as runs/leaderboard/rows.jsonl")
         try:
-            from pinnobs_gym.leaderboard.site import page
+            from pinnobs_gym.leaderboard.site.model import page_model
+            from pinnobs_gym.leaderboard.site.page import draw
         except ImportError as error:
             raise ValueError(
                 f"the page needs {error.name}: pip install 'pinnobs-gym[report]'"
@@ -42,7 +43,7 @@ class Report:
             raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
         check_writable(self.out)
         folders = list(dict.fromkeys(map(curves.folder_of, self.rows)))
-        text = page.build(stored.rows, stored.failures, folders)
+        text = draw(page_model(stored, folders))
         path = self.out / "index.html"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -15,7 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import trainer
-from pinnobs_gym.scoring.rows import Stored
+from pinnobs_gym.scoring.rows import Stored, game_of
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
 
@@ -100,8 +100,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
     they failed before; with ``retry_failed`` they are run again."""
     there: dict[tuple[GameName, str], list[tuple[str, int | None, int]]] = defaultdict(list)
     for row in stored.rows:
-        name = GameName(row["env_id"], row["setup"], row["condition"])
-        there[name, row["estimator"]].append(
+        there[game_of(row), row["estimator"]].append(
             (row["config_hash"], row["training_seed"], row["episode_seed"])
         )
     failed = {row["job"] for row in stored.failures}

@@ -1,19 +1,62 @@
-"""The numbers that the page shows across systems, from stored rows."""
+"""The numbers that the page shows across systems and conditions."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from pinnobs_gym.leaderboard import ranks
-from pinnobs_gym.leaderboard.site.data import Columns, extend, number
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.leaderboard.contenders import Contender, among
+from pinnobs_gym.leaderboard.ranks import Line
+from pinnobs_gym.leaderboard.runs import rows_of
+from pinnobs_gym.leaderboard.site.columns import Columns, extend, number
 
 
-def standings(lines: Sequence[ranks.Line], players: Mapping[str, Any]) -> Columns:
+@dataclass(frozen=True)
+class Factors:
+    """How online estimators compare with the peer under several conditions."""
+
+    of: str
+    """A system, or "all systems"."""
+    estimators: tuple[str, ...]
+    """Those that were played under more conditions first, then those with the better worst rank."""
+    worst: tuple[int, ...]
+    """The worst rank of each."""
+    values: Mapping[str, Mapping[str, float]]
+    """`ranks.log_ratios`, by condition and estimator; absent where it played less than the peer."""
+
+
+def factors(contenders: Sequence[Contender]) -> list[Factors]:
+    """The factors over all systems together and, if there are several, those of each; of those that
+    were played under several conditions."""
+    online = [contender for contender in contenders if contender.track == "online"]
+    systems = sorted({game.system for contender in online for game in contender.games})
+    groups = {"all systems": online}
+    for system in systems if len(systems) > 1 else ():
+        groups[system] = among(online, lambda run, wanted=system: run.game.system == wanted)
+    found = {of: ranks.log_ratios(group) for of, group in groups.items()}
+    return [_factors(of, values) for of, values in found.items() if len(values) > 1]
+
+
+def _factors(of: str, values: Mapping[str, Mapping[str, float]]) -> Factors:
+    found: dict[str, list[int]] = {}
+    for placed in ranks.ranks(values).values():
+        for estimator, rank in placed.items():
+            found.setdefault(estimator, []).append(rank)
+    names = sorted(found, key=lambda n: (-len(found[n]), max(found[n]), sum(found[n])))
+    return Factors(of, tuple(names), tuple(max(found[name]) for name in names), values)
+
+
+def training_seconds(contender: Contender) -> float | None:
+    """Median CPU seconds of its trainings; None if it is not trained."""
+    spent = [row["training"].get("seconds") for row in rows_of(contender.runs)]
+    known = [seconds for seconds in spent if seconds is not None]
+    return float(np.median(known)) if known else None
+
+
+def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns:
     """Each line of the overview: its factor to the peer with the interval, its µs per step, and the
     CPU seconds that training took, a gap for those that are not trained. ``front`` is true of
     those that no other of their track beats in both accuracy and speed. Lines whose factor is not
@@ -23,9 +66,7 @@ def standings(lines: Sequence[ranks.Line], players: Mapping[str, Any]) -> Column
     for line in lines:
         if line.ratio is None or not np.isfinite(line.ratio.value):
             continue
-        groups = players.get(line.estimator, {}).values()
-        spent = [row["training"].get("seconds") for group in groups for row in group]
-        known = [seconds for seconds in spent if seconds is not None]
+        spent = seconds.get(line.estimator)
         extend(
             table,
             estimator=[line.estimator],
@@ -34,27 +75,15 @@ def standings(lines: Sequence[ranks.Line], players: Mapping[str, Any]) -> Column
             low=[number(line.ratio.low)],
             high=[number(line.ratio.high)],
             us=[number(line.us_per_step)],
-            seconds=[number(float(np.median(known))) if known else None],
+            seconds=[None if spent is None else number(spent)],
             front=[not any(_beats(other, line) for other in lines)],
         )
     return table
 
 
-def _beats(other: ranks.Line, line: ranks.Line) -> bool:
+def _beats(other: Line, line: Line) -> bool:
     """Whether the other is both faster and more accurate."""
     if other.ratio is None or line.ratio is None or other.track != line.track:
         return False
     faster = other.us_per_step < line.us_per_step
     return faster and other.ratio.value < line.ratio.value
-
-
-def conditions(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """`ranks.log_ratios` of all systems together, under the name "all systems", and of each; of
-    those that were played under several conditions."""
-    online = [row for row in rows if row["track"] == "online"]
-    systems: dict[str, list[Row]] = defaultdict(list)
-    for row in online:
-        systems[row["env_id"].removeprefix("pinnobs/")].append(row)
-    every = {"all systems": online} | (dict(sorted(systems.items())) if len(systems) > 1 else {})
-    found = {name: ranks.log_ratios(some) for name, some in every.items()}
-    return {name: values for name, values in found.items() if len(values) > 1}

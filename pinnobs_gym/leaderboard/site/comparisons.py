@@ -22,6 +22,7 @@ STEP = 21
 PLAIN_NAMES = alt.Axis(
     domain=False, ticks=False, grid=False, labelLimit=150, labelPadding=8, minExtent=0
 )
+"""The axis of a chart that has a line per estimator."""
 
 
 def level(scale: alt.Scale, vertical: bool) -> alt.Chart:

@@ -3,107 +3,116 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pinnobs_gym.leaderboard.site import comparisons, over_time
 from pinnobs_gym.leaderboard.site.charts import Spec, Styled, nice_range
-from pinnobs_gym.leaderboard.site.data import Columns, Game
-from pinnobs_gym.leaderboard.site.palette import styles
+from pinnobs_gym.leaderboard.site.columns import Columns
+from pinnobs_gym.leaderboard.site.games import GameResults
+from pinnobs_gym.leaderboard.site.model import Page
+from pinnobs_gym.leaderboard.site.palette import Style
+
+COSTS = {"us": "CPU time per step and episode (µs)", "seconds": "CPU time of training (s)"}
+"""Titles of the axes of what estimators cost, by column."""
 
 
-class Drawings:
-    """The charts of a page by name, and the data that they draw."""
+@dataclass(frozen=True)
+class Charts:
+    """Charts by name, and the data that they draw by key."""
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.styles = styles(names)
-        self._styled = Styled(self.styles)
-        self.charts: dict[str, dict[str, Any]] = {}
-        self._data: dict[str, dict[str, Any]] = {}
-
-    def embedded(self, chosen: Sequence[str]) -> str:
-        """All of it as JSON, to stand in a script element, with the estimators chosen at first."""
-        everything = {
-            "light": [style.light for style in self.styles.values()],
-            "dark": [style.dark for style in self.styles.values()],
-            "shown": list(chosen),
-            "charts": self.charts,
-            "data": self._data,
-        }
-        return json.dumps(everything, separators=(",", ":"), ensure_ascii=False).replace(
-            "</", "<\\/"
-        )
-
-    def compare(self, standings: Columns) -> None:
-        """The charts across systems."""
-        names = standings["estimator"]
-        if not names:
-            return
-        self._data["across"] = {"standings": _packed(standings), "one": {"at": [1]}}
-        up = _range_of(standings, [True] * len(names))
-        standings = standings | {
-            "named_us": _apart(standings["us"], standings["ratio"], standings["front"]),
-            "named_seconds": _apart(
-                standings["seconds"],
-                standings["ratio"],
-                [x is not None for x in standings["seconds"]],
-            ),
-        }
-        self._data["across"]["standings"] = _packed(standings)
-        self._add("factors", "across", comparisons.factors(self._styled, names, *up))
-        titles = {"us": "CPU time per step and episode (µs)", "seconds": "CPU time of training (s)"}
-        for field, title in titles.items():
-            known = [value for value in standings[field] if value]
-            if known:
-                across = min(known) / 1.6, max(known) * 4
-                up = _range_of(standings, [value is not None for value in standings[field]])
-                spec = comparisons.cost(self._styled, field, title, across, up)
-                self._add(field, "across", spec)
-
-    def play(self, number: int, game: Game) -> None:
-        """The charts of one game, their names ending in its number."""
-        key = f"game{number}"
-        parts = {
-            name: getattr(game, name) for name in ("settling", "ratios", "errors", "reference")
-        }
-        if game.states is not None:
-            parts |= {"truth": game.states.truth, "estimates": game.states.estimates}
-        self._data[key] = {name: _packed(part) for name, part in parts.items()}
-        self._data[key]["one"] = {"at": [1]}
-        end = max([*game.errors["t"], *game.settling["t"], 1e-9])
-        if game.errors["t"]:
-            seen = [*game.errors["median"], *game.reference["median"]]
-            spec = over_time.errors(self._styled, end, *nice_range(seen, 1e-6, 3.0))
-            self._add(f"errors{number}", key, spec)
-        self._add(f"settling{number}", key, over_time.settling(self._styled, end))
-        order = game.ratios["estimator"]
-        if order:
-            seen = [*game.ratios["q10"], *game.ratios["q90"]]
-            low, high = nice_range(seen, 0.01, 100.0)
-            spec = comparisons.ratios(self._styled, order, min(low, 0.8), max(high, 2.0))
-            self._add(f"ratios{number}", key, spec)
-        if game.states is not None:
-            for i, name in enumerate(game.states.names):
-                measured = f"y{i}" in game.states.truth
-                limits = game.states.limits[i]
-                spec = over_time.state(self._styled, i, name, end, limits, measured)
-                self._add(f"state{number}-{i}", key, spec)
-
-    def _add(self, name: str, key: str, spec: Spec) -> None:
-        """A chart, and how high it will be, so that nothing moves when it is drawn."""
-        self.charts[name] = {"spec": spec, "data": key, "height": spec["height"] + 48}
+    charts: dict[str, dict[str, Any]]
+    """Each with its ``spec``, the key of its ``data``, and its ``height``."""
+    data: dict[str, dict[str, Any]]
+    """Tables by name, as the page's script takes them."""
 
 
-def _range_of(standings: Columns, wanted: Sequence[bool]) -> tuple[float, float]:
+def charts_of(page: Page, styles: Mapping[str, Style]) -> Charts:
+    """All charts of a page: those across systems, and those of each game, whose names end in its
+    number."""
+    styled = Styled(styles)
+    parts = [_across(styled, page.costs)] if page.costs["estimator"] else []
+    parts += [_game(styled, game) for section in page.sections for game in section.games]
+    charts = {name: chart for part in parts for name, chart in part.charts.items()}
+    return Charts(charts, {key: tables for part in parts for key, tables in part.data.items()})
+
+
+def embedded(charts: Charts, styles: Mapping[str, Style], chosen: Sequence[str]) -> str:
+    """All of it as JSON, to stand in a script element, with the estimators chosen at first."""
+    everything = {
+        "light": [style.light for style in styles.values()],
+        "dark": [style.dark for style in styles.values()],
+        "shown": list(chosen),
+        "charts": charts.charts,
+        "data": charts.data,
+    }
+    text = json.dumps(everything, separators=(",", ":"), ensure_ascii=False)
+    return text.replace("</", "<\\/")
+
+
+def _across(styled: Styled, costs: Columns) -> Charts:
+    """The charts across systems, of at least one estimator."""
+    names, ratio = costs["estimator"], costs["ratio"]
+    trained = [seconds is not None for seconds in costs["seconds"]]
+    named = {
+        "named_us": _apart(costs["us"], ratio, costs["front"]),
+        "named_seconds": _apart(costs["seconds"], ratio, trained),
+    }
+    specs = {"factors": comparisons.factors(styled, names, *_range_of(costs, [True] * len(names)))}
+    for field, title in COSTS.items():
+        known = [value for value in costs[field] if value]
+        if known:
+            across = min(known) / 1.6, max(known) * 4
+            up = _range_of(costs, [value is not None for value in costs[field]])
+            specs[field] = comparisons.cost(styled, field, title, across, up)
+    return _charts("across", specs, {"standings": costs | named})
+
+
+def _game(styled: Styled, game: GameResults) -> Charts:
+    """The charts of one game."""
+    tables = {name: getattr(game, name) for name in ("settling", "ratios", "errors", "reference")}
+    end = max([*game.errors["t"], *game.settling["t"], 1e-9])
+    specs = {}
+    if game.errors["t"]:
+        seen = [*game.errors["median"], *game.reference["median"]]
+        specs[f"errors{game.number}"] = over_time.errors(styled, end, *nice_range(seen, 1e-6, 3.0))
+    specs[f"settling{game.number}"] = over_time.settling(styled, end)
+    order = game.ratios["estimator"]
+    if order:
+        low, high = nice_range([*game.ratios["q10"], *game.ratios["q90"]], 0.01, 100.0)
+        spec = comparisons.ratios(styled, order, min(low, 0.8), max(high, 2.0))
+        specs[f"ratios{game.number}"] = spec
+    if game.states is not None:
+        tables |= {"truth": game.states.truth, "estimates": game.states.estimates}
+        for i, name in enumerate(game.states.names):
+            measured, limits = f"y{i}" in game.states.truth, game.states.limits[i]
+            spec = over_time.state(styled, i, name, end, limits, measured)
+            specs[f"state{game.number}-{i}"] = spec
+    return _charts(f"game{game.number}", specs, tables)
+
+
+def _charts(key: str, specs: Mapping[str, Spec], tables: Mapping[str, Columns]) -> Charts:
+    """Charts of the same data, each with how high it will be, so that nothing moves when it is
+    drawn."""
+    charts = {
+        name: {"spec": spec, "data": key, "height": spec["height"] + 48}
+        for name, spec in specs.items()
+    }
+    packed = {name: _packed(table) for name, table in tables.items()}
+    return Charts(charts, {key: {**packed, "one": {"at": [1]}}})
+
+
+def _range_of(costs: Columns, wanted: Sequence[bool]) -> tuple[float, float]:
     """What an axis of factors shows of those wanted: their intervals, and 1."""
-    parts = [standings[part] for part in ("ratio", "low", "high")]
+    parts = [costs[part] for part in ("ratio", "low", "high")]
     seen = [value for part in parts for value, want in zip(part, wanted, strict=True) if want]
     return nice_range([1.0, *seen], 0.02, 50.0)
 
 
-def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Sequence[bool]) -> list[bool]:
+def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Iterable[bool]) -> list[bool]:
     """Which of the points that want it can have a name beside them without one covering another,
     the lowest first; both axes are logarithmic."""
     places = {i: (np.log10(x[i] or 1.0), np.log10(y[i])) for i, want in enumerate(wanted) if want}
@@ -113,7 +122,7 @@ def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Sequence[bool]) -> list[b
         gaps = [abs(np.subtract(places[i], places[j])) / spread for j in chosen]
         if all(gap[0] > 0.25 or gap[1] > 0.06 for gap in gaps):
             chosen.append(i)
-    return [i in chosen for i in range(len(wanted))]
+    return [i in chosen for i in range(len(x))]
 
 
 def _packed(table: Columns) -> dict[str, Any]:

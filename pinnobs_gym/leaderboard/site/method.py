@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
+from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.contenders import Contender
+from pinnobs_gym.leaderboard.runs import Run, rows_of
 from pinnobs_gym.leaderboard.standings import training_of
-from pinnobs_gym.scoring.rows import Row
-
-Players = Mapping[str, Mapping[str, Sequence[Row]]]
-"""Rows by the estimator's name in the overview and by what is played."""
+from pinnobs_gym.scoring.rows import Row, Stored, game_of
 
 
 @dataclass(frozen=True)
-class Method:
+class EstimatorMethod:
     """How one estimator's scores were made."""
 
     estimator: str
     track: str
-    told: str
+    knows: str
     settings: str
     training: str
     episodes: int
@@ -28,30 +27,61 @@ class Method:
     dates: str
 
 
-def methods(players: Players) -> list[Method]:
-    """How each estimator's scores were made."""
-    found = []
-    for name, games in players.items():
-        rows = list(chain.from_iterable(games.values()))
-        first = rows[0]
-        found.append(
-            Method(
-                estimator=name,
-                track=first["track"],
-                told=", ".join(first["knows"]),
-                settings="; ".join(
-                    dict.fromkeys(_settings(row["options"]) for row in _some(games))
-                ),
-                training=training_of(rows),
-                episodes=len(rows),
-                dates=dates(rows),
-            )
-        )
-    return found
+@dataclass(frozen=True)
+class FailedJob:
+    """A job of the leaderboard that failed."""
+
+    estimator: str
+    game: GameName
+    episodes: int
+    error: str
+    """In one line."""
 
 
-def _some(games: Mapping[str, Sequence[Row]]) -> Iterable[Row]:
-    return (rows[0] for rows in games.values())
+@dataclass(frozen=True)
+class Method:
+    """How all scores were made."""
+
+    estimators: tuple[EstimatorMethod, ...]
+    failures: tuple[FailedJob, ...]
+    versions: Mapping[str, str]
+    """Of each package."""
+    commands: tuple[str, ...]
+    """Command lines that make the rows anew."""
+    dates: str
+    """The day, or the first and the last."""
+    episodes: int
+    """How many rows."""
+
+
+def method_of(stored: Stored, runs: Sequence[Run], contenders: Iterable[Contender]) -> Method:
+    """How stored scores were made; of the same rows are the runs, and of these the contenders."""
+    return Method(
+        estimators=tuple(map(estimator_method, contenders)),
+        failures=tuple(
+            FailedJob(row["estimator"], game_of(row), row["episodes"], row["error"])
+            for row in stored.failures
+        ),
+        versions=versions(stored.rows),
+        commands=tuple(commands(runs)),
+        dates=dates(stored.rows),
+        episodes=len(stored.rows),
+    )
+
+
+def estimator_method(contender: Contender) -> EstimatorMethod:
+    """How one contender's scores were made."""
+    rows = rows_of(contender.runs)
+    firsts = [runs[0].rows[0] for runs in contender.games.values()]
+    return EstimatorMethod(
+        estimator=contender.name,
+        track=contender.track,
+        knows=", ".join(rows[0]["knows"]),
+        settings="; ".join(dict.fromkeys(_settings(row["options"]) for row in firsts)),
+        training=training_of(rows),
+        episodes=len(rows),
+        dates=dates(rows),
+    )
 
 
 def _settings(options: Mapping[str, Any]) -> str:
@@ -80,31 +110,32 @@ def versions(rows: Iterable[Row]) -> dict[str, str]:
     return {name: ", ".join(sorted(those)) for name, those in sorted(found.items())}
 
 
-def commands(rows: Sequence[Row]) -> list[str]:
-    """Command lines that make these rows anew: one per setup for the conditions that are played by
+def commands(runs: Iterable[Run]) -> list[str]:
+    """Command lines that make these runs anew: one per setup for the conditions that are played by
     default, and one for each set of others that some systems were played under. They may make
     more rows, since every estimator named plays every system named."""
-    usual: dict[str, list[Row]] = {}
-    others: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        if row["ranked"] or row["condition"] == "nominal":
-            usual.setdefault(row["setup"], []).append(row)
+    usual: dict[str, list[Run]] = {}
+    others: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        if run.ranked or run.game.condition == "nominal":
+            usual.setdefault(run.game.setup, []).append(run)
         else:
-            others.setdefault((row["setup"], row["env_id"]), []).append(row)
-    alike: dict[tuple[str, ...], list[Row]] = {}
+            others.setdefault((run.game.setup, run.game.env_id), []).append(run)
+    alike: dict[tuple[str, ...], list[Run]] = {}
     for (setup, _), some in others.items():
-        played = dict.fromkeys(row["condition"] for row in some)
+        played = {run.game.condition for run in some}
         alike.setdefault((setup, *sorted(played)), []).extend(some)
     lines = [_command(some) for some in usual.values()]
     return lines + [_command(some, conditions) for (_, *conditions), some in alike.items()]
 
 
-def _command(rows: Sequence[Row], conditions: Sequence[str] = ()) -> str:
+def _command(runs: Sequence[Run], conditions: Sequence[str] = ()) -> str:
+    rows = rows_of(runs)
     words = ["pinnobs leaderboard"]
-    systems = {row["env_id"].removeprefix("pinnobs/").rpartition("-v")[0] for row in rows}
+    systems = {run.game.system.rpartition("-v")[0] for run in runs}
     words += ["--systems", *sorted(systems)]
-    words += ["--estimators", *sorted({row["estimator"] for row in rows})]
-    setup = rows[0]["setup"]
+    words += ["--estimators", *sorted({run.estimator for run in runs})]
+    setup = runs[0].game.setup
     words += ["--setup", setup] if setup != "benchmark" else []
     words += ["--condition", *conditions] if conditions else []
     alone = {row["episode_seed"] for row in rows if row["training"].get("per_record")}

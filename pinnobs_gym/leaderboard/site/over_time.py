@@ -18,6 +18,7 @@ from pinnobs_gym.leaderboard.site.charts import (
 )
 
 HEIGHT = 300
+"""Of a chart over time, in pixels."""
 
 
 def errors(styled: Styled, end: float, low: float, high: float) -> Spec:

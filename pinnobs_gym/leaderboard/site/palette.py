@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.leaderboard.ranks import PEER
+from pinnobs_gym.leaderboard.contenders import PEER
 
 LIGHT = ("#0072b2", "#d55e00", "#009e73", "#b8559a", "#c78500", "#3d9bd6", "#7a5230")
 DARK = ("#4aa8e0", "#ff8a3d", "#2fc79b", "#e08ec4", "#f2b733", "#9ad4ff", "#c9a27e")
@@ -14,8 +14,9 @@ asks; those that look alike to some differ in lightness."""
 PEER_COLOURS = ("#3b4048", "#d7dbe0")
 """Of the estimator that all are compared with, in light and in the dark."""
 DASHES = ((1, 0), (6, 3), (2, 2), (9, 3, 2, 3))
+"""Lengths of strokes and gaps, in pixels."""
 SHAPES = ("circle", "square", "triangle-up", "diamond")
-"""What tells the second, third and fourth round of the hues from the first."""
+"""These and `DASHES` tell the second, third and fourth round of the hues from the first."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,42 @@
+"""All tables of a leaderboard, computed once from stored scores, and their Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pinnobs_gym.leaderboard import ranks, ranks_table, standings_table
+from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.ranks import Line
+from pinnobs_gym.leaderboard.runs import runs_of
+from pinnobs_gym.leaderboard.standings_table import Table
+from pinnobs_gym.scoring.rows import Stored
+
+
+@dataclass(frozen=True)
+class Board:
+    """What the leaderboard's command prints and writes."""
+
+    tables: tuple[Table, ...]
+    """One per game, what failed in their notes."""
+    lines: tuple[Line, ...]
+    """The overview across systems."""
+    ranks: Mapping[str, Mapping[str, int]]
+    """Ranks of online estimators, by condition and estimator."""
+
+
+def board(stored: Stored) -> Board:
+    """All tables of stored scores."""
+    runs = runs_of(stored.rows)
+    found = contenders(runs)
+    return Board(
+        tables=tuple(standings_table.tables(runs, stored.failures)),
+        lines=tuple(ranks.lines(found)),
+        ranks=ranks.ranks(ranks.log_ratios(found)),
+    )
+
+
+def markdown(board: Board) -> str:
+    """The overview, the ranks and every game's table, in Markdown."""
+    across = ranks_table.markdown(board.lines, board.ranks)
+    return across + "\n" + standings_table.markdown(board.tables)

@@ -1,0 +1,115 @@
+"""Estimators across games, as the overview tells them apart, and compared with the `PEER`."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.intervals import log_ratio
+from pinnobs_gym.leaderboard.runs import Run, rows_of
+from pinnobs_gym.leaderboard.standings import Standing, standing
+from pinnobs_gym.scoring.rows import Row
+
+PEER = "ekf"
+"""The estimator that all are compared with."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """An estimator, all its training seeds together, with one budget of training; one that is not
+    trained with one choice of settings."""
+
+    name: str
+    games: Mapping[GameName, Sequence[Run]]
+    """Its runs of each game, in the order of their `label`; several where training seeds differ."""
+    ratios: Mapping[GameName, np.ndarray]
+    """log(NRMSE/NRMSE of the `PEER`) of each game of which both played some episode, shape
+    (training seeds, episodes), of the episodes that the peer and all training seeds played."""
+
+    @property
+    def track(self) -> str:
+        """``online`` or ``offline``."""
+        return self.runs[0].track
+
+    @property
+    def runs(self) -> list[Run]:
+        """Its runs of all games."""
+        return [run for runs in self.games.values() for run in runs]
+
+    def standing(self, game: GameName) -> Standing:
+        """How it did on one of its games, all training seeds together."""
+        runs = self.games[game]
+        return runs[0].standing if len(runs) == 1 else standing(rows_of(runs))
+
+
+def contenders(runs: Iterable[Run]) -> list[Contender]:
+    """The contenders that runs are of, those with the most rows first. Budgets of training are in
+    the name, and settings where they tell two of a name apart, but for those with the most rows."""
+    groups: dict[tuple[str, str], dict[GameName, list[Run]]]
+    groups = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        groups[_identity(run.rows[0])][run.game].append(run)
+    named: dict[str, dict[GameName, list[Run]]] = {}
+    for (name, settings), games in sorted(groups.items(), key=lambda group: _order(group[1])):
+        ordered = dict(sorted(games.items(), key=lambda item: label(item[0])))
+        named[f"{name} {settings}" if name in named else name] = ordered
+    peer = named.get(PEER, {})
+    return [Contender(name, games, _ratios(games, peer)) for name, games in named.items()]
+
+
+def among(contenders: Iterable[Contender], wanted: Callable[[Run], bool]) -> list[Contender]:
+    """The contenders with those games alone whose runs are wanted, those with the most rows first;
+    who played none of them is left out."""
+    found = []
+    for contender in contenders:
+        games = {game: runs for game, runs in contender.games.items() if wanted(runs[0])}
+        ratios = {game: ratio for game, ratio in contender.ratios.items() if game in games}
+        if games:
+            found.append(replace(contender, games=games, ratios=ratios))
+    return sorted(found, key=lambda contender: _order(contender.games))
+
+
+def label(game: GameName) -> str:
+    """The heading of a game's column: the system, and condition and setup if not the usual ones."""
+    condition = "" if game.condition == "nominal" else f" ({game.condition})"
+    setup = "" if game.setup == "benchmark" else f", {game.setup}"
+    return game.system + condition + setup
+
+
+def _identity(row: Row) -> tuple[str, str]:
+    """The name of a row's estimator with the budget, and its settings if it is not trained."""
+    budget = row["training"].get("config", {}).get("budget")
+    name = row["estimator"] if budget is None else f"{row['estimator']}, {budget:g} s"
+    return name, "" if row["training"] else json.dumps(row["options"], sort_keys=True)
+
+
+def _order(games: Mapping[GameName, Sequence[Run]]) -> tuple[int, int]:
+    """What contenders are sorted by: the most rows first, then the first row."""
+    runs = [run for group in games.values() for run in group]
+    return -sum(len(run.rows) for run in runs), min(run.position for run in runs)
+
+
+def _ratios(
+    games: Mapping[GameName, Sequence[Run]], peer: Mapping[GameName, Sequence[Run]]
+) -> dict[GameName, np.ndarray]:
+    """`Contender.ratios` of a contender's games."""
+    found = {}
+    for game in games:
+        theirs = {row["episode_seed"]: _score(row) for row in rows_of(peer.get(game, ()))}
+        own: dict[object, dict[int, float]] = defaultdict(dict)
+        for row in rows_of(games[game]):
+            own[row["training_seed"]][row["episode_seed"]] = _score(row)
+        common = sorted(set(theirs).intersection(*own.values()))
+        if common:
+            mine = np.array([[scores[seed] for seed in common] for scores in own.values()])
+            found[game] = log_ratio(mine, np.array([theirs[seed] for seed in common]))
+    return found
+
+
+def _score(row: Row) -> float:
+    return np.inf if row["diverged"] else row["nrmse"]

@@ -1,0 +1,64 @@
+"""Stored scores by game and configuration: each table's line is of one run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+
+from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.standings import Standing, standing
+from pinnobs_gym.scoring.rows import Row, game_of
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The episodes that one estimator played of one game with one configuration."""
+
+    game: GameName
+    rows: list[Row]
+    """At least one."""
+    position: int
+    """Of the first of them among all stored rows."""
+
+    @property
+    def estimator(self) -> str:
+        """The estimator's name in rows."""
+        return self.rows[0]["estimator"]
+
+    @property
+    def config_hash(self) -> str:
+        """The hash of its settings, model and training."""
+        return self.rows[0]["config_hash"]
+
+    @property
+    def track(self) -> str:
+        """``online`` or ``offline``."""
+        return self.rows[0]["track"]
+
+    @property
+    def ranked(self) -> bool:
+        """Whether the system is ranked under the condition that is played."""
+        return self.rows[0]["ranked"]
+
+    @cached_property
+    def standing(self) -> Standing:
+        """The summary of its rows, computed at the first use."""
+        return standing(self.rows)
+
+
+def runs_of(rows: Iterable[Row]) -> list[Run]:
+    """Scored episodes as runs, in the order of their first rows."""
+    found: dict[tuple[GameName, str, str], Run] = {}
+    for position, row in enumerate(rows):
+        key = (game_of(row), row["estimator"], row["config_hash"])
+        if key not in found:
+            found[key] = Run(key[0], [], position)
+        found[key].rows.append(row)
+    return list(found.values())
+
+
+def rows_of(runs: Iterable[Run]) -> list[Row]:
+    """The rows of all these runs."""
+    return list(chain.from_iterable(run.rows for run in runs))

@@ -1,0 +1,95 @@
+"""What the page shows of each game, from runs and curves."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.contenders import Contender
+from pinnobs_gym.leaderboard.runs import Run, rows_of
+from pinnobs_gym.leaderboard.site.columns import Columns
+from pinnobs_gym.leaderboard.site.over_episodes import ratios, settling
+from pinnobs_gym.leaderboard.site.over_samples import States, errors, reference, states
+from pinnobs_gym.leaderboard.standings_table import Table
+from pinnobs_gym.scoring import curves
+from pinnobs_gym.scoring.curves import Curves
+
+Players = Mapping[str, Sequence[Run]]
+"""Runs of one game by the contender's name."""
+
+
+@dataclass(frozen=True)
+class GameResults:
+    """How one game went."""
+
+    number: int
+    """Its place on the page."""
+    game: GameName
+    table: Table
+    settling: Columns
+    """``estimator``, ``t`` in s, and ``share`` of its episodes that have settled by then."""
+    ratios: Columns
+    """Quantiles ``q10`` to ``q90`` of each estimator's NRMSE over the Cramér-Rao reference."""
+    errors: Columns
+    """``estimator``, ``t``, and ``median``, ``q10``, ``q90`` over episodes of a sample's NRMSE."""
+    reference: Columns
+    """``t`` and the ``median`` over episodes of what the Cramér-Rao reference expects."""
+    states: States | None
+    """The example episode; None without curves."""
+
+
+def games_of(contenders: Iterable[Contender], folders: Sequence[Path]) -> list[GameResults]:
+    """The games that systems are ranked under, each system's nominal ones after them.
+
+    Args:
+        contenders: in the order in which charts list them.
+        folders: where their curves lie.
+
+    Raises:
+        ValueError: in one line, if a file of curves is damaged.
+    """
+    played: dict[GameName, dict[str, Sequence[Run]]] = defaultdict(dict)
+    for contender in contenders:
+        for game, runs in contender.games.items():
+            if runs[0].ranked or game.condition == "nominal":
+                played[game][contender.name] = runs
+    ranked = {game: next(iter(players.values()))[0].ranked for game, players in played.items()}
+    order = sorted(
+        played, key=lambda game: (game.env_id, game.setup, not ranked[game], game.condition)
+    )
+    return [_results(number, game, played[game], folders) for number, game in enumerate(order)]
+
+
+def _results(number: int, game: GameName, players: Players, folders: Sequence[Path]) -> GameResults:
+    found = _curves(game, players, folders)
+    rows = {name: rows_of(runs) for name, runs in players.items()}
+    return GameResults(
+        number=number,
+        game=game,
+        table=standings_table.table(game, (run for runs in players.values() for run in runs)),
+        settling=settling(rows),
+        ratios=ratios(rows),
+        errors=errors(found),
+        reference=reference(found.values()),
+        states=states(found),
+    )
+
+
+def _curves(game: GameName, players: Players, folders: Sequence[Path]) -> dict[str, Curves]:
+    """Each contender's curves of the episodes that have rows."""
+    parts: dict[tuple[str, str], list[Curves]] = defaultdict(list)
+    for folder in folders:
+        for name, listed in curves.read(folder, game).items():
+            parts[name] += listed
+    found = {}
+    for name, runs in players.items():
+        names = sorted((run.estimator, run.config_hash) for run in runs)
+        own = [part for each in names for part in parts.get(each, [])]
+        merged = curves.merged(own, {row["episode_seed"] for row in rows_of(runs)})
+        if merged is not None:
+            found[name] = merged
+    return found

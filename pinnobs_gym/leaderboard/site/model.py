@@ -1,0 +1,103 @@
+"""The page model: all that the page shows, computed once from stored rows and curves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pinnobs_gym.leaderboard import ranks
+from pinnobs_gym.leaderboard.contenders import PEER, Contender, contenders
+from pinnobs_gym.leaderboard.ranks import Line
+from pinnobs_gym.leaderboard.runs import runs_of
+from pinnobs_gym.leaderboard.site.across import Factors, costs, factors, training_seconds
+from pinnobs_gym.leaderboard.site.columns import Columns
+from pinnobs_gym.leaderboard.site.games import GameResults, games_of
+from pinnobs_gym.leaderboard.site.method import Method, method_of
+from pinnobs_gym.scoring.rows import Stored
+from pinnobs_gym.systems import SYSTEMS
+
+SHOWN = 3
+"""How many of the best online estimators are chosen at first, besides the peer."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """The games of one system and setup."""
+
+    title: str
+    about: str
+    """What the system is, in a sentence."""
+    games: tuple[GameResults, ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """All that the page shows."""
+
+    tracks: Mapping[str, str]
+    """Each estimator's track, in the order in which estimators are listed."""
+    chosen: tuple[str, ...]
+    """The estimators that are drawn over time at first."""
+    lines: tuple[Line, ...]
+    """The overview across systems."""
+    costs: Columns
+    """The overview's factors, and what estimators cost; see `across.costs`."""
+    sections: tuple[Section, ...]
+    factors: tuple[Factors, ...]
+    """Under each condition, of all systems and of each."""
+    method: Method
+
+
+def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
+    """The page of stored scores.
+
+    Args:
+        stored: scored episodes, at least one, and jobs that failed.
+        folders: where the curves of these rows lie.
+
+    Raises:
+        ValueError: in one line, if a file of curves is damaged.
+    """
+    runs = runs_of(stored.rows)
+    found = contenders(runs)
+    lines = ranks.lines(found)
+    listed = _listed(found, lines)
+    seconds = {contender.name: training_seconds(contender) for contender in listed}
+    return Page(
+        tracks={contender.name: contender.track for contender in listed},
+        chosen=_chosen(lines),
+        lines=tuple(lines),
+        costs=costs(lines, seconds),
+        sections=tuple(_sections(games_of(listed, folders))),
+        factors=tuple(factors(found)),
+        method=method_of(stored, runs, listed),
+    )
+
+
+def _listed(found: Iterable[Contender], lines: Iterable[Line]) -> list[Contender]:
+    """Contenders in the order of the overview's lines; those that it does not list come last."""
+    by_name = {contender.name: contender for contender in found}
+    order = dict.fromkeys([*(line.estimator for line in lines), *sorted(by_name)])
+    return [by_name[name] for name in order]
+
+
+def _chosen(lines: Iterable[Line]) -> tuple[str, ...]:
+    """The best online estimators, and the peer."""
+    online = [line.estimator for line in lines if line.track == "online"]
+    return tuple(dict.fromkeys([*online[:SHOWN], *(name for name in online if name == PEER)]))
+
+
+def _sections(games: Iterable[GameResults]) -> list[Section]:
+    """The games by system and setup."""
+    known = {f"{name}-v{cls.version}": cls for name, cls in SYSTEMS.classes().items()}
+    found: dict[tuple[str, str], list[GameResults]] = {}
+    for each in games:
+        found.setdefault((each.game.system, each.game.setup), []).append(each)
+    sections = []
+    for (system, setup), some in found.items():
+        cls = known.get(system)
+        about = (cls.__doc__ or "").strip().partition("\n")[0] if cls else ""
+        title = system if setup == "benchmark" else f"{system}, {setup}"
+        sections.append(Section(title, about, tuple(some)))
+    return sections

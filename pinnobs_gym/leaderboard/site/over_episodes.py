@@ -1,0 +1,78 @@
+"""Columns of a game's charts from its rows: settling, and errors over the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pinnobs_gym.leaderboard.site.columns import QUANTILES, Columns, extend, number, quantiles
+from pinnobs_gym.scoring.rows import Row
+
+STEPS = 100
+"""Most steps of a settling curve."""
+
+Players = Mapping[str, Sequence[Row]]
+"""Rows of one game by the contender's name."""
+
+
+class _Ratios(NamedTuple):
+    """One contender's errors over the reference."""
+
+    estimator: str
+    median: float
+    quantiles: np.ndarray
+
+
+def settling(players: Players) -> Columns:
+    """For every estimator, at ``t`` in s, the ``share`` of its episodes that have settled by then;
+    diverged ones never have. Steps hold until the next."""
+    times = {name: _settled(rows) for name, rows in players.items()}
+    last = max([0.0, *(float(t[-1]) for t in times.values() if len(t))])
+    table: Columns = {"estimator": [], "t": [], "share": []}
+    for name, settled in times.items():
+        t, shares = _steps(settled, len(players[name]))
+        extend(
+            table,
+            estimator=[name] * (len(t) + 1),
+            t=[*t.tolist(), last],
+            share=[*shares.tolist(), float(shares[-1])],
+        )
+    return table
+
+
+def _settled(rows: Sequence[Row]) -> np.ndarray:
+    """When episodes settled, those alone that did, in ascending order."""
+    times = [row["settling"] for row in rows if not row["diverged"]]
+    return np.sort([t for t in times if np.isfinite(t)])
+
+
+def _steps(settled: np.ndarray, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times, the first of them 0, and the share of the episodes that have settled by then; at most
+    `STEPS` steps."""
+    t, first = np.unique(settled, return_index=True)
+    shares = np.append(first[1:], len(settled))[: len(t)] / episodes
+    if len(t) > STEPS:
+        chosen = np.unique(np.linspace(0, len(t) - 1, STEPS).round().astype(int))
+        t, shares = t[chosen], shares[chosen]
+    if not len(t) or t[0] > 0:
+        t, shares = np.insert(t, 0, 0.0), np.insert(shares, 0, 0.0)
+    return t, shares
+
+
+def ratios(players: Players) -> Columns:
+    """Median and quantiles ``q10`` to ``q90`` of each estimator's NRMSE over the Cramér-Rao
+    reference of the same episode, the smallest median first."""
+    found = []
+    for name, rows in players.items():
+        values = [row["reference_ratio"] for row in rows if row["reference_ratio"] is not None]
+        if values:
+            spread = quantiles(np.array(values)[:, None])[:, 0]
+            found.append(_Ratios(name, float(np.median(values)), spread))
+    found.sort(key=lambda each: each.median)
+    table: Columns = {"estimator": [each.estimator for each in found]}
+    table["median"] = [number(each.median) for each in found]
+    for i, q in enumerate(QUANTILES):
+        table[f"q{100 * q:.0f}"] = [number(each.quantiles[i]) for each in found]
+    return table

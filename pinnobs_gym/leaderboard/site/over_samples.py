@@ -1,0 +1,113 @@
+"""Columns of a game's charts from its curves: errors over time, and the example episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.leaderboard.site.columns import Columns, extend, medians, numbers, quantiles
+from pinnobs_gym.scoring.curves import Curves
+from pinnobs_gym.scoring.thinning import kept
+
+POINTS = 120
+"""Most times that a curve is drawn at."""
+
+
+@dataclass(frozen=True)
+class States:
+    """One episode, and what the estimators make of it."""
+
+    seed: int
+    names: tuple[str, ...]
+    """Of the states, with units."""
+    limits: tuple[tuple[float, float], ...]
+    """What each state's axis shows."""
+    truth: Columns
+    """``t``, true states ``x0``, ...; outputs ``y0``, ... under the state that they measure."""
+    estimates: Columns
+    """``estimator``, ``t``, estimates ``m0``, ... and two of their standard deviations ``s0``, ...,
+    gaps where it gives none."""
+
+
+def errors(found: Mapping[str, Curves]) -> Columns:
+    """Median and 10-90 % band over episodes of each estimator's error over time."""
+    table: Columns = {"estimator": [], "t": [], "median": [], "q10": [], "q90": []}
+    for name, own in found.items():
+        k = kept(len(own.t), POINTS)
+        k = k[~np.isnan(own.error[:, k]).all(axis=0)]
+        error = own.error[:, k].astype(float)
+        band = quantiles(error)
+        extend(
+            table,
+            estimator=[name] * len(k),
+            t=numbers(own.t[k]),
+            median=numbers(medians(error)),
+            q10=numbers(band[0]),
+            q90=numbers(band[-1]),
+        )
+    return table
+
+
+def reference(found: Iterable[Curves]) -> Columns:
+    """Median over all episodes of the error at the Cramér-Rao reference."""
+    episodes: dict[int, np.ndarray] = {}
+    t = np.empty(0)
+    for own in found:
+        if own.reference is None or (len(t) and len(own.t) != len(t)):
+            continue
+        t = own.t
+        for seed, line in zip(own.seeds.tolist(), own.reference, strict=True):
+            episodes.setdefault(seed, line)
+    if not episodes:
+        return {"t": [], "median": []}
+    k = kept(len(t), POINTS)
+    lines = np.stack(list(episodes.values()))[:, k].astype(float)
+    some = ~np.isnan(lines).all(axis=0)
+    return {"t": numbers(t[k][some]), "median": numbers(medians(lines[:, some]))}
+
+
+def states(found: Mapping[str, Curves]) -> States | None:
+    """The first episode that most estimators have as their example; None without curves."""
+    seeds = [own.example.seed for own in found.values()]
+    if not seeds:
+        return None
+    seed = max(sorted(set(seeds)), key=seeds.count)
+    shown = {name: own for name, own in found.items() if own.example.seed == seed}
+    first = next(iter(shown.values()))
+    return States(
+        seed=seed,
+        names=first.states,
+        limits=tuple(map(_limits, first.example.x.T)),
+        truth=_truth(first),
+        estimates=_estimates(shown),
+    )
+
+
+def _truth(own: Curves) -> Columns:
+    """`States.truth` of an example."""
+    x, y = own.example.x, own.example.y
+    table: Columns = {"t": numbers(own.example.t)}
+    table |= {f"x{i}": numbers(x[:, i]) for i in range(x.shape[1])}
+    return table | {f"y{i}": numbers(y[:, output]) for i, output in own.measured.items()}
+
+
+def _estimates(shown: Mapping[str, Curves]) -> Columns:
+    """`States.estimates` of everyone's example."""
+    nx = next(iter(shown.values())).example.x.shape[1]
+    table: Columns = {"estimator": [], "t": []}
+    table |= {f"{part}{i}": [] for i in range(nx) for part in ("m", "s")}
+    for name, own in shown.items():
+        t, mean, std = own.example.t, own.example.xhat, own.example.std
+        parts = {"m": mean, "s": np.full(mean.shape, np.nan) if std is None else 2 * std}
+        new = {f"{part}{i}": numbers(v[:, i]) for part, v in parts.items() for i in range(nx)}
+        extend(table, estimator=[name] * len(t), t=numbers(t), **new)
+    return table
+
+
+def _limits(x: np.ndarray) -> tuple[float, float]:
+    """The range of a state with a margin."""
+    low, high = float(x.min()), float(x.max())
+    margin = 0.15 * (high - low) + 1e-9 * max(abs(low), abs(high), 1.0)
+    return low - margin, high + margin

@@ -1,0 +1,16 @@
+"""The games that the page shows."""
+
+from page_rows import row
+
+from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.runs import runs_of
+from pinnobs_gym.leaderboard.site.games import games_of
+
+
+def test_games_are_the_ranked_one_and_then_the_nominal_one():
+    group = [row(condition=c, ranked=c == "load_step") for c in ("nominal", "load_step", "noise5")]
+    games = games_of(contenders(runs_of(group)), [])
+    assert [each.game.condition for each in games] == ["load_step", "nominal"]
+    assert [each.number for each in games] == [0, 1]
+    assert games[0].states is None
+    assert games[0].errors["t"] == []

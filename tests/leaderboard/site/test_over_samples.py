@@ -1,0 +1,51 @@
+"""Errors over time and the example episode, against ones worked out by hand or by other means."""
+
+import numpy as np
+import pytest
+from page_rows import curves, lines_of
+
+from pinnobs_gym.leaderboard.site import over_samples
+
+
+def test_error_over_time_is_median_and_band():
+    rng = np.random.default_rng(1)
+    error = np.exp(rng.normal(size=(11, 3)))
+    error[:3, 2] = np.inf
+    table = over_samples.errors({"ekf": curves(error), "lost": curves([[np.nan, np.inf, 1.0]])})
+    for k, (t, median, low, high) in enumerate(lines_of(table, "ekf")):
+        ordered = sorted(error[:, k].tolist())
+        assert t == k
+        assert median == pytest.approx(ordered[5], rel=1e-3)
+        assert low == pytest.approx(ordered[1], rel=1e-3)  # of 11 the second is 10 % or more
+        assert high == (None if k == 2 else pytest.approx(ordered[9], rel=1e-3))
+    # Where nothing counts there is no point, and where nothing is finite a gap.
+    assert lines_of(table, "lost") == [(1.0, None, None, None), (2.0, 1.0, 1.0, 1.0)]
+
+
+def test_the_median_of_an_even_number_is_between_the_two():
+    table = over_samples.errors({"ekf": curves([[1.0], [2.0], [4.0], [np.inf]], t=[0.0])})
+    assert lines_of(table, "ekf") == [(0.0, 3.0, 1.0, None)]
+
+
+def test_the_reference_is_of_each_episode_once():
+    first = curves(np.ones((2, 3)), reference=[[1, 2, 3], [3, 4, 5]])
+    second = curves(np.ones((2, 3)), reference=[[3, 4, 5], [8, 8, 8]], seeds=[1, 2])
+    table = over_samples.reference([first, second, curves(np.ones((1, 3)))])
+    assert table == {"t": [0, 1, 2], "median": [3, 4, 5]}
+    assert over_samples.reference([curves(np.ones((1, 3)))]) == {"t": [], "median": []}
+
+
+def test_the_example_is_of_the_episode_that_most_have():
+    own = {"a": curves(np.ones((1, 3)), seed=5), "b": curves(np.ones((1, 3)))}
+    found = over_samples.states({**own, "c": curves(np.ones((1, 3)))})
+    assert found is not None
+    assert found.seed == 0
+    assert found.truth == {
+        "t": [0, 1, 2],
+        "x0": [0, 1, 2],
+        "x1": [0, -1, -2],
+        "y0": [0, 1, 2],
+    }
+    assert set(found.estimates["estimator"]) == {"b", "c"}
+    assert lines_of(found.estimates, "b")[1] == (1, 2, 0.5, 0, 0.5)
+    assert over_samples.states({}) is None

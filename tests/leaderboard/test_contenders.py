@@ -1,0 +1,56 @@
+"""Rows as runs and contenders, against cases worked out by hand."""
+
+import numpy as np
+from made_rows import rows_of
+
+from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.contenders import among, contenders, label
+from pinnobs_gym.leaderboard.runs import runs_of
+
+X = GameName("pinnobs/X-v0", "benchmark", "nominal")
+
+
+def test_runs_are_in_the_order_of_their_first_rows():
+    a, b = rows_of("a", [0.1, 0.2]), rows_of("b", [0.3], condition="delay")
+    runs = runs_of([a[0], *b, a[1]])
+    assert [(run.estimator, run.position, len(run.rows)) for run in runs] == [
+        ("a", 0, 2),
+        ("b", 1, 1),
+    ]
+    assert [run.game for run in runs] == [X, X._replace(condition="delay")]
+    assert runs[0].standing.nrmse.value == np.median([0.1, 0.2])
+    assert runs[0].standing is runs[0].standing
+
+
+def test_labels_leave_out_what_is_usual():
+    assert label(X) == "X-v0"
+    assert label(X._replace(condition="delay")) == "X-v0 (delay)"
+    assert label(X._replace(condition="delay", setup="paper")) == "X-v0 (delay), paper"
+
+
+def test_ratios_are_of_the_episodes_that_the_peer_and_all_trainings_played():
+    made = {"training": {"seconds": 1.0}}
+    rows = [
+        *rows_of("ekf", [1.0, 1.0, 2.0]),
+        *rows_of("gain", [0.5, 4.0], training_seed=0, config_hash="g0", **made),
+        *rows_of("gain", [0.25, 1.0, 1.0], training_seed=1, config_hash="g1", **made),
+        *rows_of("gain", [9.0], condition="delay", training_seed=0, config_hash="g0", **made),
+    ]
+    gain, ekf = contenders(runs_of(rows))
+    assert (gain.name, ekf.name) == ("gain", "ekf")  # the most rows first
+    assert list(gain.games) == [X._replace(condition="delay"), X][::-1]
+    assert list(gain.ratios) == [X]  # the peer did not play the other
+    np.testing.assert_allclose(gain.ratios[X], np.log([[0.5, 4.0], [0.25, 1.0]]))
+    assert gain.standing(X).episodes == 5
+    assert ekf.ratios[X].tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_among_wanted_games_the_order_is_of_their_rows_alone():
+    rows = [*rows_of("a", [0.1] * 3), *rows_of("b", [0.1] * 2), *rows_of("c", [0.1] * 2)]
+    rows += [*rows_of("c", [0.1] * 2, condition="delay"), *rows_of("b", [0.1], condition="delay")]
+    found = contenders(runs_of(rows))
+    assert [each.name for each in found] == ["c", "a", "b"]
+    delayed = among(found, lambda run: run.game.condition == "delay")
+    assert [each.name for each in delayed] == ["c", "b"]
+    nominal = among(found, lambda run: run.game.condition == "nominal")
+    assert [each.name for each in nominal] == ["a", "b", "c"]
