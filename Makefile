@@ -3,6 +3,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 export OMP_NUM_THREADS ?= 1
 
+# The version of a Python that is too old; empty for one that is not.
+TOO_OLD = $(shell $(PYTHON) -c 'import sys; v = sys.version_info[:2]; \
+	sys.stdout.write("" if v >= (3, 11) else "Python %d.%d" % v)' 2>&1)
+
 .PHONY: leaderboard test lint benchmark docs clean
 
 leaderboard: $(VENV)/installed
@@ -16,6 +20,7 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+	$(BIN)/lint-imports
 
 benchmark: $(VENV)/installed-dev
 	$(BIN)/python scripts/benchmark.py
@@ -25,6 +30,8 @@ docs: $(VENV)/installed-docs
 	@echo "open docs/_build/html/index.html"
 
 $(VENV)/bin/python:
+	$(if $(TOO_OLD),$(error Python 3.11 or newer is needed; "$(PYTHON)" is $(TOO_OLD): \
+		try make PYTHON=python3.12))
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/installed: pyproject.toml | $(VENV)/bin/python
@@ -41,4 +48,4 @@ $(VENV)/installed-docs: pyproject.toml | $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) build docs/_build docs/reference *.egg-info
+	rm -rf $(VENV) build dist docs/_build docs/jupyter_execute docs/reference *.egg-info

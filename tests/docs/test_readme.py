@@ -24,6 +24,14 @@ def test_there_is_a_snippet_of_each_kind():
         assert any(words in snippet for snippet in PYTHON), words
 
 
+def test_an_env_is_made_by_the_prefix_alone_and_not_without_it(tmp_path):
+    (call,) = re.findall(r'gym\.make\("pinnobs_gym:[^`]*', README)
+    run_python(f"import gymnasium as gym\n{call}.reset(seed=0)", tmp_path)
+    plain = call.replace("pinnobs_gym:", "")
+    refused = f"try:\n    {plain}\nexcept gym.error.NamespaceNotFound:\n    print('not found')"
+    assert run_python(f"import gymnasium as gym\n{refused}", tmp_path).strip() == "not found"
+
+
 def test_the_custom_estimator_takes_fifteen_lines():
     (snippet,) = (s for s in PYTHON if "class Luenberger" in s)
     body = snippet.partition("@dataclass")[2].partition("\n\n\n")[0]
