@@ -35,7 +35,7 @@ def loaded(code: str, *modules: str) -> set[str]:
     done = subprocess.run(
         [sys.executable, "-c", ask], capture_output=True, text=True, timeout=120, check=True
     )
-    return set(done.stdout.split())
+    return set(done.stdout.splitlines()[-1].split())
 
 
 HEAVY = ("torch", "matplotlib", "stable_baselines3", "scipy.stats", "scipy.optimize")
@@ -61,6 +61,20 @@ def test_an_estimator_is_resolved_alone(name: str) -> None:
 @pytest.mark.parametrize("name", ["standings_table", "ranks_table", "board"])
 def test_tables_load_no_statistics_before_they_are_computed(name: str) -> None:
     assert not loaded(f"import pinnobs_gym.leaderboard.{name}", *HEAVY)
+
+
+def test_evaluating_a_filter_loads_neither_torch_nor_statistics(tmp_path) -> None:
+    arguments = [
+        "evaluate",
+        "--system",
+        "ReverseDuffing",
+        "--episodes",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
+    code = f"from pinnobs_gym.cli import main; assert main({arguments!r}) == 0"
+    assert not loaded(code, "torch", "scipy.stats", "scipy.integrate", "stable_baselines3")
 
 
 def test_finding_all_estimators_loads_no_agents_library() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import pkgutil
 import sys
 from collections.abc import Sequence
-
-from threadpoolctl import threadpool_limits
+from importlib import resources
 
 from pinnobs_gym.cli import commands
 
@@ -20,8 +20,9 @@ def usage() -> str:
     """One line for each command, from the first line of its module."""
     lines = ["usage: pinnobs COMMAND ...", ""]
     for name in COMMANDS:
-        module = importlib.import_module(f"{commands.__name__}.{name}")
-        call, _, what = (module.__doc__ or name).partition("\n")[0].partition(": ")
+        source = resources.files(commands).joinpath(f"{name}.py").read_text(encoding="utf-8")
+        told = ast.get_docstring(ast.parse(source)) or name  # importing it takes long
+        call, _, what = told.partition("\n")[0].partition(": ")
         lines.append(f"  {call.strip('`'):21} {what.rstrip('.')}")
     return "\n".join(
         [
@@ -72,5 +73,7 @@ def _one_thread() -> None:
     """Run numerical libraries on one thread unless OMP_NUM_THREADS says otherwise: the arrays are
     so small that several threads mostly wait for each other."""
     if "OMP_NUM_THREADS" not in os.environ:
+        from threadpoolctl import threadpool_limits
+
         os.environ["OMP_NUM_THREADS"] = "1"  # for what is loaded later, torch and workers among it
         threadpool_limits(1)

@@ -9,8 +9,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
-from scipy.signal import place_poles
 
 from pinnobs_gym.simulation.model import model_step, model_step_jacobian
 from pinnobs_gym.simulation.system import System, vector
@@ -72,10 +70,14 @@ def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = N
     if poles is not None:
         if len(poles) != system.nx:
             raise ValueError(f"poles={tuple(poles)}; {type(system).__name__} has nx={system.nx}")
+        from scipy.signal import place_poles  # takes long to import
+
         placed: Any = place_poles(A.T, H.T, poles)
         return scale[:, None] * placed.gain_matrix.T
     identity = np.eye(system.nx)
     noise = (0.1 * rate) ** 2 * identity
+    from scipy.linalg import solve_continuous_are
+
     P = solve_continuous_are((A + rate * identity).T, H.T, noise, np.eye(system.ny))
     return scale[:, None] * (P @ H.T)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
@@ -83,8 +82,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         prior = checked(prior)
         P0 = prior.cov
         wide = P0 + np.diag(vector(self.system.scale, self.system.nx, "scale") ** 2)
-        degrees = np.maximum(np.arange(self.system.ny + 1), 1)
-        bounds = chi2.ppf(1.0 if self.gate is None else self.gate, degrees)
+        bounds = self._gate_bounds()
         beyond = np.zeros(len(P0), dtype=int)
         memory = Memory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
         return State(prior.mean, P=P0, memory=memory)
@@ -101,6 +99,15 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         xhat, P, S = joseph_update(xhat, P, innovation, H, R)
         covariance, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, covariance, innovation, S, memory)
+
+    def _gate_bounds(self) -> np.ndarray:
+        """The gate's bounds on the NIS of 0, 1, ... ny outputs, quantiles of χ²."""
+        if self.gate is None:
+            return np.full(self.system.ny + 1, np.inf)
+        from scipy.special import gammaincinv
+
+        degrees = np.maximum(np.arange(self.system.ny + 1), 1)
+        return 2 * gammaincinv(degrees / 2, self.gate)
 
     def _gated(
         self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, memory: Memory

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from math import sqrt
+from statistics import NormalDist
 
 import numpy as np
 
@@ -46,18 +48,21 @@ def median(values: np.ndarray) -> Interval:
 @lru_cache(maxsize=1024)
 def _lowest_rank(count: int) -> int:
     """The index, from either end of so many ordered values, of the bounds of their median."""
-    from scipy.stats import binom  # takes long to import
+    from scipy.special import bdtr  # scipy.stats takes long to import
 
-    return max(int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5)) - 1, 0)
+    cumulative = bdtr(np.arange(count + 1), count, 0.5)
+    return max(int(np.searchsorted(cumulative, (1 - CONFIDENCE) / 2)) - 1, 0)
 
 
 @lru_cache(maxsize=65536)
 def rate(hits: int, count: int) -> Interval:
-    """A proportion with Wilson's interval."""
-    from scipy.stats import binomtest
-
-    interval = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
-    return Interval(hits / count, float(interval.low), float(interval.high))
+    """A proportion with Wilson's interval (Wilson, "Probable inference, the law of succession, and
+    statistical inference", 1927)."""
+    part, z2 = hits / count, NormalDist().inv_cdf((1 + CONFIDENCE) / 2) ** 2
+    middle = (hits + z2 / 2) / (count + z2)
+    half = sqrt(z2) / (count + z2) * sqrt(hits * (1 - part) + z2 / 4)
+    low = 0.0 if hits == 0 else middle - half
+    return Interval(part, low, 1.0 if hits == count else middle + half)
 
 
 def log_ratio(score: np.ndarray, peer: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimates
@@ -9,6 +11,8 @@ from pinnobs_gym.simulation.matrices import squared_size
 
 COVERAGE = 0.9
 """Probability of the intervals whose coverage is counted."""
+_QUANTILE = NormalDist().inv_cdf((1 + COVERAGE) / 2)
+"""How many standard deviations they reach to each side."""
 
 
 def consistency(
@@ -40,8 +44,6 @@ def consistency(
         - ``innovation_correlation``: of the innovations over √S_ii with the next sample's; 0 if
           they are white. Not a number if there are no two to compare.
     """
-    from scipy.stats import norm  # takes long to import
-
     scores: dict[str, np.ndarray | None]
     scores = dict.fromkeys(("anees", "coverage", "nis", "innovation_correlation"))
     with np.errstate(all="ignore"):  # what is not finite is infinite in the scores
@@ -49,7 +51,7 @@ def consistency(
             error, variance = estimates.xhat - x, np.einsum("bkii->bki", estimates.P)
             size = _squared_sizes(error, estimates.P)
             scores["anees"] = size.mean(axis=1) / x.shape[-1]
-            inside = abs(error) <= norm.ppf((1 + COVERAGE) / 2) * np.sqrt(variance)
+            inside = abs(error) <= _QUANTILE * np.sqrt(variance)
             scores["coverage"] = inside.mean(axis=(1, 2))
         if estimates.innovation is not None and estimates.S is not None:
             innovation = np.where(missing, 0.0, estimates.innovation)
@@ -66,10 +68,10 @@ def band(episodes: int, degrees: int, confidence: float = 0.95) -> tuple[float, 
     probability, if errors are Gaussian and covariances right: χ²/(episodes·degrees) of as many
     degrees of freedom. That of one sample is this wide; samples of one episode are taken as wholly
     dependent, because of plants without process noise they nearly are."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     count = episodes * degrees
-    low, high = chi2.ppf([(1 - confidence) / 2, (1 + confidence) / 2], count) / count
+    low, high = 2 * gammaincinv(count / 2, [(1 - confidence) / 2, (1 + confidence) / 2]) / count
     return float(low), float(high)
 
 

@@ -8,8 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from scipy.integrate import DOP853, solve_ivp
 
+from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.system import System, vector
 
 TOLERANCE = 3e-11
@@ -98,7 +98,7 @@ def disturbed_truth(
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
     longest = max_step or float(times[-1] - times[0]) / 100
-    stages = np.empty((1 + len(DOP853.B), *x0.shape))
+    stages = np.empty((1 + len(dop853.B), *x0.shape))
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
             start, end = float(times[k]), float(times[k + 1])
@@ -121,7 +121,7 @@ def _take_step(system: System, start: float, step: float, last: float, stages: n
     ``last``; ``stages`` holds the state (batch, nx), and then room for the slopes of the stages.
     The state in it becomes the next one; the first slope stays that of the state before."""
     flat = stages.reshape(len(stages), -1)
-    t = np.minimum(start + step * DOP853.C, last)
+    t = np.minimum(start + step * dop853.C, last)
     u = system.input(t)
     weights = _tableau(step)
     for i, row in enumerate(weights[:-1]):
@@ -185,7 +185,7 @@ def _fixed_step(
     last = np.nextafter(end, start)  # f may jump at the end; it is wanted from the left
     batch, nx = x0.shape
     path = np.empty((len(mesh.nodes), 2, batch, nx))  # the states and their slopes at the nodes
-    stages = np.empty((1 + len(DOP853.B), batch, nx))  # the state, then the slopes of the stages
+    stages = np.empty((1 + len(dop853.B), batch, nx))  # the state, then the slopes of the stages
     stages[0] = x0
     for k, step in enumerate(mesh.steps):
         path[k, 0] = stages[0]
@@ -219,8 +219,8 @@ def _local_error(
 @lru_cache(maxsize=64)
 def _tableau(step: float) -> list[np.ndarray]:
     """Weights of (state, slopes of the stages so far) in each stage, and last in the next state."""
-    rows = [np.append(1.0, step * row[:i]) for i, row in enumerate(DOP853.A[:12])]
-    return [*rows, np.append(1.0, step * DOP853.B)]
+    rows = [np.append(1.0, step * row[:i]) for i, row in enumerate(dop853.A)]
+    return [*rows, np.append(1.0, step * dop853.B)]
 
 
 @dataclass(frozen=True)
@@ -292,6 +292,8 @@ def _adaptive(
 ) -> np.ndarray:
     """One episode by an adaptive method that also takes stiff and kinked plants; not a number if
     the state runs away, before whose singularity such a method would stand still for ever."""
+    from scipy.integrate import solve_ivp  # takes longer to import than an episode takes
+
     last = np.nextafter(end, start)
     scale = vector(system.scale, system.nx, "scale")
 

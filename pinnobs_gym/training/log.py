@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from torch.utils.tensorboard import SummaryWriter
+    from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 
 class Log:
@@ -28,7 +30,7 @@ class Log:
 
     def __init__(self, folder: str | Path | None) -> None:
         self._folder = None if folder is None else Path(folder)
-        self._opened: SummaryWriter | None = None
+        self._opened: EventFileWriter | None = None
         if self._folder is None:
             return
         try:  # the writer's own thread would only fail much later
@@ -50,31 +52,27 @@ class Log:
 
     def scalar(self, tag: str, value: float, step: int) -> None:
         """Add the value of the curve ``tag`` at a step."""
-        if writer := self._writer():
-            writer.add_scalar(tag, value, step)
+        if self.active:
+            self._add(_summary().Value(tag=tag, simple_value=value), step)
 
     def figure(self, tag: str, figure: Figure, step: int) -> None:
         """Add a Matplotlib figure as an image."""
-        if writer := self._writer():
-            writer.add_figure(tag, figure, step)
+        if self.active:
+            self._add(_summary().Value(tag=tag, image=_image(figure)), step)
 
     def hparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """Add the run's settings and what came of them to the HPARAMS table."""
-        if writer := self._writer():
-            from torch.utils.tensorboard.summary import hparams
+        if not self.active:
+            return
+        from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 
-            # The table takes no None and no sequences.
-            shown = {
-                k: v if isinstance(v, bool | int | float) else str(v) for k, v in params.items()
-            }
-            # The writer's own add_hparams would also say which columns the table has, and
-            # TensorBoard would give the table of all runs the columns of the first.
-            _, start, end = hparams(shown, dict(metrics))
-            assert writer.file_writer is not None  # it is there until the writer is closed
-            for summary in (start, end):
-                writer.file_writer.add_summary(summary)
-            for tag, value in metrics.items():
-                writer.add_scalar(tag, value, 0)
+        # The table takes no None and no sequences. What columns it has is not said: TensorBoard
+        # would give the table of all runs the columns of the first.
+        shown = {k: v if isinstance(v, bool | int | float) else str(v) for k, v in params.items()}
+        for value in hparams_pb(shown, trial_id=str(self._folder)).value:
+            self._add(value, 0)
+        for tag, value in metrics.items():
+            self.scalar(tag, value, 0)
 
     def close(self) -> None:
         """Write everything out and close the files; a closed log that is used again reopens."""
@@ -93,12 +91,33 @@ class Log:
     ) -> None:
         self.close()
 
-    def _writer(self) -> SummaryWriter | None:
-        if self._opened is None and self._folder is not None:
-            from torch.utils.tensorboard import SummaryWriter
+    def _add(self, value: Any, step: int) -> None:
+        """Write one value of a step."""
+        from tensorboard.compat.proto import event_pb2
+        from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-            self._opened = SummaryWriter(str(self._folder))
-        return self._opened
+        if self._opened is None:
+            self._opened = EventFileWriter(str(self._folder))
+        summary = _summary()(value=[value])
+        events: Any = event_pb2
+        self._opened.add_event(events.Event(wall_time=time.time(), step=step, summary=summary))
+
+
+def _summary() -> Any:
+    """The class of TensorBoard's summaries, which is generated and so has no types."""
+    from tensorboard.compat.proto import summary_pb2
+
+    generated: Any = summary_pb2
+    return generated.Summary
+
+
+def _image(figure: Figure) -> Any:
+    """A figure as a PNG."""
+    with io.BytesIO() as file:
+        figure.savefig(file, format="png")
+        data = file.getvalue()
+    width, height = figure.canvas.get_width_height()
+    return _summary().Image(height=height, width=width, colorspace=4, encoded_image_string=data)
 
 
 SILENT = Log(None)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, binomtest
 
 from pinnobs_gym.leaderboard import intervals
 
@@ -32,6 +32,19 @@ def test_wilsons_interval():
     interval = intervals.rate(15, 148)
     assert interval.low == pytest.approx(0.0624, abs=5e-5)
     assert interval.high == pytest.approx(0.1605, abs=5e-5)
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 1), (0, 7), (7, 7), (3, 20), (999, 1000)])
+def test_wilsons_interval_is_scipys(hits, count):
+    peer = binomtest(hits, count).proportion_ci(0.95, method="wilson")
+    own = intervals.rate(hits, count)
+    assert (own.low, own.high) == pytest.approx((peer.low, peer.high), abs=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 6, 9, 20, 100, 1001, 20_000])
+def test_the_ranks_of_the_median_are_scipys(count):
+    rank = max(int(binom.ppf(0.025, count, 0.5)), 1)
+    assert intervals.median(np.arange(1.0, count + 1)).low == rank
 
 
 def test_the_interquartile_mean_by_hand():

@@ -10,10 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from array_api_compat import array_namespace
-from scipy.integrate import solve_ivp
+from scipy.integrate import DOP853, solve_ivp
 from scipy.linalg import expm
 
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.model import model_step, model_step_jacobian
 from pinnobs_gym.simulation.system import Setup, System, matrix, stack
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
@@ -25,6 +26,12 @@ from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
 LONGEST = {("InductionMotor", "paper"): 2.0}
 """Durations in s up to which the truth is compared, where the whole would take long."""
+
+
+def test_the_coefficients_are_scipys():
+    np.testing.assert_array_equal(dop853.A, DOP853.A[:12, :12])
+    np.testing.assert_array_equal(dop853.B, DOP853.B)
+    np.testing.assert_array_equal(dop853.C, DOP853.C[:12])
 
 
 def initial_states(system: System, setup: Setup, count: int, seed: int = 5) -> np.ndarray:

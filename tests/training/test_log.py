@@ -53,7 +53,9 @@ def test_a_closed_log_goes_on_when_written_again(tmp_path):
 
 def test_without_a_folder_nothing_happens(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # importing it would raise
+    monkeypatch.setitem(
+        sys.modules, "tensorboard.summary.writer.event_file_writer", None
+    )  # importing it would raise
     with Log(None) as log:
         log.scalar("a", 1.0, 0)
         log.figure("b", Figure(), 0)
@@ -64,7 +66,7 @@ def test_without_a_folder_nothing_happens(monkeypatch, tmp_path):
 
 
 def test_tensorboard_is_imported_on_the_first_write(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.event_file_writer", None)
     log = Log(tmp_path)
     with pytest.raises(ImportError):
         log.scalar("a", 1.0, 0)
