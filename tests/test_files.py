@@ -34,9 +34,8 @@ def test_replacing_leaves_the_old_file_after_an_error(tmp_path):
         temporary.write_text("old")
         assert not path.exists()
     assert path.read_text() == "old"
-    with pytest.raises(KeyError), replacing(path) as temporary:
-        temporary.write_text("new")
-        raise KeyError
+    with pytest.raises(FileNotFoundError), replacing(path) as temporary:
+        temporary.write_bytes(path.with_name("none").read_bytes())
     assert path.read_text() == "old"
     assert os.listdir(path.parent) == ["file"]
 
@@ -44,7 +43,7 @@ def test_replacing_leaves_the_old_file_after_an_error(tmp_path):
 def test_where_nothing_can_be_put_replacing_says_so_in_one_line(tmp_path):
     (tmp_path / "folder").mkdir()
     with (
-        pytest.raises(ValueError, match="cannot write .*folder"),
+        pytest.raises(ValueError, match=r"cannot write .*folder"),
         replacing(tmp_path / "folder") as temporary,
     ):
         temporary.write_text("a file cannot take a folder's place")

@@ -125,7 +125,7 @@ def test_a_class_of_a_function_is_refused_in_one_line_by_a_new_process(folder):
 
 def test_a_class_of_a_notebook_is_refused_in_one_line():
     systems = Registry("system", "pinnobs_gym.simulation.system:System", "pinnobs_gym.systems")
-    with pytest.raises(ValueError, match="system '__main__:Cell' in a new process, .*notebook"):
+    with pytest.raises(ValueError, match=r"system '__main__:Cell' in a new process, .*notebook"):
         systems.resolve("__main__:Cell")
     with pytest.raises(ValueError, match="cannot load system 'osc:Osc': ModuleNotFoundError"):
         systems.resolve("osc:Osc")

@@ -1,9 +1,9 @@
 """Jobs in worker processes of this machine, which loky starts.
 
 loky's executor is that of `concurrent.futures` with what is needed here besides: its workers are
-started afresh instead of forked, whatever the operating system; it can be shut down at once, jobs
-that run included; and it is broken, instead of waiting for ever, if a worker dies, in whichever
-state.
+started afresh instead of forked, on every operating system; it can be shut down at once, jobs
+that run included; and if a worker dies, whatever it was doing, the executor is broken instead of
+waiting for ever.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import signal
 from concurrent.futures import Future
 from types import TracebackType
 
-from loky import BrokenProcessPool, get_reusable_executor
+from loky import BrokenProcessPool, ProcessPoolExecutor, get_reusable_executor
 
 from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkerLost
 from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome, attempt, interrupts
@@ -74,9 +74,9 @@ class ProcessPool(Pool):
         if kind is not None:
             self._executor.shutdown(kill_workers=True)
 
-    def _usable(self):
-        """The executor, or a new one in its place if it is broken. Ctrl-C is for the client alone:
-        workers that loky starts later ignore it, too."""
+    def _usable(self) -> ProcessPoolExecutor:
+        """The executor, or a new one in its place if it is broken. Workers ignore Ctrl-C, also
+        those that loky starts later: it is for the client, which then stops them."""
         return get_reusable_executor(
             self.size,
             timeout=IDLE,
