@@ -142,7 +142,10 @@ def test_the_commands_run_without_fcntl(tmp_path):
     program = WITHOUT_FCNTL + "from pinnobs_gym import cli\n"
     program += f"for command in {commands!r}:\n    assert cli.main(command) == 0, command\n"
     command = [sys.executable, "-W", "ignore", "-c", program]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252"}  # as Windows writes into a file
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, errors="replace"
+    )
     assert done.returncode == 0, done.stderr
     assert "ReverseDuffing" in done.stdout
     assert len((tmp_path / "evaluated" / "rows.jsonl").read_text().splitlines()) == 2

@@ -7,6 +7,7 @@ import os
 import pkgutil
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 
 from threadpoolctl import threadpool_limits
 
@@ -41,6 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0 if arguments else 2
     _one_thread()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # into a file Windows writes few characters
+            stream.reconfigure(errors="replace")
     sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
     name, rest = arguments[0], list(arguments[1:])
     try:
