@@ -142,6 +142,12 @@ class Registry(Generic[T]):
             for cls in self._known.values():  # of a function or a notebook's cell
                 if (cls.__module__, cls.__qualname__) == (module, name):
                     return cls
+            if isinstance(error, AttributeError) and ("<locals>" in name or module == "__main__"):
+                raise ValueError(
+                    f"cannot load {self._kind} {spec!r} in a new process, which does not know what "
+                    "a function, a notebook or the main guard has defined; expected a class at "
+                    "the top level of a module"
+                ) from None
             kind = type(error).__name__
             raise ValueError(f"cannot load {self._kind} {spec!r}: {kind}: {error}") from error
 

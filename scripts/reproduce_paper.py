@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import joblib
 import tyro
+from loky import ProcessPoolExecutor, as_completed
 from reproduction import comparison, report
 from reproduction.comparison import METHODS, Comparison
 from reproduction.running import Job, run
@@ -114,9 +114,12 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Row | s
         for job in jobs:
             yield _attempt(job, progress=len(jobs) == 1)
         return
-    with joblib.parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
-        parallel: Any = joblib.Parallel(return_as="generator_unordered")
-        yield from parallel(joblib.delayed(_attempt)(job) for job in jobs)
+    pool = ProcessPoolExecutor(processes)  # which inherit the environment set above
+    try:
+        for ended in as_completed([pool.submit(_attempt, job) for job in jobs]):
+            yield ended.result()
+    finally:  # after Ctrl-C jobs still run
+        pool.shutdown(kill_workers=True)
 
 
 def _attempt(job: Job, progress: bool = False) -> tuple[Job, Row | str]:

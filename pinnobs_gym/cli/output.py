@@ -26,7 +26,7 @@ def write_estimates(path: Path, system: System, record: Record, estimates: Estim
         header += [f"{name}_std" for name in system.state_names]
         variance = np.diagonal(estimates.P[0], axis1=1, axis2=2)
         columns.append(np.sqrt(np.maximum(variance, 0)))
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows(np.concatenate(columns, axis=1).tolist())

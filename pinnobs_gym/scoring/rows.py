@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from io import FileIO
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -102,41 +103,38 @@ def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
         CannotWrite: in one line, if the file cannot be written; what it held is untouched.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with locked(path) as descriptor:
-            there = _keys(descriptor) if new else set()
-            rows = [row for row in rows if row["kind"] != "score" or key(row) not in there]
-            _write(descriptor, b"".join(_line(row) for row in rows))
+        with locked(path) as file:
+            present = _keys(file) if new else set()
+            rows = [row for row in rows if row["kind"] != "score" or key(row) not in present]
+            _write(file, b"".join(_line(row) for row in rows))
     except OSError as error:
         raise CannotWrite(f"cannot write rows to {path}: {error}") from None
 
 
-def _keys(descriptor: int) -> set[tuple[Any, ...]]:
+def _keys(file: FileIO) -> set[tuple[Any, ...]]:
     """What names the scored episodes of an open file."""
-    with open(descriptor, "rb", closefd=False) as file:  # closing a file gives up its lock
-        file.seek(0)
-        rows = [_parsed(line) for line in file]
+    file.seek(0)
+    rows = [_parsed(line) for line in file.readall().splitlines()]
     return {key(row) for row in rows if row is not None and row.get("kind") == "score"}
 
 
-def _write(descriptor: int, data: bytes) -> None:
-    """Write at the end of a locked file, all or nothing."""
-    size = os.fstat(descriptor).st_size
-    begin, tail = _last_line(descriptor, size)
+def _write(file: FileIO, data: bytes) -> None:
+    """Append to a locked file, all or nothing, in place of a half line at its end."""
+    begin, tail = _last_line(file)
     if _is_cut(tail):
-        os.ftruncate(descriptor, begin)
-        size = begin
+        file.truncate(begin)
     elif tail:  # only the line's end is missing, or the line is not ours to delete
         data = b"\n" + data
-    write_whole(descriptor, data, size)
+    write_whole(file, data)
 
 
-def _last_line(descriptor: int, size: int) -> tuple[int, bytes]:
+def _last_line(file: FileIO) -> tuple[int, bytes]:
     """Where the last line begins and what it holds, if it does not end; else the file's end."""
-    begin, tail = size, b""
+    begin, tail = file.seek(0, os.SEEK_END), b""
     while begin > 0:
         step = min(begin, 1 << 16 if tail else 1)  # most files end as they should
-        block = os.pread(descriptor, step, begin - step)
+        file.seek(begin - step)
+        block = file.read(step)
         _, newline, rest = block.rpartition(b"\n")
         tail = rest + tail
         if newline:

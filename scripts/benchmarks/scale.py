@@ -20,7 +20,7 @@ from benchmarks import Figure, at_least, at_most
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.board import board, markdown
 from pinnobs_gym.leaderboard.jobs import plan
-from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
+from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
@@ -34,9 +34,9 @@ EPISODES = 120
 
 def figures(repeats: int) -> Iterator[Figure]:
     """The engine and the tables."""
-    yield from overhead("loky", Where(2), 5.0)
+    yield from overhead("loky", Workers(2), 5.0)
     with cluster() as address:
-        yield from overhead("Dask", Where(scheduler=address), 20.0)
+        yield from overhead("Dask", Workers(scheduler=address), 20.0)
     yield two_over_one(min(repeats, 3))
     yield from many_rows()
 
@@ -112,13 +112,13 @@ class Trivial:
         raise AssertionError(error)
 
 
-def overhead(name: str, where: Where, bound: float) -> Iterator[Figure]:
+def overhead(name: str, workers: Workers, bound: float) -> Iterator[Figure]:
     """Wall time a job of `JOBS` that each append a row, once all workers have done one, and with
     the start of the workers."""
     with tempfile.TemporaryDirectory() as folder:
         jobs = [Trivial(Path(folder), row) for row in synthetic_rows(JOBS)]
         begun = time.perf_counter()
-        times = [time.perf_counter() for _ in Engine(where).run(jobs)]
+        times = [time.perf_counter() for _ in Engine(workers).run(jobs)]
         assert len(rows.read(Path(folder) / "rows.jsonl")) == JOBS
     first = 50  # by then both workers have loaded what they need
     steady = 1000 * (times[-1] - times[first]) / (JOBS - 1 - first)
@@ -163,7 +163,7 @@ def two_over_one(repeats: int) -> Figure:
         with tempfile.TemporaryDirectory() as folder:
             jobs = plan.jobs_of(suite, Path(folder))
             begun = time.perf_counter()
-            for job, error in Engine(Where(processes)).run(jobs):
+            for job, error in Engine(Workers(processes)).run(jobs):
                 assert error is None, (job, error)
             return time.perf_counter() - begun
 

@@ -13,7 +13,7 @@ from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.leaderboard import ranks_table, standings_table, suites
 from pinnobs_gym.leaderboard.board import board, markdown
 from pinnobs_gym.leaderboard.jobs import plan
-from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
+from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.scoring import rows, tensorboard
 
 PROCESSES = 2
@@ -59,7 +59,7 @@ class Leaderboard:
 
     def run(self) -> int:
         """Run what is missing, then print and write the tables."""
-        where = self._where()
+        workers = self._workers()
         played = suites.load(self.suite).changed(
             systems=self.systems,
             estimators=self.estimators,
@@ -78,7 +78,7 @@ class Leaderboard:
             console.print(stored.warning, style="yellow", soft_wrap=True)
         jobs = plan.jobs_of(played, self.out.absolute())
         to_run, left_out = plan.left(jobs, stored, self.retry_failed)
-        engine = Engine(where)
+        engine = Engine(workers)
         with RunView(len(to_run), lambda: [job.name for job in engine.running]) as view:
             for job, error in engine.run(to_run):
                 view.ended(job.name, error)
@@ -94,19 +94,19 @@ class Leaderboard:
             )
         return 1 if view.failed or left_out else 0
 
-    def _where(self) -> Where:
+    def _workers(self) -> Workers:
         if self.backend == "dask":
             if self.scheduler is None:
                 raise ValueError("backend 'dask' without a scheduler; expected --scheduler ADDRESS")
             if self.jobs is not None:
                 told = "the scheduler's workers say how many run at a time"
                 raise ValueError(f"jobs={self.jobs} with backend 'dask': {told}")
-            return Where(scheduler=self.scheduler)
+            return Workers(scheduler=self.scheduler)
         if self.scheduler is not None:
             raise ValueError(f"scheduler={self.scheduler!r} goes with --backend dask")
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"jobs={self.jobs}; expected at least 1")
-        return Where(self.jobs or PROCESSES)
+        return Workers(self.jobs or PROCESSES)
 
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
         """Print and write what came of it."""

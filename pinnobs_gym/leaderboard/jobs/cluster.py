@@ -1,21 +1,21 @@
-"""Jobs on the workers of a Dask scheduler, as a backend of joblib.
+"""Jobs on the workers of a Dask scheduler.
 
-joblib has one of its own, which waits for ever for a job that keeps killing its worker, and for all
-of them once the scheduler is gone.
+Dask's own futures are waited for, not those of ``Client.get_executor``, which hand a result over
+without a limit of time and are never done if the scheduler goes at that moment.
 """
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from joblib.parallel import ParallelBackendBase
-
-from pinnobs_gym.leaderboard.jobs.worker import Lost, Outcome
+from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkersLost
+from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome, attempt
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -27,8 +27,8 @@ WORKERS = 60.0
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Client]:
-    """A connection to a scheduler.
+def connected(address: str) -> Iterator[DaskPool]:
+    """The workers of a scheduler, for as long as there is a connection to it.
 
     Raises:
         ValueError: in one line, if Dask is not installed, or there is no scheduler or no worker.
@@ -42,14 +42,14 @@ def connected(address: str) -> Iterator[Client]:
     if not re.fullmatch(r"\w+://.+:\d+", address):
         raise ValueError(f"scheduler={address!r}; expected an address such as tcp://host:8786")
     for name in logging.root.manager.loggerDict:
-        if name.partition(".")[0] == "distributed":  # they would tell of every retry
+        if name.partition(".")[0] == "distributed":  # they would report every retry
             logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CONNECT, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
-        told = " ".join(str(error).split())
+        message = " ".join(str(error).split())
         raise ValueError(
-            f"no Dask scheduler at {address!r} ({told}); expected the address of one that runs, "
+            f"no Dask scheduler at {address!r} ({message}); expected the address of one that runs, "
             "such as tcp://host:8786"
         ) from None
     try:
@@ -60,61 +60,61 @@ def connected(address: str) -> Iterator[Client]:
                 f"the Dask scheduler at {address} has no worker after {WORKERS:g} s; expected at "
                 f"least one: dask worker {address} --nthreads 1"
             ) from None
-        yield client
+        with DaskPool(client) as pool:
+            yield pool
     finally:
-        with suppress(Exception):  # it may be gone, which is told elsewhere
+        with suppress(Exception):  # it may be gone, which is reported elsewhere
             client.close(timeout=2)
 
 
-class DaskBackend(ParallelBackendBase):
-    """Hands joblib's calls to Dask, one at a time."""
+class DaskPool(Pool):
+    """The workers of a Dask scheduler.
 
-    supports_retrieve_callback = True
+    Args:
+        client: the connection to the scheduler.
+    """
+
+    queued = None  # all are queued at the scheduler: workers may come and go
+    children = False
 
     def __init__(self, client: Client) -> None:
-        super().__init__(nesting_level=0)
         self._client = client
-        self._calls: dict[Future, Any] = {}
+        self._futures: set[Future] = set()
+        workers: Any = client.nthreads()
+        self.size = len(workers)  # a worker's threads take turns
 
-    def effective_n_jobs(self, n_jobs: int) -> int:  # pyright: ignore
-        # A worker's threads take turns. With one only joblib would call in this very process.
-        workers: Any = self._client.nthreads()
-        return max(2, len(workers))
-
-    def submit(self, func: Any, callback: Callable[[Future], object] | None = None) -> Future:
+    def submit(self, number: int, job: Job, origin: Origin) -> Future:
         try:
-            future = self._client.submit(_call, func, pure=False)
+            future = self._client.submit(attempt, number, job, origin, pure=False)
         except Exception as error:
-            raise self._lost(error) from None
-        self._calls[future] = func
-        if callback is not None:
-            future.add_done_callback(callback)
+            raise _gone(error) from None
+        self._futures.add(future)
         return future
 
-    def retrieve_result_callback(self, out: Future) -> Any:
+    def outcome(self, future: Future) -> Outcome:
         from distributed import KilledWorker
 
-        call = self._calls.pop(out)
+        self._futures.discard(future)
         try:
-            return out.result(timeout=CONNECT)
+            return future.result(timeout=CONNECT)
         except KilledWorker:
-            ((_, (number, *_), _),) = call.items
-            return [Outcome(number, "Dask gave it up", died=True)]
+            return Outcome("Dask gave it up", died=True)
         except (CancelledError, OSError, TimeoutError) as error:
-            raise self._lost(error) from None
+            raise _gone(error) from None
 
-    def abort_everything(self, ensure_ready: bool = True) -> None:
-        with suppress(Exception):  # the scheduler may be gone
-            self._client.cancel(list(self._calls), asynchronous=False)
-        self._calls.clear()
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None and kind is not WorkersLost:
+            with suppress(Exception):  # the scheduler may be gone
+                self._client.cancel(list(self._futures), asynchronous=False)
 
-    def _lost(self, error: BaseException) -> Lost:
-        return Lost(
-            f"the Dask scheduler is gone ({type(error).__name__}); what was finished is kept, and "
-            "the same command does the rest"
-        )
 
-
-def _call(func: Callable[[], Any]) -> Any:
-    """Make one of joblib's calls, in a worker."""
-    return func()
+def _gone(error: BaseException) -> WorkersLost:
+    return WorkersLost(
+        f"the Dask scheduler is gone ({type(error).__name__}); what was finished is kept, and the "
+        "same command does the rest"
+    )

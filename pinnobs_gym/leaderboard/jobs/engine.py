@@ -1,24 +1,34 @@
-"""Running jobs in processes, of this machine or of many, through joblib."""
+"""Running jobs in processes, of this machine or of many.
+
+The engine hands jobs to a `Pool` and takes in what becomes of them as they end. There are three
+pools: this very process, worker processes of this machine
+(`pinnobs_gym.leaderboard.jobs.processes`) and the workers of a Dask scheduler
+(`pinnobs_gym.leaderboard.jobs.cluster`). Each process runs one job at a time on one numerical
+thread; see `pinnobs_gym.leaderboard.jobs.worker`.
+"""
 
 from __future__ import annotations
 
 import os
-import re
-import signal
+import shutil
 import socket
-import warnings
-from collections.abc import Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 from uuid import uuid4
 
-import joblib
-
-from pinnobs_gym.leaderboard.jobs.worker import Home, Job, Outcome, attempt, handling
+from pinnobs_gym.files import holding, is_held
+from pinnobs_gym.leaderboard.jobs.pool import Pool, ThisProcess, WorkerLost
+from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome
 from pinnobs_gym.scoring.rows import CannotWrite
+
+LISTEN = 0.5
+"""Seconds between two looks for Ctrl-C while no job ends: Windows does not interrupt a wait."""
 
 
 class Ended(NamedTuple):
@@ -30,11 +40,13 @@ class Ended(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Where:
-    """Where jobs are run."""
+class Workers:
+    """The processes that run jobs."""
 
     processes: int = 1
-    """How many at a time on this machine. One is this very process, more are loky's."""
+    """How many of this machine. One is this very process: debuggers and profilers see the job, and
+    nothing has to be started; but a job that kills its process then ends the run. More are worker
+    processes."""
     scheduler: str | None = None
     """Address of a Dask scheduler, whose workers are then used instead."""
 
@@ -42,21 +54,18 @@ class Where:
 class Engine:
     """Runs jobs, one thread each, and tells of each as it ends.
 
-    A job whose process dies takes the others of its pool with it. All that were under way are then
-    run again, one at a time after the rest, and one that dies once more has failed. Dask does the
-    like by itself.
+    A job whose process dies may take the others of its pool with it. All that were handed out are
+    then run again, one at a time after the rest, and one that dies once more has failed. Dask does
+    the like by itself.
 
     Args:
-        where: the processes.
-
-    Raises:
-        ValueError: in one line, if the scheduler or its workers are not there.
+        workers: the processes.
     """
 
-    def __init__(self, where: Where) -> None:
-        self._where = where
+    def __init__(self, workers: Workers) -> None:
+        self._workers = workers
         self._under_way: dict[int, Job] = {}
-        self.processes = where.processes
+        self.processes = workers.processes
         """How many jobs are run at a time."""
 
     @property
@@ -68,118 +77,115 @@ class Engine:
         """Run jobs in this order, and yield each as it ends.
 
         Raises:
-            ValueError: in one line, if nothing can be written, or a worker does not see the folder.
-            Lost: in one line, if the scheduler is gone.
+            ValueError: in one line, if nothing can be written, the scheduler or its workers are not
+                there, or a worker does not see the folder.
+            WorkersLost: in one line, if the scheduler is gone.
         """
         if not jobs:
             return
-        with _backend(self._where) as backend, _mark(jobs[0].folder) as mark:
-            self.processes = backend.processes
-            children = self._where.scheduler is None
-            home = Home(os.getpid(), socket.gethostname(), os.getcwd(), mark, children)
-            yield from self._rounds(dict(enumerate(jobs)), backend, home)
-
-    def _rounds(self, waiting: dict[int, Job], backend: _Backend, home: Home) -> Iterator[Ended]:
-        """Run all that wait, going on after a process has died."""
-        suspects: set[int] = set()
-        while waiting:
-            now = {i: job for i, job in waiting.items() if i not in suspects}
-            alone = None if now else min(waiting)
+        with _pool(self._workers) as pool, _origin(jobs[0].folder, pool) as origin:
+            self.processes = pool.size
             try:
-                for outcome in self._parallel(
-                    now if alone is None else {alone: waiting[alone]}, backend, home
-                ):
-                    yield self._ended(outcome, waiting)
-            except BrokenProcessPool as death:
-                if alone is not None:
-                    codes = re.search(r"\{.*\}", str(death))  # such as {SIGKILL(-9)}
-                    told = f"exit codes {codes[0]}" if codes else str(death)
-                    yield self._ended(Outcome(alone, told, died=True), waiting)
-                suspects |= self._under_way.keys()
-                for number in suspects & waiting.keys():  # they may have written something
-                    waiting[number] = waiting[number].anew()
+                yield from self._run(dict(enumerate(jobs)), pool, origin)
             finally:
                 self._under_way.clear()
 
-    def _ended(self, outcome: Outcome, waiting: dict[int, Job]) -> Ended:
-        """What became of a job, which waits no more."""
-        number, error, ends_all, died = outcome
-        if ends_all:
-            raise CannotWrite(error)
-        self._under_way.pop(number, None)
-        job = waiting.pop(number)
-        if died:
-            error = " ".join(f"its process died more than once ({error})".split())
-            job.fail(error)
-        return Ended(job, error)
+    def _run(self, jobs: dict[int, Job], pool: Pool, origin: Origin) -> Iterator[Ended]:
+        """Run all jobs, and those whose process died once more, each alone."""
+        suspects: dict[int, Job] = {}
+        for number, future in self._futures(jobs.items(), pool, origin):
+            try:
+                outcome = pool.outcome(future)
+            except WorkerLost:
+                suspects[number] = jobs[number].anew()  # it may have written something
+                continue
+            yield _ended(jobs[number], outcome)
+        for suspect in sorted(suspects.items()):
+            ((number, future),) = self._futures([suspect], pool, origin)
+            try:
+                outcome = pool.outcome(future)
+            except WorkerLost as lost:
+                outcome = Outcome(str(lost), died=True)
+            yield _ended(suspects[number], outcome)
 
-    def _parallel(self, jobs: dict[int, Job], backend: _Backend, home: Home) -> Iterator[Outcome]:
-        """Run these jobs; what was handed out is under way until `_ended`."""
-
-        def calls() -> Iterator[Any]:
-            for number, job in jobs.items():
+    def _futures(
+        self, jobs: Iterable[tuple[int, Job]], pool: Pool, origin: Origin
+    ) -> Iterator[tuple[int, Any]]:
+        """Hand out jobs, as many as the pool queues, and yield the number and the future of each
+        as it is done. They are under way until then."""
+        done: SimpleQueue[tuple[int, Any]] = SimpleQueue()
+        waiting = iter(jobs)
+        while True:
+            free = None if pool.queued is None else pool.queued - len(self._under_way)
+            for number, job in islice(waiting, free):
                 self._under_way[number] = job
-                yield joblib.delayed(attempt)(number, job, home)
+                future = pool.submit(number, job, origin)
+                future.add_done_callback(partial(_put, done, number))
+            if not self._under_way:
+                return
+            number, future = _next(done)
+            del self._under_way[number]
+            yield number, future
 
-        with joblib.parallel_config(backend.name, n_jobs=backend.processes, **backend.options):
-            options: Any = {"batch_size": 1, "pre_dispatch": backend.ahead}
-            parallel: Any = joblib.Parallel(return_as="generator_unordered", **options)
-            with _signals_ignored():  # by the processes that are started now: Ctrl-C is for us
-                outcomes = parallel(calls())
+
+def _put(done: SimpleQueue[tuple[int, Any]], number: int, future: Any) -> None:
+    done.put((number, future))
+
+
+def _next(done: SimpleQueue[tuple[int, Any]]) -> tuple[int, Any]:
+    """What is done next, which may be interrupted."""
+    while True:
         try:
-            yield from outcomes
-        finally:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that it did not come to its end
-                outcomes.close()
+            return done.get(timeout=LISTEN)
+        except Empty:
+            continue
 
 
-class _Backend(NamedTuple):
-    """How joblib is told of the processes."""
+def _ended(job: Job, outcome: Outcome) -> Ended:
+    """What became of a job.
 
-    name: Any
-    processes: int
-    ahead: int | str
-    """How many jobs are handed out at first."""
-    options: dict[str, Any]
+    Raises:
+        CannotWrite: if no other job would fare better.
+    """
+    if outcome.ends_all:
+        raise CannotWrite(outcome.error)
+    error = outcome.error
+    if outcome.died:
+        error = " ".join(f"its process died more than once ({error})".split())
+        job.fail(error)
+    return Ended(job, error)
+
+
+def _pool(workers: Workers) -> AbstractContextManager[Pool]:
+    """The pool, which gives up what it started when it is left with an error."""
+    if workers.scheduler is not None:
+        from pinnobs_gym.leaderboard.jobs.cluster import connected
+
+        return connected(workers.scheduler)
+    if workers.processes == 1:
+        return ThisProcess()
+    from pinnobs_gym.leaderboard.jobs.processes import ProcessPool
+
+    return ProcessPool(workers.processes)
 
 
 @contextmanager
-def _backend(where: Where) -> Iterator[_Backend]:
-    if where.scheduler is None:
-        options = {"inner_max_num_threads": 1} if where.processes > 1 else {}
-        yield _Backend("loky", where.processes, 2 * where.processes, options)
-        return
-    from pinnobs_gym.leaderboard.jobs.cluster import DaskBackend, connected
+def _origin(folder: Path, pool: Pool) -> Iterator[Origin]:
+    """Make the mark of an `Origin` in a folder, for as long as jobs are run.
 
-    with connected(where.scheduler) as client:
-        backend = DaskBackend(client)
-        # All are queued at the scheduler: workers may come and go.
-        yield _Backend(backend, backend.effective_n_jobs(-1), "all", {})
-
-
-@contextmanager
-def _mark(folder: Path) -> Iterator[Path]:
-    """The mark of a `Home` in a folder, for as long as jobs are run."""
+    This process holds it. A mark that nobody holds is of a run that was killed, and is deleted: on
+    the same machine only, since not every shared folder passes locks on.
+    """
     host = socket.gethostname()
-    for old in folder.glob(f".running-{host}-*"):
+    mark = folder / f".running-{host}-{uuid4().hex}"
+    with ExitStack() as stack:
         try:
-            os.kill(int(old.name.split("-")[-2]), 0)
-        except ProcessLookupError:  # that run was killed
-            old.unlink(missing_ok=True)
-        except (OSError, ValueError):
-            pass
-    mark = folder / f".running-{host}-{os.getpid()}-{uuid4().hex}"
-    try:
-        mark.touch()
-    except OSError as error:
-        raise CannotWrite(f"cannot write to folder {folder}: {error}") from None
-    try:
-        yield mark
-    finally:
-        with suppress(OSError):
-            mark.unlink()
-
-
-def _signals_ignored() -> Any:
-    return handling(signal.SIG_IGN, lambda before: before is not signal.SIG_IGN)
+            for old in folder.glob(f".running-{host}-*/"):
+                if not is_held(old):
+                    shutil.rmtree(old, ignore_errors=True)
+            stack.enter_context(holding(mark))
+            mark.mkdir()
+        except OSError as error:
+            raise CannotWrite(f"cannot write to folder {folder}: {error}") from None
+        stack.callback(shutil.rmtree, mark, ignore_errors=True)
+        yield Origin(os.getpid(), host, os.getcwd(), mark, pool.children)

@@ -8,15 +8,16 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
+from uuid import uuid4
 
 from threadpoolctl import threadpool_limits
 
-from pinnobs_gym.files import locked, write_whole
+from pinnobs_gym.files import is_held
 from pinnobs_gym.scoring.rows import CannotWrite
 
 SEEN_AFTER = 5.0
@@ -52,113 +53,112 @@ class Job(Protocol):
 
 
 class Outcome(NamedTuple):
-    """What a worker tells of a job."""
+    """What became of a job."""
 
-    number: int
-    """The job's."""
     error: str | None
-    """What went wrong."""
+    """What went wrong, in one line; None if nothing."""
     ends_all: bool = False
     """Whether no other job would fare better."""
     died: bool = False
-    """Whether the process died, and could not say so."""
+    """Whether its process died, and could not say so."""
 
 
-class Home(NamedTuple):
-    """Where jobs come from."""
+class Origin(NamedTuple):
+    """The client: the process that hands out the jobs."""
 
     pid: int
     host: str
     folder: str
     """Working folder, where plug-ins may be."""
     mark: Path
-    """A file by which workers know that they see the folder that is written to, and what of it is
-    done: a line for each job that ended."""
+    """A folder that is there, and is held by the client, while jobs are run. By it workers know
+    that they see the folder that is written to. For each job that has ended there is a file in it,
+    named by the job's number, that holds what went wrong."""
     children: bool
-    """Whether workers are children of that process."""
+    """Whether workers are children of the client."""
 
 
 _ONE_AT_A_TIME = threading.Lock()
 """Jobs of one process run after each other: numerical libraries share state between threads."""
 
 
-def attempt(number: int, job: Job, home: Home) -> Outcome:
+def attempt(number: int, job: Job, origin: Origin) -> Outcome:
     """Run a job in a worker, unless that was done and the worker died before it could say so."""
     with _ONE_AT_A_TIME:
         try:
-            _settle_in(home)
-            ended = _ended_before(number, home.mark)
-            if ended is not None:
-                return ended
-            told = _run(job)
-            _note(number, told, home.mark)
+            _prepare(origin)
+            outcome = _earlier_outcome(number, origin.mark)
+            if outcome is None:
+                outcome = Outcome(_run(job))
+                _note(number, outcome, origin.mark)
         except CannotWrite as error:
-            return Outcome(number, str(error), ends_all=True)
-    return Outcome(number, told)
+            return Outcome(str(error), ends_all=True)
+    return outcome
 
 
 def _run(job: Job) -> str | None:
     """Run a job; what went wrong, in one line, is written down."""
     try:
-        with handling(_stop, lambda before: before is signal.default_int_handler):
+        with interrupts(_stop, only=signal.default_int_handler):
             job.run()
     except _Stopped:
         raise KeyboardInterrupt from None
     except CannotWrite:
         raise
     except Exception as error:
-        told = " ".join(f"{type(error).__name__}: {error}".split())[:1000]
-        job.fail(told)
-        return told
+        message = " ".join(f"{type(error).__name__}: {error}".split())[:1000]
+        job.fail(message)
+        return message
     return None
 
 
-def _ended_before(number: int, mark: Path) -> Outcome | None:
+def _earlier_outcome(number: int, mark: Path) -> Outcome | None:
+    """What became of a job that has ended already; nothing went wrong if nobody waits for it."""
     try:
-        lines = mark.read_text(encoding="utf-8").splitlines()
-    except OSError:  # it is gone: nobody waits for the outcome
-        return Outcome(number, None)
-    for line in lines:
-        first, _, error = line.partition(" ")
-        if first == str(number):
-            return Outcome(number, error or None)
-    return None
+        return Outcome((mark / str(number)).read_text(encoding="utf-8") or None)
+    except OSError:
+        return None if mark.is_dir() else Outcome(None)
 
 
-def _note(number: int, error: str | None, mark: Path) -> None:
+def _note(number: int, outcome: Outcome, mark: Path) -> None:
     """Write down that a job has ended."""
-    data = f"{number} {error or ''}\n".encode()
+    unfinished = mark / f"{number}.{uuid4().hex}"
     try:
-        with locked(mark, make=False) as descriptor:
-            write_whole(descriptor, data, os.fstat(descriptor).st_size)
+        unfinished.write_text(outcome.error or "", encoding="utf-8")
+        os.replace(unfinished, mark / str(number))
     except FileNotFoundError:  # nobody waits for the outcome any more
         return
     except OSError as cause:
-        raise CannotWrite(f"cannot write {mark}: {cause}") from None
+        raise CannotWrite(f"cannot write {mark / str(number)}: {cause}") from None
 
 
-def _settle_in(home: Home) -> None:
+def _prepare(origin: Origin) -> None:
     """Make a process ready for jobs, and see that it can do them.
 
     Raises:
         CannotWrite: if it does not see the folder.
     """
     here = socket.gethostname()
-    if (here, os.getpid()) == (home.host, home.pid):
+    if (here, os.getpid()) == (origin.host, origin.pid):
         return
-    if home.children and os.getppid() != home.pid:
-        os._exit(1)  # that process was killed, and nobody waits for this job
+    if origin.children and _is_orphan(origin):
+        os._exit(1)  # nobody waits for this job
     _one_thread()
-    if home.folder not in sys.path:
-        sys.path.append(home.folder)  # for module:Class of the user's folder
+    if origin.folder not in sys.path:
+        sys.path.append(origin.folder)  # for module:Class of the user's folder
     deadline = time.monotonic() + SEEN_AFTER
-    while not home.mark.exists():
+    while not origin.mark.exists():
         if time.monotonic() > deadline:
             raise CannotWrite(
-                f"the worker on {here} does not see folder {home.mark.parent} of {home.host}; "
+                f"the worker on {here} does not see folder {origin.mark.parent} of {origin.host}; "
                 "expected a folder that all machines share"
             )
         time.sleep(0.2)
+
+
+def _is_orphan(origin: Origin) -> bool:
+    """Whether the client was killed. On Windows a process keeps its parent's number for good."""
+    return os.getppid() != origin.pid if os.name == "posix" else not is_held(origin.mark)
 
 
 @cache
@@ -168,11 +168,12 @@ def _one_thread() -> None:
 
 
 @contextmanager
-def handling(handler: Any, of: Callable[[Any], bool]) -> Iterator[None]:
-    """Another handler of Ctrl-C, in the main thread, in place of some."""
-    ours = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGINT) if ours else None
-    if before is None or not of(before):
+def interrupts(handler: Any, *, only: Any = None, unless: Any = None) -> Iterator[None]:
+    """Another handler of Ctrl-C, in the main thread: in place of ``only`` this one, or of any
+    ``unless`` it is that one."""
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT) if main else None
+    if before is None or before is unless or (only is not None and before is not only):
         yield
         return
     signal.signal(signal.SIGINT, handler)
@@ -189,7 +190,3 @@ class _Stopped(BaseException):
 
 def _stop(number: int, frame: object) -> None:
     raise _Stopped
-
-
-class Lost(ConnectionError):
-    """The workers are gone; what was finished is kept."""

@@ -16,8 +16,8 @@ from simple_job import Simple
 
 from pinnobs_gym.cli import main
 from pinnobs_gym.leaderboard.jobs import cluster, worker
-from pinnobs_gym.leaderboard.jobs.engine import Engine, Where
-from pinnobs_gym.leaderboard.jobs.worker import Home
+from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
+from pinnobs_gym.leaderboard.jobs.worker import Origin
 from pinnobs_gym.scoring import rows
 
 PLUG_IN = '''
@@ -26,8 +26,6 @@ import time
 from pathlib import Path
 from pinnobs_gym.estimators.ekf import EKF
 
-HERE = Path(__file__).parent
-
 
 class Held(EKF):
     """Says which process runs it, and waits until it may go on."""
@@ -35,8 +33,8 @@ class Held(EKF):
     name = "held"
 
     def run(self, record):
-        (HERE / f"held-{os.getpid()}").touch()
-        while not (HERE / "go").exists():
+        Path(f"held-{os.getpid()}").touch()
+        while not Path("go").exists():
             time.sleep(0.02)
         return super().run(record)
 '''
@@ -237,7 +235,7 @@ def test_no_scheduler_is_one_line(folder, monkeypatch, capsys):
 def test_a_job_that_kills_its_process_has_failed_and_the_others_are_done(tmp_path):
     kinds = {2: "die", 4: "fail"}
     jobs = [Simple(tmp_path, i, kinds.get(i, "work")) for i in range(9)]
-    ended = {job.number: error for job, error in Engine(Where(2)).run(jobs)}
+    ended = {job.number: error for job, error in Engine(Workers(2)).run(jobs)}
     assert ended.keys() == set(range(9))
     assert ended[2] == "its process died more than once (exit codes {SIGKILL(-9)})"
     assert ended[4] == "RuntimeError: out of luck"
@@ -247,7 +245,7 @@ def test_a_job_that_kills_its_process_has_failed_and_the_others_are_done(tmp_pat
 
 
 def test_jobs_that_end_are_told_and_those_that_run_are_named(tmp_path):
-    found = Engine(Where(1))
+    found = Engine(Workers(1))
     assert found.running == []
     names = []
     for job, error in found.run([Simple(tmp_path, i) for i in range(3)]):
@@ -259,7 +257,7 @@ def test_jobs_that_end_are_told_and_those_that_run_are_named(tmp_path):
 
 def test_what_cannot_be_written_ends_the_run(tmp_path):
     jobs = [Simple(tmp_path, 0), Simple(tmp_path, 1, "fill"), Simple(tmp_path, 2)]
-    ended = Engine(Where(1)).run(jobs)
+    ended = Engine(Workers(1)).run(jobs)
     assert next(ended).job.number == 0
     with pytest.raises(rows.CannotWrite, match="the disk is full"):
         next(ended)
@@ -268,9 +266,9 @@ def test_what_cannot_be_written_ends_the_run(tmp_path):
 
 def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "SEEN_AFTER", 0.1)
-    home = Home(1, "client", str(tmp_path), tmp_path / "elsewhere" / ".running", children=False)
-    number, error, ends_all, _ = worker.attempt(5, Simple(tmp_path, 5), home)
-    assert (number, ends_all) == (5, True)
+    origin = Origin(1, "client", str(tmp_path), tmp_path / "elsewhere" / ".running", children=False)
+    error, ends_all, _ = worker.attempt(5, Simple(tmp_path, 5), origin)
+    assert ends_all
     here = socket.gethostname()
     told = f"the worker on {here} does not see folder {tmp_path / 'elsewhere'} of client; expected"
     assert error.startswith(told)
@@ -279,10 +277,10 @@ def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path, monkeypatch):
 
 def test_a_job_whose_end_was_not_heard_of_is_not_run_again(tmp_path):
     mark = tmp_path / ".running"
-    mark.touch()
-    home = Home(1, "client", str(tmp_path), mark, children=False)
+    mark.mkdir()
+    origin = Origin(1, "client", str(tmp_path), mark, children=False)
     for number, what, error in ((11, "work", None), (1, "fail", "RuntimeError: out of luck")):
         for _ in range(2):
-            assert worker.attempt(number, Simple(tmp_path, number, what), home)[1] == error
+            assert worker.attempt(number, Simple(tmp_path, number, what), origin).error == error
     notes = (tmp_path / "notes").read_text().splitlines()
     assert notes == ["11 done", "1 RuntimeError: out of luck"]
