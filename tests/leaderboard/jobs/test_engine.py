@@ -151,16 +151,16 @@ def test_ctrl_c_stops_at_once_and_keeps_what_was_finished(folder, started, undis
 
 
 def test_ctrl_c_in_a_training_of_this_process_scores_nothing(folder, started):
-    endless = f"{{preset = 'paper', iterations = {10**9}, patience = {10**9}}}"
+    endless = f"preset = 'paper', transfer = false, iterations = {10**9}, patience = {10**9}"
     (folder / "endless.toml").write_text(
         "systems = ['Academic']\nbudgets = [1e9]\n"
-        f"estimators = [{{name = 'pinn_obs_replay', settings = {endless}}}]\n"
+        f"estimators = [{{name = 'pinn_obs_replay', settings = {{{endless}}}}}]\n"
     )
     client = started(*COMMAND[:4], "--suite", "endless.toml", "--out", "lb", "--jobs", "1")
-    until(lambda: list(folder.rglob("events.*")))
+    until(lambda: client.poll() is not None or list(folder.rglob("events.*")))
     client.send_signal(signal.SIGINT)
-    client.communicate(timeout=PATIENCE)
-    assert client.returncode == 130
+    printed, _ = client.communicate(timeout=PATIENCE)
+    assert client.returncode == 130, printed
     assert not list(folder.rglob("*.pt"))
     assert rows.read(folder / "lb" / "rows.jsonl") == []
 
