@@ -1,3 +1,9 @@
+import itertools
+import os
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as our command does, whichever test calls it first
+
 import gymnasium as gym
 import pytest
 
@@ -13,3 +19,10 @@ def registries_as_they_were():
         yield
     for name in set(gym.registry) - ids:
         del gym.registry[name]
+
+
+@pytest.fixture
+def ticking(monkeypatch):
+    """CPU time goes on by 0.01 s whenever it is looked at, on a machine of any speed."""
+    ticks = itertools.count()
+    monkeypatch.setattr(time, "process_time", lambda: next(ticks) / 100)

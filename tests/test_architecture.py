@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE
 
 import pinnobs_gym
 
@@ -20,7 +21,9 @@ def test_rooms_import_downwards_only() -> None:
         "-c",
         "from importlinter.cli import lint_imports_command as run; run()",
     ]
-    done = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        command, cwd=ROOT.parent, capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stdout
 
 
@@ -33,7 +36,7 @@ def loaded(code: str, *modules: str) -> set[str]:
     """Which of these modules a fresh process has loaded after it ran the code."""
     ask = f"import sys\n{code}\nprint(*[m for m in {modules!r} if m in sys.modules])"
     done = subprocess.run(
-        [sys.executable, "-c", ask], capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-c", ask], capture_output=True, text=True, timeout=PATIENCE, check=True
     )
     return set(done.stdout.splitlines()[-1].split())
 

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
 """Colours of true states, estimates and measured outputs."""
+_LARGEST = 1e100
+"""Estimates beyond it have diverged, and are not drawn: an axis cannot span all numbers."""
 
 
 def state_figure(
@@ -49,13 +51,14 @@ def state_figure(
             panel.plot(t, dots, ".", ms=2, color=MEASURED, label="measured")
         if x is not None:
             panel.plot(t, x[:, i], color=TRUE, lw=1.5, label="true")
-        finite = np.isfinite(xhat[:, i])
-        panel.plot(t[finite], xhat[finite, i], "--", color=ESTIMATE, lw=1.3, label="estimate")
+        estimate = _drawn(xhat[:, i])
+        kept = np.isfinite(estimate)
+        panel.plot(t[kept], estimate[kept], "--", color=ESTIMATE, lw=1.3, label="estimate")
         if P is not None:
-            band = 2 * np.sqrt(np.maximum(P[:, i, i], 0))
-            low, high = xhat[:, i] - band, xhat[:, i] + band
+            band = 2 * np.sqrt(_drawn(np.maximum(P[:, i, i], 0)))
+            low, high = estimate - band, estimate + band
             panel.fill_between(t, low, high, color=ESTIMATE, alpha=0.15, lw=0)
-        seen = x[:, i] if x is not None else xhat[finite, i]
+        seen = x[:, i] if x is not None else estimate[kept]
         if len(seen):
             panel.set_ylim(*_limits(seen, float(system.scale[i])))
         panel.grid(alpha=0.3)
@@ -79,6 +82,11 @@ def measured_states(system: System) -> dict[int, int]:
         if (H[:, output] == np.eye(system.nx)[state]).all() and (y[:, output] == x[:, state]).all():
             measured[state] = output
     return measured
+
+
+def _drawn(values: np.ndarray) -> np.ndarray:
+    """The values, NaN where they are not drawn."""
+    return np.where(abs(values) <= _LARGEST, values, np.nan)
 
 
 def _limits(values: np.ndarray, scale: float) -> tuple[float, float]:

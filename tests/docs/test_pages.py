@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 from snippets import ROOT, run_page
+from waiting import PATIENCE
 
 from pinnobs_gym import Setup, System, registry
 from pinnobs_gym.cli.system_page import page
@@ -158,7 +159,7 @@ def test_the_code_of_a_guide_runs(path, tmp_path):
 def test_the_site_builds_without_a_warning_and_shows_what_it_ran(tmp_path):
     shutil.copytree(DOCS, tmp_path / "docs", ignore=shutil.ignore_patterns("_build", "reference"))
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "docs", "site"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     site = tmp_path / "site"
     tutorial = (site / "tutorial.html").read_text(encoding="utf-8")

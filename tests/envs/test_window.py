@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from waiting import PATIENCE
 
 pytest.importorskip("PySide6.QtWidgets", exc_type=ImportError)
 
@@ -70,7 +71,7 @@ def test_an_episode_is_shown_in_a_window_that_close_closes(system):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
     )
     assert run.returncode == 0, run.stderr
     assert run.stdout.split() == ["shown", "9"]
@@ -84,7 +85,11 @@ def test_without_a_display_one_sentence_says_what_is_missing():
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
     run = subprocess.run(
-        [sys.executable, "-c", play], env=environment, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", play],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
     )
     assert run.returncode == 1
     message = "needs a display and a window toolkit for matplotlib, such as PySide6"

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from waiting import PATIENCE
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -14,13 +16,13 @@ def blocks(path, *kinds):
     return [(kind, text) for kind, text in found if kind in kinds]
 
 
-def run_python(text, folder, timeout=120):
+def run_python(text, folder):
     """Run a block by itself. Returns what it printed."""
     (folder / "snippet.py").write_text(text, encoding="utf-8")
-    return _run([sys.executable, "-W", "error::UserWarning", "snippet.py"], folder, timeout)
+    return _run([sys.executable, "-W", "error::UserWarning", "snippet.py"], folder)
 
 
-def run_page(path, folder, timeout=240):
+def run_page(path, folder):
     """Run a file's blocks of Python and lines of ``pinnobs``, in order, in one process. A block
     that begins with a comment ``# name.py`` is a module that later ones may import."""
     parts = []
@@ -35,17 +37,17 @@ def run_page(path, folder, timeout=240):
         (folder / f"{name}.py").write_text(text, encoding="utf-8")
         parts.append(f"import {name}\n")
     whole = "from pinnobs_gym.cli import main\n" + "".join(parts)
-    return run_python(whole, folder, timeout) if parts else ""
+    return run_python(whole, folder) if parts else ""
 
 
-def run_command(line, folder, timeout=120):
+def run_command(line, folder):
     """Run a line that begins with ``pinnobs``. Returns what it printed."""
     name, *arguments = line.split()
     assert name == "pinnobs", line
-    return _run([sys.executable, "-m", "pinnobs_gym.cli", *arguments], folder, timeout)
+    return _run([sys.executable, "-m", "pinnobs_gym.cli", *arguments], folder)
 
 
-def _run(command, folder, timeout):
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout)
+def _run(command, folder):
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, f"{command}: {done.stderr}"
     return done.stdout

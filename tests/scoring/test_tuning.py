@@ -1,12 +1,12 @@
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import pytest
 from linear import Linear
+from waiting import PATIENCE, heed_ctrl_c, until
 
 from pinnobs_gym.cli import main
 from pinnobs_gym.envs.game import Game
@@ -168,22 +168,22 @@ def test_ctrl_c_keeps_what_was_tried_and_the_next_run_goes_on(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     command = ["tune", "ekf", "--system", "Academic", "--condition", "dt5", "--episodes", "4"]
     command += ["--out", "tune"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pinnobs_gym.cli", *command, "--trials", "100000"],
+    path = tmp_path / "tune" / "Academic-v0-benchmark-dt5-ekf.journal"
+    one = Search(EKF, Game.of("Academic", condition="dt5"), 4, path)
+    with subprocess.Popen(
+        [sys.executable, "-m", "pinnobs_gym.cli", *command, "--trials", str(10**9)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    path = tmp_path / "tune" / "Academic-v0-benchmark-dt5-ekf.journal"
-    one = Search(EKF, Game.of("Academic", condition="dt5"), 4, path)
-    deadline = time.monotonic() + 120
-    while not (path.exists() and path.stat().st_size and one.done() >= 5):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    printed, told = process.communicate(timeout=60)
-    assert process.returncode == 130
+        preexec_fn=heed_ctrl_c,
+    ) as process:
+        try:
+            until(lambda: process.poll() is not None or (path.exists() and one.done() >= 5))
+            process.send_signal(signal.SIGINT)
+            printed, told = process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
+    assert process.returncode == 130, told
     assert "Traceback" not in printed + told
     done, best = one.done(), one.best()
     assert done >= 5

@@ -12,6 +12,7 @@ import pytest
 from array_api_compat import array_namespace
 from scipy.integrate import DOP853, solve_ivp
 from scipy.linalg import expm
+from waiting import PATIENCE
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.simulation import dop853
@@ -283,7 +284,7 @@ def limited() -> Iterator[None]:
         raise TimeoutError("the solver does not come to an end")
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(20)
+    signal.alarm(PATIENCE)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)

@@ -6,6 +6,7 @@ import sys
 
 import altair as alt
 import pytest
+from waiting import PATIENCE
 
 from pinnobs_gym import evaluate
 from pinnobs_gym.cli import main
@@ -140,7 +141,8 @@ def browser():
         pytest.skip("no chromium here")
     api = pytest.importorskip("playwright.sync_api")
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        launch = playwright.chromium.launch
+        browser = launch(executable_path=CHROMIUM, args=ARGUMENTS, timeout=1000 * PATIENCE)
         yield browser
         browser.close()
 
@@ -153,7 +155,7 @@ def opened(browser, site):
     def opened(**options):
         context = browser.new_context(offline=True, **options)
         contexts.append(context)
-        context.set_default_timeout(120_000)  # machines may be busy
+        context.set_default_timeout(1000 * PATIENCE)
         page = context.new_page()
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))

