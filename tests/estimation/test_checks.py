@@ -268,7 +268,7 @@ def test_sound_system_passes(cls: type[System]) -> None:
         (NumPyOnly, "array_api", "f of torch tensors .*array_namespace"),
         (NumPyFunction, "array_api", "h of torch tensors .*array_namespace"),
         (OneRowOnly, "shapes", r"f .* has shape \(3, 2\); expected \(2, 3, 2\)"),
-        (NoLastAxis, "shapes", r"h at x .* has shape \(\); expected \(1,\)"),
+        (NoLastAxis, "shapes", r"h at t .* has shape \(\); expected \(1,\)"),
         (CoupledRows, "rows_independent", "f: a row of a batch and alone differ"),
         (WrongInvariant, "invariants", "invariants .* 'benchmark' differ by"),
         (WrongTwin, "indistinguishable", "outputs of indistinguishable states"),
