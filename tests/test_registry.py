@@ -164,6 +164,15 @@ def test_register_refuses_what_is_incomplete_or_taken():
     with pytest.raises(TypeError, match="NoSetups has no class attribute 'setups'"):
         pinnobs_gym.register(NoSetups)
 
+    class OldOutput(NoSetups):
+        setups = {"benchmark": Setup((0,), (1,), (0,), (1,), duration=1, dt=0.1)}
+
+        def h(self, x):
+            return x
+
+    with pytest.raises(TypeError, match=r"OldOutput: h\(self, x\); expected h\(self, t, x, u\)"):
+        pinnobs_gym.register(OldOutput)
+
     class WrongSize(NoSetups):
         setups = {"benchmark": Setup((0, 0), (1, 1), (0, 0), (1, 1), duration=1, dt=0.1)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -224,6 +225,13 @@ class System(ABC):
         for name in ("state_names", "output_names", "scale", "setups"):
             if not hasattr(cls, name):
                 raise TypeError(f"system {cls.__name__} has no class attribute {name!r}")
+        for name in ("f", "h"):
+            taken = list(inspect.signature(getattr(cls, name)).parameters)
+            if len(taken) != 4:
+                raise TypeError(
+                    f"system {cls.__name__}: {name}({', '.join(taken)}); "
+                    f"expected {name}(self, t, x, u)"
+                )
         if "benchmark" not in cls.setups:
             raise TypeError(f"system {cls.__name__} has no setup named 'benchmark'")
         try:
