@@ -184,7 +184,9 @@ def test_all_conditions_are_played_by_those_that_need_no_training(folder, capsys
     jobs = jobs_of(played, folder)
     played = {
         (system, estimator): [
-            job.condition for job in jobs if (job.system, job.estimator) == (system, estimator)
+            job.game.name.condition
+            for job in jobs
+            if (job.game.name.system, job.estimator) == (f"{system}-v0", estimator)
         ]
         for system in ("ReverseDuffing", "InductionMotor")
         for estimator in ("ekf", "pinn_gain", "pinn_obs")

@@ -33,7 +33,7 @@ class Osc(System):
     def f(self, t, x, u):
         return stack(x, x[..., 1], -x[..., 0])
 
-    def h(self, x):
+    def h(self, t, x, u):
         return x[..., :1]
 '''
 SCRIPT = '''
