@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from pinnobs_gym import registry
-from pinnobs_gym.cli.docstrings import field_docs, variable_docs
 from pinnobs_gym.cli.output import write_figure
-from pinnobs_gym.cli.system_page import page
+from pinnobs_gym.cli.system_page import field_docs, page, variable_docs
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import Estimator

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from types import ModuleType
 
-from pinnobs_gym.cli.docstrings import field_docs
+from docstring_parser import parse_from_object
+
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
 from pinnobs_gym.simulation.system import System, vector
-
-if TYPE_CHECKING:
-    pass
 
 
 def page(cls: type[System], env_id: str) -> str:
@@ -111,3 +109,20 @@ def _parameters(cls: type[System]) -> str:
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(map(str, row)) + " |" for row in rows])
+
+
+def field_docs(cls: type) -> dict[str, str]:
+    """The docstring under each attribute of a class, those that it inherits included."""
+    found: dict[str, str] = {}
+    for each in reversed(cls.__mro__[:-1]):
+        found |= variable_docs(each)
+    return found
+
+
+def variable_docs(where: ModuleType | type) -> dict[str, str]:
+    """The docstring under each variable of a module, or of a class's own body."""
+    return {
+        p.arg_name: inspect.cleandoc(p.description or "")
+        for p in parse_from_object(where).params
+        if p.args[0] == "attribute"
+    }

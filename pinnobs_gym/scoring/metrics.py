@@ -65,7 +65,9 @@ def _number(name: str, column: np.ndarray | None, i: int) -> float | bool | None
 SCORES = tuple(f.name for f in fields(Scores) if f.default is MISSING and f.name != "diverged")
 """The numbers that each episode has, besides ``diverged``."""
 OPTIONAL_SCORES = tuple(f.name for f in fields(Scores) if f.default is None)
-"""Numbers that episodes have where they apply."""
+"""Numbers that episodes have where they apply: those of `pinnobs_gym.scoring.consistency`, and the
+NRMSE of the whole episode and of its tail over their Cramér-Rao reference
+(`pinnobs_gym.scoring.cramer_rao`)."""
 
 
 def score(system: System, record: Record, truth: np.ndarray, estimates: Estimates) -> Scores:

@@ -102,7 +102,7 @@ def test_every_suite_of_ours_has_jobs(name, tmp_path):
     jobs = jobs_of(suites.load(name), tmp_path)
     assert jobs
     assert len({job.digest for job in jobs}) == len(jobs)
-    assert {job.system for job in jobs} == set(SYSTEMS.classes())
+    assert {job.game.system.partition(":")[2] for job in jobs} == set(SYSTEMS.classes())
 
 
 def test_full_is_every_system_estimator_and_condition(tmp_path):
@@ -111,7 +111,7 @@ def test_full_is_every_system_estimator_and_condition(tmp_path):
         n for n, c in ESTIMATORS.classes().items() if not c.needs_training or c.track == "online"
     }
     assert {job.estimator for job in jobs} == ranked
-    assert {job.condition for job in jobs} == set(CONDITIONS)
+    assert {job.game.name.condition for job in jobs} == set(CONDITIONS)
 
 
 def test_budgets_and_seeds_multiply_what_learns(tmp_path):

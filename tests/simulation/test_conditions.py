@@ -199,7 +199,7 @@ def test_both_spellings_are_one_condition_to_rows_jobs_and_files(tmp_path, monke
     assert row["condition"] == "dt5+outliers"
     suite = Suite(systems=("Academic",), estimators=(Entry("ekf"),), conditions=tuple(spellings))
     jobs = jobs_of(suite, tmp_path)
-    assert [job.condition for job in jobs] == ["dt5+outliers"]
+    assert [job.game.name.condition for job in jobs] == ["dt5+outliers"]
     pytest.importorskip("optuna")
     for name in spellings:
         chosen = ["--system", "Academic", "--condition", name, "--episodes", "2"]
