@@ -111,7 +111,8 @@ def test_a_fast_oscillation_is_found():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
     system, setup, record = record_of(env_id("ReverseDuffing"), "paper", "nominal", 0)
-    estimator = PinnObs(system, config=Config(seed=seed), noise_std=setup.noise_std)
+    config = Config(iterations=2000, seed=seed)
+    estimator = PinnObs(system, config=config, noise_std=setup.noise_std)
     (trained,) = estimator.fit(record)
     direct = PinnObsDirect(system, trained=trained)
     _, example = acceptance.score_batch(direct, env_id("ReverseDuffing"), "paper", "nominal", [0])
@@ -123,7 +124,8 @@ def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
 
 def test_noise_is_not_fitted():
     system, setup, record = record_of(env_id("Academic"), "benchmark", "nominal", 3)
-    trained = train(system, Config(), record=record, noise_std=setup.noise_std)
+    config = Config(iterations=500)
+    trained = train(system, config, record=record, noise_std=setup.noise_std)
     output = system.h(trained.xhat(record.t)) - record.y[0]
     later = record.t > 5
     assert output[later].std() == pytest.approx(0.02, rel=0.15)
