@@ -111,8 +111,7 @@ def test_a_fast_oscillation_is_found():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
     system, setup, record = record_of(env_id("ReverseDuffing"), "paper", "nominal", 0)
-    config = Config(iterations=2000, seed=seed)
-    estimator = PinnObs(system, config=config, noise_std=setup.noise_std)
+    estimator = PinnObs(system, config=Config(seed=seed), noise_std=setup.noise_std)
     (trained,) = estimator.fit(record)
     direct = PinnObsDirect(system, trained=trained)
     _, example = acceptance.score_batch(direct, env_id("ReverseDuffing"), "paper", "nominal", [0])
