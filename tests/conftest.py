@@ -2,6 +2,10 @@ import itertools
 import os
 import time
 
+# What a terminal or a user's environment would change, before anything reads it.
+os.environ["TTY_COMPATIBLE"] = "0"
+os.environ.pop("FORCE_COLOR", None)
+os.environ.pop("PINNOBS_TRACEBACK", None)
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as our command does, whichever test calls it first
 
 import gymnasium as gym

@@ -125,7 +125,7 @@ def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
 def test_noise_is_not_fitted():
     game = Game.of("Academic")
     system, setup, record = game.source.system, game.source.setup, game.record([3])
-    trained = train(system, Config(), record=record, noise_std=setup.noise_std)
+    trained = train(system, Config(iterations=500), record=record, noise_std=setup.noise_std)
     output = system.h(record.t, trained.xhat(record.t), record.u[0]) - record.y[0]
     later = record.t > 5
     assert output[later].std() == pytest.approx(0.02, rel=0.15)

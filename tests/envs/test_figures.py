@@ -1,0 +1,24 @@
+"""Pictures of estimates, also of those that diverged."""
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+
+
+@pytest.mark.parametrize("value", [1e150, 1.7e308, np.inf, np.nan])
+@pytest.mark.parametrize("known", [True, False])
+def test_estimates_that_diverged_are_drawn_as_far_as_they_go(value, known):
+    """Warnings, such as of overflow, are errors here."""
+    t = np.linspace(0, 1, 50)
+    xhat, P = np.ones((50, 2)), np.tile(np.eye(2), (50, 1, 1))
+    xhat[20:] = value * np.where(np.arange(30) % 2, 1, -1)[:, None]
+    P[30:] = value
+    x = np.zeros((50, 2)) if known else None
+    figure = state_figure(ReverseDuffing(), t, xhat, x=x, y=np.zeros((50, 1)), P=P)
+    FigureCanvasAgg(figure).draw()
+    for panel in figure.axes:
+        (line,) = (line for line in panel.lines if line.get_label() == "estimate")
+        np.testing.assert_array_equal(line.get_xdata(), t[:20])
