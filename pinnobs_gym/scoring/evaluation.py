@@ -66,7 +66,7 @@ def evaluate(
     Args:
         estimator: an instance, whose own model is then used; or a class, a name or
             ``module:Class``, which is then made for the env's model and noise.
-        env_id: such as ``pinnobs/ReverseDuffing-v0``.
+        env_id: such as ``pinnobs/ReverseDuffing-v0``; or the name of the system.
         episodes: how many, of seeds seed, seed + 1, ...
         seed: of the first episode.
         setup: ``benchmark`` or ``paper``.

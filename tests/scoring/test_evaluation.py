@@ -121,7 +121,7 @@ def test_tensorboard_has_scalars_a_figure_and_hparams(tmp_path):
     ("call", "message"),
     [
         ({"env_id": "pinnobs/Nothing-v0"}, "unknown env id 'pinnobs/Nothing-v0'; known are pinn"),
-        ({"env_id": "CartPole-v1"}, "unknown env id 'CartPole-v1'"),
+        ({"env_id": "CartPole-v1"}, "unknown system 'CartPole-v1'; known are Academic"),
         ({"estimator": "kf"}, "unknown estimator 'kf'; known are .*, ekf, "),
         ({"setup": "hard"}, "unknown setup 'hard' of ReverseDuffing; it has benchmark, paper"),
         ({"condition": "rain"}, "unknown condition 'rain'; known are nominal"),

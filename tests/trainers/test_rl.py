@@ -95,8 +95,7 @@ def test_actions_are_those_of_sb3(algorithm: str, mode: str) -> None:
 )
 def test_conforms(system: str, mode: str) -> None:
     plant = SYSTEMS.resolve(system)()
-    played = Game.of(system)
-    training = begin(plant, small(mode=mode), played)
+    training = begin(plant, small(mode=mode), Game.of(system), TRAINING_SEED)
     check_estimator(Sb3(plant, trained=training.agent(0.0, 0.0)))
 
 
