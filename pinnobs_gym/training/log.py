@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import tempfile
 import time
@@ -69,7 +70,8 @@ class Log:
         # The table takes no None and no sequences. What columns it has is not said: TensorBoard
         # would give the table of all runs the columns of the first.
         shown = {k: v if isinstance(v, bool | int | float) else str(v) for k, v in params.items()}
-        for value in hparams_pb(shown, trial_id=str(self._folder)).value:
+        run = hashlib.sha256(str(self._folder).encode()).hexdigest()[:12]  # each has its own line
+        for value in hparams_pb(shown, trial_id=run).value:
             self._add(value, 0)
         for tag, value in metrics.items():
             self.scalar(tag, value, 0)
