@@ -1,7 +1,7 @@
 """How a file becomes a name: systems, estimators and trainers are found by reading their sources.
 
-A name is resolved by importing the one file that gives it; the others are not even looked at. Only
-a name that no source shows, and a list of all classes, takes importing everything.
+A name is resolved by importing the one file that gives it. Only a list of all classes takes
+importing everything.
 """
 
 from __future__ import annotations
@@ -110,10 +110,12 @@ class Registry(Generic[T]):
             return self._imported(spec)
         if spec not in self._known and spec in self.sources:
             self._take(spec)
-        known = self._known if spec in self._known else self.classes()
-        if spec not in known:
-            raise ValueError(f"unknown {self._kind} {spec!r}; known are {', '.join(known)}")
-        return known[spec]
+        if spec not in self._known:
+            self.plug_ins()
+        if spec not in self._known:
+            known = ", ".join(sorted({*self._known, *self.sources}))
+            raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}")
+        return self._known[spec]
 
     def name_of(self, cls: type[T]) -> str:
         """The name a class is found by."""

@@ -136,8 +136,10 @@ def test_what_a_registry_forgets(zoo):
         zoo.register(Own)
         assert zoo.resolve("Own") is Own
         assert zoo.resolve(f"{Own.__module__}:{Own.__qualname__}") is Own  # of a function
-    with pytest.raises(RuntimeError, match="imported"):  # it is not known: all are looked at
+    known = "Broken, Decay, another name, no system"
+    with pytest.raises(ValueError, match=f"unknown system 'Own'; known are {known}"):
         zoo.resolve("Own")
+    assert "zoo_package.broken" not in sys.modules
 
 
 def test_unknown_names_list_the_known_ones():

@@ -15,12 +15,12 @@ NOT_FINITE_REWARD = -1e4
 """Reward of an action that is not finite; it ends the episode."""
 
 
-def _reward_weights(system: System) -> np.ndarray:
+def reward_weights(system: System) -> np.ndarray:
     """What each squared error counts in minus the reward."""
     return 1 / (np.asarray(system.scale, dtype=float) ** 2 * system.nx)
 
 
-def _seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
+def seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
     """The seeds that Gymnasium made an env's generator from."""
     seeds = rng.bit_generator.seed_seq
     if not isinstance(seeds, np.random.SeedSequence):
@@ -28,19 +28,29 @@ def _seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
     return seeds
 
 
-def _check_render_mode(mode: str | None, known: Sequence[str]) -> None:
+def check_render_mode(mode: str | None, known: Sequence[str]) -> None:
+    """Check a render mode; None is none.
+
+    Raises:
+        ValueError: in one line, listing the known ones.
+    """
     if mode is not None and mode not in known:
         raise ValueError(f"render_mode={mode!r}; expected {' or '.join(known)}")
 
 
-def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
+def check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
+    """The options of a reset, none if there are none.
+
+    Raises:
+        ValueError: in one line, listing the known ones, if one is unknown.
+    """
     for name in options or {}:
         if name not in known:
             raise ValueError(f"unknown reset option {name!r}; known are {', '.join(known)}")
     return options or {}
 
 
-def _given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.ndarray | None:
+def given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.ndarray | None:
     """The initial states (batch, nx) among the reset options, if there; a warning if they are
     outside the setup's set."""
     if "x0" not in options:

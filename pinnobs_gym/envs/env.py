@@ -12,11 +12,11 @@ import numpy as np
 from pinnobs_gym.envs.agent_side import AgentSide
 from pinnobs_gym.envs.arguments import (
     NOT_FINITE_REWARD,
-    _check_options,
-    _check_render_mode,
-    _given_x0,
-    _reward_weights,
-    _seeds_of,
+    check_options,
+    check_render_mode,
+    given_x0,
+    reward_weights,
+    seeds_of,
 )
 from pinnobs_gym.envs.episodes import Ahead, Changes, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
@@ -66,13 +66,13 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
-        _check_render_mode(render_mode, self.metadata["render_modes"])
+        check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)
         self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)
         self.observation_space = self.agent.form.observation_space
         self.action_space = self.agent.form.action_space
-        self._weights = _reward_weights(self.source.system)
+        self._weights = reward_weights(self.source.system)
         self._num_steps = self.source.setup.num_steps
         self._k = 0
         self._over = True
@@ -84,11 +84,11 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        options = _check_options(options, ("x0", "xhat0"))
+        options = check_options(options, ("x0", "xhat0"))
         prior = Prior.of(self.source.system, self.source.setup, 1, options.get("xhat0"))
-        x0 = _given_x0(self.source, options, 1)
+        x0 = given_x0(self.source, options, 1)
         if seed is not None or self._stream is None:
-            self._stream = Stream(_seeds_of(self.np_random))
+            self._stream = Stream(seeds_of(self.np_random))
             self._ahead.forget([0])
         episode = self._ahead.take([0], [self._stream], x0)
         self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]

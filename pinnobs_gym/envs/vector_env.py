@@ -15,10 +15,10 @@ from gymnasium.vector.utils import batch_space
 from pinnobs_gym.envs.agent_side import AgentSide
 from pinnobs_gym.envs.arguments import (
     NOT_FINITE_REWARD,
-    _check_options,
-    _check_render_mode,
-    _given_x0,
-    _reward_weights,
+    check_options,
+    check_render_mode,
+    given_x0,
+    reward_weights,
 )
 from pinnobs_gym.envs.episodes import Ahead, Changes, Episodes, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
@@ -56,7 +56,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}; expected at least 1")
-        _check_render_mode(render_mode, self.metadata["render_modes"])
+        check_render_mode(render_mode, self.metadata["render_modes"])
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)
@@ -65,7 +65,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self.single_action_space = self.agent.form.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._weights = _reward_weights(self.source.system)
+        self._weights = reward_weights(self.source.system)
         self._num_steps = self.source.setup.num_steps
         self._rows = np.arange(num_envs)
         self._k = np.zeros(num_envs, dtype=int)
@@ -85,7 +85,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         seed: int | Sequence[int | None] | None = None,  # pyright: ignore
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        options = _check_options(options, ("x0", "xhat0", "reset_mask"))
+        options = check_options(options, ("x0", "xhat0", "reset_mask"))
         rows = self._rows
         if "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
@@ -94,7 +94,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             rows = np.flatnonzero(mask) if self._episodes is not None else rows
         xhat0 = options.get("xhat0")
         prior = Prior.of(self.source.system, self.source.setup, self.num_envs, xhat0)
-        x0 = _given_x0(self.source, options, self.num_envs)
+        x0 = given_x0(self.source, options, self.num_envs)
         self._seed(seed, rows)
         self._begin(rows, prior.mean[rows], None if x0 is None else x0[rows])
         observations, infos = self._look()
