@@ -29,6 +29,7 @@ from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.estimators.rts_smoother import RTSSmoother
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.system import System
 
 MEASURED = pytest.mark.parametrize("measured", [False, True], ids=["known", "measured"])
 STD = (0.1, 0.2)
@@ -155,6 +156,15 @@ def test_a_known_part_of_the_outputs_changes_no_estimate(name, measured):
     for part in ("xhat", "P", "innovation", "S"):
         if (value := getattr(expected, part)) is not None:
             np.testing.assert_allclose(getattr(found, part), value, rtol=1e-9, atol=1e-9)
+
+
+def test_the_jacobians_by_hand_are_those_of_automatic_differentiation():
+    rng = np.random.default_rng(0)
+    t, x, u = rng.random((3, 1)), rng.standard_normal((3, 4, 2)), rng.standard_normal((3, 4, 1))
+    for system in (FeedThrough(), Modulated()):
+        for name in ("f_jacobian", "h_jacobian"):
+            expected = getattr(System, name)(system, t, x, u)
+            np.testing.assert_allclose(getattr(system, name)(t, x, u), expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("name", UNTRAINED)

@@ -210,7 +210,7 @@ def test_presets_fill_what_is_not_given():
 
 @pytest.mark.parametrize("setup", ["benchmark", "paper"])
 def test_a_trained_observer_is_replayed_on_four_records(setup):
-    game = Game.of("Academic", setup)
+    game = Game.of("Academic", setup, duration=4.0)
     system, record = game.source.system, game.record([7])
     trained = constant_gain(system, [[2.0], [1.0]], record)
     replay = PinnObsReplay(system, trained=trained)
