@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from pinnobs_gym import registry
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.cli.system_page import field_docs, page, variable_docs
 from pinnobs_gym.envs.game import Game
@@ -22,12 +22,14 @@ from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import consistency, metrics, rows
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.training.trainer import Trainer
 
 
 def write(folder: Path) -> None:
@@ -48,7 +50,7 @@ def write(folder: Path) -> None:
 def pages() -> dict[str, str]:
     """Their texts by file name."""
     systems, estimators = SYSTEMS.classes(), ESTIMATORS.classes()
-    trainers = {name: registry.trainer(name) for name in registry.trainers()}
+    trainers = TRAINERS.classes()
     return {
         **{f"systems/{name}.md": system_page(cls) for name, cls in systems.items()},
         "systems/index.md": _systems(systems),
@@ -179,34 +181,35 @@ def _choices(hint: Any) -> str:
     return f" One of {', '.join(f'`{choice}`' for choice in found)}." if found else ""
 
 
-def trainer_page(name: str, module: types.ModuleType) -> str:
+def trainer_page(name: str, cls: type[Trainer[Any, Any]]) -> str:
     """A trainer's recipe: its Config's fields, preset by preset."""
-    config = module.Config
     used = [
         f"[`{label}`](../estimators/{label}.md)"
-        for label, cls in ESTIMATORS.classes().items()
-        if name in (cls.needs_training, cls.trains_on_record)
+        for label, estimator in ESTIMATORS.classes().items()
+        if name in (estimator.needs_training, estimator.trains_on_record)
     ]
-    hints = get_type_hints(config)
-    presets = get_args(hints["preset"]) if "preset" in hints else ()
-    made = [config(preset=preset) for preset in presets] or [config()]
+    made = {preset: cls.configured({"preset": preset}) for preset in cls.presets}
+    config = type(next(iter(made.values())))
     lines = [
-        (label, *(_shown(getattr(each, label.strip("`"))) for each in made), meaning)
+        (label, *(_shown(getattr(each, label.strip("`"))) for each in made.values()), meaning)
         for label, _, meaning in _settings(config, {f.name for f in fields(config)})
     ]
     call = f"```sh\npinnobs train {name} --system ReverseDuffing\n```\n"
+    presets = [(f"`{preset}`", docstring(function)) for preset, function in cls.presets.items()]
     return "\n".join(
         [
             f"# {name}\n",
-            docstring(module),
+            docstring(sys.modules[cls.__module__]),
+            "",
+            docstring(cls),
             f"\nMakes {', '.join(used)}.\n" if used else "",
             call,
-            "## Config\n",
+            "## Presets\n",
+            markdown_table(("name", "what it is"), presets),
+            "\n## Config\n",
             docstring(config),
             "",
-            markdown_table(("name", *(presets or ("default",)), "meaning"), lines),
-            "\n## train\n",
-            docstring(module.train) + "\n",
+            markdown_table(("name", *made, "meaning"), lines),
         ]
     )
 
@@ -234,8 +237,11 @@ def _estimators(estimators: Mapping[str, type[Estimator]]) -> str:
     return _index("Estimators", ("name", "track", "is told", "what it is"), lines, estimators)
 
 
-def _trainers(trainers: Mapping[str, types.ModuleType]) -> str:
-    lines = [(f"[{name}]({name}.md)", first_line(module)) for name, module in trainers.items()]
+def _trainers(trainers: Mapping[str, type[Trainer[Any, Any]]]) -> str:
+    lines = [
+        (f"[{name}]({name}.md)", first_line(sys.modules[cls.__module__]))
+        for name, cls in trainers.items()
+    ]
     return _index("Trainers", ("name", "what it is"), lines, trainers)
 
 

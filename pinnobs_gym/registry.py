@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -175,29 +174,6 @@ class Registry(Generic[T]):
         return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
 
 
-def trainers() -> dict[str, str]:
-    """The trainers by name, and the dotted name of each one's module: those of the package
-    ``trainers`` whose source defines both ``Config`` and ``train``. None is imported."""
-    found = {}
-    for module in _modules("trainers"):
-        tree = ast.parse(_source(module))
-        if {"Config", "train"} <= set(_top_level_names(tree)):
-            found[module.rpartition(".")[2]] = module
-    return found
-
-
-def trainer(name: str) -> ModuleType:
-    """The module of the trainer of that name, which is imported.
-
-    Raises:
-        ValueError: listing the known ones, if it is unknown.
-    """
-    known = trainers()
-    if name not in known:
-        raise ValueError(f"unknown trainer {name!r}; known are {', '.join(known)}")
-    return importlib.import_module(known[name])
-
-
 @cache
 def _shown(package: str, attributes: tuple[str, ...]) -> dict[str, Origin]:
     """What `Registry.sources` returns."""
@@ -237,12 +213,7 @@ def _constants(node: ast.ClassDef) -> dict[str, Any]:
     return found
 
 
-def _top_level_names(tree: ast.Module) -> Iterator[str]:
-    """The names that a module's source binds at its top level."""
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef | ast.FunctionDef):
-            yield node.name
-        elif isinstance(node, ast.Assign):
-            yield from (target.id for target in node.targets if isinstance(target, ast.Name))
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            yield from (alias.asname or alias.name for alias in node.names)
+TRAINERS: Registry[Any] = Registry(
+    "trainer", "pinnobs_gym.training.trainer:Trainer", "trainers", "name"
+)
+"""All trainers by name. It stands here for estimators, which know no trainer but by name."""

@@ -18,14 +18,14 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from loky import ProcessPoolExecutor, as_completed
 from reproduction import comparison, report
 from reproduction.comparison import METHODS, Comparison
 from reproduction.running import Job, run
-from reproduction.tables import TABLES, Table
+from reproduction.tables import TABLES, Table, recipe
 from rich import box
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -33,7 +33,6 @@ from rich.table import Table as RichTable
 
 from pinnobs_gym.files import append_lines, check_writable, replacing
 from pinnobs_gym.scoring.rows import Row
-from trainers.pinn_obs import Config
 
 COMPARISON = "comparison"
 """The table that is none of `TABLES`: its methods are several."""
@@ -79,10 +78,11 @@ class Options:
                 raise ValueError(f"unknown case {name!r} of {self.table}; known are {known}")
         if self.jobs < 1:
             raise ValueError(f"jobs={self.jobs}; expected at least 1")
-        free: dict[str, Any] = {"preset": self.preset, "seed": self.seed}
-        free["budget"] = _number(self.budget)
-        names = self.only or cases
-        return [Job(cases[n], Config(**free, **cases[n].settings), self.out) for n in names]
+        seed, budget = self.seed, _number(self.budget)
+        chosen = [
+            (cases[n], recipe(self.preset, cases[n], seed, budget)) for n in self.only or cases
+        ]
+        return [Job(case, self.preset, config, self.out) for case, config in chosen]
 
     def compared(self) -> Comparison:
         """The comparison asked for.

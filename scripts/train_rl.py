@@ -15,9 +15,8 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -27,14 +26,14 @@ from pinnobs_gym import evaluate
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import Estimator
-from pinnobs_gym.estimation.learned.trained_file import check_same
+from pinnobs_gym.estimation.learned.trained_file import check_same, plain
 from pinnobs_gym.estimators.sb3 import Sb3
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training import by_name
+from pinnobs_gym.training.by_name import train_by_name
 from pinnobs_gym.training.log import Log
-from trainers.rl import Config
+from trainers.rl import RLTrainer
 
 
 @dataclass(frozen=True)
@@ -44,11 +43,17 @@ class Main:
     system: str = "ReverseDuffing"
     """Name or module:Class of a system, or ``all``."""
     seeds: int = 1
-    """Agents of each system, of the config's seed and those after it."""
+    """Agents of each system, of the first seed and those after it."""
     episodes: int = 100
     """Episodes that each is scored on."""
-    config: Annotated[Config, tyro.conf.OmitArgPrefixes] = field(default_factory=Config)
-    """The recipe."""
+    algorithm: str = "ppo"
+    """Preset of the trainer, such as ppo, sac or ppo_normalized."""
+    seed: int = 0
+    """Seed of the first agent."""
+    steps: int = 300_000
+    """Steps of each training."""
+    budget: float | None = None
+    """CPU seconds of each training."""
     out: Path = Path("runs/rl")
     """Folder of everything that is written."""
 
@@ -60,20 +65,19 @@ class Main:
         for name in names:
             for peer in ("open_loop", "ekf"):
                 self._score(name, peer, peer)
-            for seed in range(self.config.seed, self.config.seed + self.seeds):
-                config = replace(self.config, seed=seed)
-                label = f"{config.algorithm} {config.action_mode}, seed {seed}"
-                self._score(name, self._trained(name, config), label)
+            for seed in range(self.seed, self.seed + self.seeds):
+                self._score(name, self._trained(name, seed), f"{self.algorithm}, seed {seed}")
 
-    def _trained(self, name: str, config: Config) -> Estimator:
+    def _trained(self, name: str, seed: int) -> Estimator:
         """The agent, trained unless its file is there."""
+        changes = {"seed": seed, "steps": self.steps, "budget": self.budget}
+        config = RLTrainer.configured({"preset": self.algorithm, **changes})
         game = Game.of(name)
-        title = f"{game.name.system}-{config.algorithm}-{config.action_mode}"
-        path = self.out / f"{title}-seed{config.seed}.pt"
+        path = self.out / f"{game.name.system}-{self.algorithm}-seed{seed}.pt"
         if not path.exists():
-            checkpoint = path.with_suffix(".checkpoint.zip")
+            checkpoint = path.with_suffix(".checkpoint.pt")
             with Log(self.out / "tensorboard" / path.stem) as log:
-                trained = by_name.train(
+                trained = train_by_name(
                     "rl",
                     config,
                     game,
@@ -84,7 +88,7 @@ class Main:
                 )
             trained.save(path)
         made = Sb3.load(path, game.source.system)
-        check_same(path, made.trained.config, asdict(config.filled()))
+        check_same(path, made.trained.config, plain(asdict(config)))
         return made
 
     def _score(self, name: str, estimator: Estimator | str, label: str) -> None:

@@ -86,5 +86,5 @@ def test_finding_all_estimators_loads_no_agents_library() -> None:
 
 
 def test_the_names_of_trainers_are_known_without_importing_them() -> None:
-    code = "from pinnobs_gym.registry import trainers; assert 'pinn_obs' in trainers()"
+    code = "from pinnobs_gym.registry import TRAINERS; assert 'pinn_obs' in TRAINERS.sources"
     assert not loaded(code, "torch", "trainers.pinn_obs")

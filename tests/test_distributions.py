@@ -116,10 +116,10 @@ def test_the_installed_wheel_runs(wheel, tmp_path):
     assert "pinnobs/InductionMotor-v0" in systems
     ask = (
         "import pinnobs_gym, pinnobs_gym.registry as r\n"
-        "print(pinnobs_gym.__file__, pinnobs_gym.__version__, *r.trainers())"
+        "print(pinnobs_gym.__file__, pinnobs_gym.__version__, *r.TRAINERS.sources)"
     )
     place, version, *trainers = run([python, "-c", ask], cwd=tmp_path, env=clean).split()
     assert Path(place).is_relative_to(own)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert version == project["version"]
-    assert trainers == list(registry.trainers())
+    assert trainers == list(registry.TRAINERS.sources)

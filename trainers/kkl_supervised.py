@@ -10,58 +10,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from types import MappingProxyType
 
 import torch
 
-from trainers.kkl import course
-from trainers.kkl.config import DEFAULT, KKLConfig
+from trainers.kkl.config import KKLConfig, as_published
 from trainers.kkl.fitting import Equations, Objective, Term
-from trainers.kkl.pictures import figures
-from trainers.kkl.run import Method, Run
-
-__all__ = ["Config", "figures", "train"]
+from trainers.kkl.samples import Samples
+from trainers.kkl.trainer import KKLTrainer
 
 
 @dataclass(frozen=True)
 class Config(KKLConfig):
-    """The recipe of a supervised KKL observer. ``faithful`` is Ramos et al.'s: Bessel poles, SiLU
-    networks of five layers of 50, z from 0, no noise, Adam."""
-
-    PRESETS = MappingProxyType(
-        {
-            "default": DEFAULT,
-            "faithful": {
-                **DEFAULT,
-                "start": "zero",
-                "transient": False,
-                "depth": 5,
-                "width": 50,
-                "activation": "silu",
-                "method": "adam",
-                "learning_rate": 1e-3,
-                "batch": 256,
-                "iterations": 12_000,
-                "share": 0.5,
-                "noise": False,
-                "dtype": "float32",
-            },
-        }
-    )
+    """The recipe of a supervised KKL observer."""
 
 
-def labels(run: Run) -> Objective:
-    """T(x) = z at samples of simulated episodes."""
-    assert run.labels is not None
-    known = run.labels
-
-    def draw(generator: torch.Generator) -> Sequence[Equations]:
-        k, i = run.draw(generator, run.dynamics.size)
-        return [Equations([Term(run.encoded(k, i))], known[k, i])]
-
-    return draw
+def faithful() -> Config:
+    """Ramos et al.'s recipe: Bessel poles, SiLU networks of five layers of 50, z from 0, no noise,
+    Adam."""
+    return as_published(Config(), depth=5, activation="silu", share=0.5)
 
 
-train = partial(course.train, Method("kkl_supervised", labels))
-"""See `trainers.kkl.course.train`."""
+class KKLSupervisedTrainer(KKLTrainer[Config]):
+    """Fits T to simulated pairs of x and z."""
+
+    name = "kkl_supervised"
+    presets = {"default": Config, "faithful": faithful}
+
+    def gap(self) -> int:
+        return 0
+
+    def encoding(self, samples: Samples) -> Objective:
+        """T(x) = z at samples of simulated episodes."""
+        assert samples.labels is not None
+        labels = samples.labels
+
+        def draw(generator: torch.Generator) -> Sequence[Equations]:
+            k, i = samples.draw(generator, samples.dynamics.size)
+            return [Equations([Term(samples.encoded(k, i))], labels[k, i])]
+
+        return draw

@@ -6,13 +6,13 @@ import contextlib
 import io
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 from rich.text import Text
 
 from pinnobs_gym.estimation.estimator import Estimator
-from pinnobs_gym.registry import trainer
+from pinnobs_gym.registry import TRAINERS
 
 T = TypeVar("T")
 
@@ -55,27 +55,26 @@ def settings_of(cls: type[Estimator], settings: Sequence[str]) -> dict[str, Any]
     base = {f.name for f in fields(Estimator)}
     own = {f.name: f for f in fields(cls) if f.name not in base and f.repr}
     trained_by = cls.trains_on_record
-    recipes = {} if trained_by is None else {"config": trainer(trained_by).Config}
-    hints = {n: h for n, h in get_type_hints(cls).items() if n in own and n not in recipes}
-    nested = {
-        name: (field_name, hint)
-        for field_name, recipe in recipes.items()
-        for name, hint in get_type_hints(recipe).items()
-    }
+    hints = {n: h for n, h in get_type_hints(cls).items() if n in own}
+    trainer: Any = None if trained_by is None else TRAINERS.resolve(trained_by)
+    recipe: dict[str, Any] = {}
+    nested: dict[str, Any] = {}
+    if trainer is not None:  # its settings are those of its recipe, the field ``config``
+        hints.pop("config")
+        kinds = get_type_hints(type(trainer.configured({})))
+        nested = {"preset": str} | {n: h for n, h in kinds.items() if get_origin(h) is not ClassVar}
     values: dict[str, Any] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
         if equals and name in hints:
             values[name] = _parsed(setting, text, hints[name])
         elif equals and name in nested:
-            field_name, hint = nested[name]
-            values.setdefault(field_name, {})[name] = _parsed(setting, text, hint)
+            recipe[name] = _parsed(setting, text, nested[name])
         else:
             listed = ", ".join(sorted([*hints, *nested])) or "none"
             raise ValueError(f"setting {setting!r}; expected name=value with a name of: {listed}")
-    for name, recipe in recipes.items():
-        if name in values:
-            values[name] = recipe(**values[name])
+    if trainer is not None and recipe:
+        values["config"] = trainer.configured(recipe)
     return values
 
 

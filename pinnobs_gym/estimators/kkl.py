@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-import torch
 
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.learned.kkl_dynamics import Dynamics, Mode, Start, at_rest
 from pinnobs_gym.estimation.learned.kkl_maps import Activation, Layers, evaluate
-from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
+from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Array, System
@@ -43,12 +42,11 @@ class Clock:
         return xp.stack(told, -1)
 
 
-@dataclass(frozen=True, eq=False)
-class TrainedKKL:
-    """A KKL observer, and how its training went."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainedKKL(Trained):
+    """A KKL observer; its loss is the mean squared scaled error of x̂ on episodes held out, noise
+    included, and its iterations are those for both networks."""
 
-    trainer: str
-    """Name of the trainer."""
     A: np.ndarray
     """Shape (nz, nz), in 1/s."""
     B: np.ndarray
@@ -62,22 +60,6 @@ class TrainedKKL:
     """T: from x (and the clock, if T changes with time) to z."""
     decoder: Layers
     """T*: from z and the clock to x."""
-    system: str
-    """Class name of the system."""
-    parameters: Mapping[str, Any]
-    """The system's physical parameters, as JSON holds them."""
-    noise_std: tuple[float, ...]
-    """Standard deviations of the output noise that it was trained with."""
-    config: Mapping[str, Any]
-    """The trainer's settings."""
-    seed: int
-    """What the weights and initial states were drawn from."""
-    loss: float
-    """Mean squared scaled error of x̂ on episodes held out, noise included."""
-    iterations: int
-    """Steps made for both networks."""
-    seconds: float
-    """CPU time in s that all took."""
     facts: Mapping[str, Any]
     """What else is known of the training: initial states dropped, the error of T, a sweep."""
 
@@ -109,52 +91,17 @@ class TrainedKKL:
             z = np.concatenate([z, self.clock(t, u)], axis=-1)
         return evaluate(self.decoder, self.activation, z)
 
-    def save(self, path: str | Path) -> None:
-        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        return {name: self.facts[name] for name in ("dropped", "drawn")}
 
-        Raises:
-            ValueError: in one line, if the file cannot be written.
-        """
-        facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        arrays = {name: torch.tensor(facts.pop(name)) for name in ("A", "B")}
-        maps = {
-            name: [[torch.tensor(a) for a in layer] for layer in facts.pop(name)]
-            for name in ("encoder", "decoder")
-        }
-        facts["clock"] = {"rates": self.clock.rates, "amplitudes": self.clock.amplitudes}
-        write(path, {"facts": json.dumps(facts), **arrays, **maps})
-
-    @classmethod
-    def load(cls, path: str | Path, system: System, trainer: str) -> Self:
-        """Read what `save` wrote, for the system and by the trainer it was trained with.
-
-        Raises:
-            ValueError: in one line, if there is no such file, if it is something else or damaged,
-                or if it belongs to another system, other parameters or another trainer.
-        """
-        saved = read(path)
-        try:
-            facts = json.loads(saved["facts"])
-            facts["noise_std"] = tuple(facts["noise_std"])
-            clock = Clock(**{name: tuple(v) for name, v in facts.pop("clock").items()})
-            arrays = {name: saved[name].numpy() for name in ("A", "B")}
-            maps = {
-                name: tuple((W.numpy(), b.numpy()) for W, b in saved[name])
-                for name in ("encoder", "decoder")
-            }
-            trained = cls(clock=clock, **arrays, **maps, **facts)
-            ny, nx = trained.B.shape[1], len(trained.decoder[-1][1])
-        except (KeyError, TypeError, IndexError, ValueError, AttributeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path} is not a saved KKL observer: {reason}") from None
-        found = {"system": trained.system, "parameters": trained.parameters, "nx": nx, "ny": ny}
-        check_same(path, {**found, "trainer": trained.trainer}, identity(system))
-        check_same(path, {"trainer": trained.trainer}, {"trainer": trainer})
-        return trained
+    def check_fits(self, path: str | Path, system: System) -> None:
+        found = {"nx": len(self.decoder[-1][1]), "ny": self.B.shape[1]}
+        check_same(path, found, {"nx": system.nx, "ny": system.ny})
 
 
 @dataclass(frozen=True)
-class KKL(Estimator):
+class KKL(LearnedEstimator, Estimator):
     """What the learned KKL observers share: ż = A_z z + B_z y, exactly integrated for outputs that
     are straight lines between samples, of any lengths, and x̂ = T*(z).
 
@@ -205,23 +152,6 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
         y = y.copy()
         y[rows] = np.where(missing[rows], self.system.h(t, xhat, u[rows]), y[rows])
         return y
-
-    def save(self, path: str | Path) -> None:
-        """Write the trained observer to a file; see `TrainedKKL.save`."""
-        self.trained.save(path)
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """The estimator with the observer in a file; see `TrainedKKL.load`."""
-        trained = TrainedKKL.load(path, system, str(cls.needs_training))
-        return cls(system, trained.noise_std, trained=trained)
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """How it was trained."""
-        names = ("trainer", "seed", "loss", "iterations", "seconds", "config")
-        dropped = {name: self.trained.facts[name] for name in ("dropped", "drawn")}
-        return {**{name: getattr(self.trained, name) for name in names}, **dropped}
 
 
 @dataclass(frozen=True)

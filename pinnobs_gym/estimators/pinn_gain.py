@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
-import torch
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
@@ -22,7 +18,8 @@ from pinnobs_gym.estimation.learned.gain_network import (
     remembered,
     shapes,
 )
-from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
+from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, output_scale, vector
@@ -31,75 +28,28 @@ Layers = tuple[tuple[np.ndarray, np.ndarray], ...]
 """Weights (rows, columns) and biases (rows,) of each layer."""
 
 
-@dataclass(frozen=True, eq=False)
-class TrainedGain:
-    """A network that gives gains, and how its training went."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainedGain(Trained):
+    """A network that gives gains; its loss is the error on held-out episodes, over the EKF's."""
 
     layers: Layers
     """Weights and biases; those of the least held-out loss."""
     variant: Variant
     """``kalman`` corrects a Kalman gain; ``gru`` is a recurrent network alone."""
-    system: str
-    """Class name of the system."""
-    parameters: Mapping[str, Any]
-    """The system's physical parameters, as JSON holds them."""
-    noise_std: tuple[float, ...]
-    """Standard deviations of the output noise that training was told, in output units."""
-    config: Mapping[str, Any]
-    """The trainer's settings."""
-    seed: int
-    """What the weights were drawn from; it is not the config's if training had to restart."""
-    loss: float
-    """The error on held-out episodes, over the EKF's; see the trainer."""
-    iterations: int
-    """Iterations made, of which the best is one."""
-    seconds: float
-    """CPU time in s that they took."""
 
     @property
     def width(self) -> int:
         """Neurons in a hidden layer."""
         return self.layers[-1][0].shape[1]
 
-    def save(self, path: str | Path) -> None:
-        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
-
-        Raises:
-            ValueError: in one line, if the file cannot be written.
-        """
-        facts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "layers"}
-        layers = [[torch.tensor(a) for a in layer] for layer in self.layers]
-        write(path, {"facts": json.dumps(facts), "layers": layers})
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """Read what `save` wrote, for the system it was trained on.
-
-        Raises:
-            ValueError: in one line, if there is no such file, if it is something else or damaged,
-                or if it belongs to another system, other parameters or other sizes.
-        """
-        saved = read(path)
-        try:
-            facts = json.loads(saved["facts"])
-            facts["noise_std"] = tuple(facts["noise_std"])
-            layers = tuple((W.numpy(), b.numpy()) for W, b in saved["layers"])
-            trained = cls(layers=layers, **facts)
-            found = {"system": trained.system, "parameters": trained.parameters}
-            check_same(path, found, {n: identity(system)[n] for n in found})
-            sizes = [W.shape for W, b in layers if b.shape == W.shape[:1]]
-            expected = shapes(trained.variant, system.nx, system.ny, trained.width)
-        except (KeyError, TypeError, IndexError, AttributeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path} is not a saved gain: {reason}") from None
-        check_same(
-            path, {"sizes": [list(s) for s in sizes]}, {"sizes": [list(s) for s in expected]}
-        )
-        return trained
+    def check_fits(self, path: str | Path, system: System) -> None:
+        sizes = [list(W.shape) for W, b in self.layers if b.shape == W.shape[:1]]
+        expected = [list(s) for s in shapes(self.variant, system.nx, system.ny, self.width)]
+        check_same(path, {"sizes": sizes}, {"sizes": expected})
 
 
 @dataclass(frozen=True)
-class PinnGain(GaussianEstimator):
+class PinnGain(LearnedEstimator, GaussianEstimator):
     """A Kalman filter whose gain a small network corrects, one network for all episodes; it is
     trained beforehand on outputs and the model's equations and never sees a true state.
 
@@ -175,20 +125,3 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         K, memory = recurrent_gain(self.trained.layers, scale, size, x, e, told, memory)
         xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
         return State(xhat, t, u, innovation=innovation, memory=(fixed, memory))
-
-    def save(self, path: str | Path) -> None:
-        """Write the trained network to a file; see `TrainedGain.save`."""
-        self.trained.save(path)
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """The estimator with the network in a file, told the noise of its training; see
-        `TrainedGain.load`."""
-        trained = TrainedGain.load(path, system)
-        return cls(system, trained.noise_std, trained=trained)
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """How the network was trained."""
-        names = ("seed", "loss", "iterations", "seconds", "config")
-        return {"trainer": "pinn_gain", **{name: getattr(self.trained, name) for name in names}}

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from pinnobs_gym.estimation.adapters import OfflineEstimator
 from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
-from pinnobs_gym.estimation.learned.mlp import Architecture, Layers, Network, evaluate, layers_of
-from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
-from pinnobs_gym.registry import trainer
+from pinnobs_gym.estimation.learned.mlp import Architecture, Layers, evaluate
+from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
+from pinnobs_gym.estimation.learned.trained_file import check_same
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.simulation.model import substeps
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
@@ -42,30 +39,17 @@ class Covariance:
         return (1 - part) * self.P[after - 1] + part * self.P[after]
 
 
-@dataclass(frozen=True, eq=False)
-class Trained:
-    """A network trained on one record, and how that went."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainedNetwork(Trained):
+    """A network trained on one record; its weights are those of the least training loss."""
 
-    network: Network
-    """Its weights are those of the least loss."""
+    architecture: Architecture
+    layers: Layers
+    """Weights (fan_out, fan_in) and biases (fan_out,) of each layer."""
     t: np.ndarray
     """Sample times in s of the record it was trained on, shape (num_samples,)."""
     y: np.ndarray
     """Outputs of that record, shape (num_samples, ny)."""
-    system: str
-    """Class name of the system."""
-    parameters: Mapping[str, Any]
-    """The system's physical parameters, as JSON holds them."""
-    config: Mapping[str, Any]
-    """The trainer's settings."""
-    seed: int
-    """What the weights were drawn from; it is not the config's if training had to restart."""
-    loss: float
-    """The least training loss."""
-    iterations: int
-    """Iterations made, of which the best is one."""
-    seconds: float
-    """CPU time in s that they took."""
     covariance: Covariance | None = None
     """Covariances of its estimates, if the recipe gives them."""
 
@@ -78,91 +62,24 @@ class Trained:
         in s. Outside the record's times they are extrapolated."""
         return self._evaluate(t)[1]
 
+    def check_fits(self, path: str | Path, system: System) -> None:
+        sizes = {"nx": self.architecture.nx, "ny": self.architecture.ny}
+        check_same(path, sizes, {"nx": system.nx, "ny": system.ny})
+
     def _evaluate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return evaluate(self.network.architecture, self._layers, t)
+        return evaluate(self.architecture, self._doubled, t)
 
     @cached_property
-    def _layers(self) -> Layers:
-        return layers_of(self.network)
-
-    def save(self, path: str | Path) -> None:
-        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
-
-        Raises:
-            ValueError: in one line, if the file cannot be written.
-        """
-        facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        network, t, y = (facts.pop(name) for name in ("network", "t", "y"))
-        covariance = facts.pop("covariance")
-        facts["architecture"] = asdict(network.architecture)
-        content = {"weights": network.state_dict(), "record": _tensors(t=t, y=y)}
-        if covariance is not None:
-            content["covariance"] = _tensors(t=covariance.t, P=covariance.P)
-        write(path, {"facts": json.dumps(facts), **content})
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """Read what `save` wrote, for the system it was trained on.
-
-        Raises:
-            ValueError: in one line, if there is no such file, if it is something else or damaged,
-                or if it belongs to another system, other parameters or other sizes.
-        """
-        saved = read(path)
-        try:
-            facts = json.loads(saved["facts"])
-            architecture = Architecture(**facts.pop("architecture"))
-            record = {name: saved["record"][name].numpy() for name in ("t", "y")}
-            network = Network(architecture)
-            network.load_state_dict(saved["weights"])
-            if "covariance" in saved:
-                known = {name: saved["covariance"][name].numpy() for name in ("t", "P")}
-                facts["covariance"] = Covariance(**known)
-            trained = cls(network=network, **record, **facts)
-        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path} is not a saved PINN-Obs network: {reason}") from None
-        found = {"system": trained.system, "parameters": trained.parameters}
-        check_same(path, {**found, "nx": architecture.nx, "ny": architecture.ny}, identity(system))
-        return trained
+    def _doubled(self) -> Layers:
+        return tuple((W.astype(float), b.astype(float)) for W, b in self.layers)
 
 
-def estimates_of(rows: Sequence[Trained], t: np.ndarray) -> Estimates:
+def estimates_of(rows: Sequence[TrainedNetwork], t: np.ndarray) -> Estimates:
     """What networks, one per row, make of their records at times t (num_samples,) in s."""
     xhat = np.stack([trained.xhat(t) for trained in rows])
     known = [trained.covariance for trained in rows if trained.covariance is not None]
     whole = len(known) == len(rows)
     return Estimates(xhat, np.stack([covariance(t) for covariance in known]) if whole else None)
-
-
-def _tensors(**arrays: np.ndarray) -> dict[str, Tensor]:
-    return {name: torch.tensor(array) for name, array in arrays.items()}
-
-
-class _Learned(ABC):
-    """What the estimators that need a trained network share."""
-
-    trained: Trained
-
-    @classmethod
-    @abstractmethod
-    def of(cls, system: System, trained: Trained) -> Self:
-        """The estimator with this network."""
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """The estimator with the network in a file; see `Trained.load`."""
-        return cls.of(system, Trained.load(path, system))
-
-    def save(self, path: str | Path) -> None:
-        """Write the trained network to a file; see `Trained.save`."""
-        self.trained.save(path)
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """How the network was trained."""
-        names = ("seed", "loss", "iterations", "seconds", "config")
-        return {"trainer": "pinn_obs", **{name: getattr(self.trained, name) for name in names}}
 
 
 STEP = 0.7
@@ -173,7 +90,7 @@ MOST_STEPS = 200
 
 
 @dataclass(frozen=True)
-class PinnObsReplay(_Learned, Estimator):
+class PinnObsReplay(LearnedEstimator, Estimator):
     """The observer x̂' = f(t, x̂, u) + L(t)(y − h(t, x̂, u)) with a learned gain L(t) (Farkane et
     al., PINN-Obs, the time-varying observer of "Nonlinear State Observer", run as in "Neural
     Network Training and Testing").
@@ -188,7 +105,7 @@ class PinnObsReplay(_Learned, Estimator):
     makes the observer stable elsewhere.
     """
 
-    trained: Trained = field(kw_only=True, repr=False)
+    trained: TrainedNetwork = field(kw_only=True, repr=False)
     """The trained network."""
 
     name = "pinn_obs_replay"
@@ -197,7 +114,7 @@ class PinnObsReplay(_Learned, Estimator):
 """
     knows = ("model", "prior")
     needs_training = "pinn_obs"
-    recipe = MappingProxyType({"transfer": True})
+    recipe = MappingProxyType({"preset": "transfer"})
 
     def reset(self, prior: Prior) -> State:
         return State(prior.mean)
@@ -266,17 +183,13 @@ class PinnObsReplay(_Learned, Estimator):
         largest = abs(np.linalg.eigvals(H @ self.trained.gain(t)[:, None])).max(axis=(0, 2))
         return np.clip(largest, 1e-9, MOST_STEPS * STEP / (end - start))
 
-    @classmethod
-    def of(cls, system: System, trained: Trained) -> Self:
-        return cls(system, trained=trained)
-
 
 @dataclass(frozen=True)
-class PinnObsDirect(_Learned, OfflineEstimator):
+class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     """The network's own estimates x̂(t) (Farkane et al., PINN-Obs, "Proposed Adaptive PINN-Based
     Model"), which mean something for the record that it was trained on alone."""
 
-    trained: Trained = field(kw_only=True, repr=False)
+    trained: TrainedNetwork = field(kw_only=True, repr=False)
     """The trained network."""
 
     name = "pinn_obs_direct"
@@ -306,16 +219,12 @@ class PinnObsDirect(_Learned, OfflineEstimator):
                 )
         return estimates_of([self.trained], record.t)
 
-    @classmethod
-    def of(cls, system: System, trained: Trained) -> Self:
-        return cls(system, trained=trained)
-
 
 @dataclass(frozen=True)
 class PinnObs(OfflineEstimator):
     """PINN-Obs trained anew on every record it is given, and its network's x̂(t)."""
 
-    config: Any = field(default_factory=lambda: trainer("pinn_obs").Config())
+    config: Any = field(default_factory=lambda: TRAINERS.resolve("pinn_obs").configured({}))
     """The recipe; its seed is that of every row."""
     folder: Path | None = field(default=None, repr=False)
     """Where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained network; None
@@ -338,12 +247,11 @@ class PinnObs(OfflineEstimator):
         facts = {"trainer": "pinn_obs", "seed": self.config.seed, "per_record": True}
         return {**facts, "config": asdict(self.config)}
 
-    def fit(self, record: Record) -> list[Trained]:
-        """Train on each row of the record; see `trainers.pinn_obs.train_rows`."""
-        benchmark = self.system.setups["benchmark"].noise_std
-        noise_std = benchmark if self.noise_std is None else self.noise_std
-        return trainer("pinn_obs").train_rows(
-            self.system, self.config, record=record, noise_std=noise_std, folder=self.folder
+    def fit(self, record: Record) -> list[TrainedNetwork]:
+        """Train on each row of the record; see `trainers.pinn_obs.PinnObsTrainer.train_rows`."""
+        trainer: Any = TRAINERS.resolve("pinn_obs")
+        return trainer.train_rows(
+            self.system, self.config, record=record, noise_std=self.noise_std, folder=self.folder
         )
 
     def run(self, record: Record) -> Estimates:

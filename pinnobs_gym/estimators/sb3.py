@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-import torch
 
 from pinnobs_gym.envs.actions import Form, Memory, form_of
 from pinnobs_gym.estimation.estimator import Estimator, State
-from pinnobs_gym.estimation.learned.trained_file import check_same, identity, read, write
+from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
+from pinnobs_gym.estimation.learned.trained_file import check_same, plain
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Setup, System
 
@@ -28,9 +27,10 @@ TINY = 1e-8
 """Added to the variance of features by SB3's ``VecNormalize``."""
 
 
-@dataclass(frozen=True, eq=False)
-class TrainedAgent:
-    """The part of an agent that chooses actions, and how its training went."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainedAgent(Trained):
+    """The part of an agent that chooses actions. Its loss is the trainer's measure on episodes held
+    out."""
 
     layers: tuple[Layer, ...]
     """From normalised features, or from the recurrent layer, to the action."""
@@ -51,57 +51,27 @@ class TrainedAgent:
     """How many of the last outputs the features hold."""
     setup: Mapping[str, Any]
     """The part of the training's setup that the form takes; see `SETUP`."""
-    system: str
-    """Class name of the system."""
-    parameters: Mapping[str, Any]
-    """The system's physical parameters, as JSON holds them."""
-    config: Mapping[str, Any]
-    """The trainer's settings."""
     sb3: str
     """Version of Stable-Baselines3 that trained it."""
-    loss: float
-    """The trainer's measure on episodes held out."""
-    iterations: int
-    """Steps that training took, of which the best agent is one."""
-    seconds: float
-    """CPU time in s that they took."""
+    steps: int
+    """Steps of the env that training took, those of all rows together."""
 
-    def save(self, path: str | Path) -> None:
-        """Write it to one file: tensors, and the rest as JSON. The file holds no code.
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        names = ("algorithm", "action_mode", "sb3", "steps")
+        return {"reward": "of the true states", **{name: getattr(self, name) for name in names}}
 
-        Raises:
-            ValueError: in one line, if the file cannot be written.
-        """
-        arrays = {n: _tensors(getattr(self, n)) for n in _ARRAYS}
-        facts = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
-        write(path, {"facts": json.dumps(facts), **arrays})
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """Read what `save` wrote, for the system it was trained on.
-
-        Raises:
-            ValueError: in one line, if there is no such file, if it is something else or damaged,
-                if it has no normalisation, or if it belongs to another system, other parameters or
-                another major version of Stable-Baselines3.
-        """
-        saved = read(path)
-        if "facts" in saved and saved.get("normalization") is None:
-            raise ValueError(f"{path} holds an agent without the normalisation of its features")
-        try:
-            facts = json.loads(saved["facts"])
-            agent = cls(**{n: _arrays(saved[n]) for n in _ARRAYS}, **facts)
-            found = {"system": agent.system, "parameters": agent.parameters}
-            check_same(path, found, {n: identity(system)[n] for n in found})
-            _check_version(path, agent.sb3)
-            form = agent.form(system)
-            sizes = [agent.normalization[0].size, *(len(b) for _, b in agent.layers[-1:])]
-        except (KeyError, TypeError, IndexError, AttributeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path} is not a saved agent: {reason}") from None
+    def check_fits(self, path: str | Path, system: System) -> None:
+        here = importlib.metadata.version("stable-baselines3")
+        if self.sb3.partition(".")[0] != here.partition(".")[0]:
+            raise ValueError(
+                f"{path} was trained with stable-baselines3 {self.sb3}; {here} is installed, of "
+                "another major version"
+            )
+        form = self.form(system)
         actions: int = form.action_space.shape[0]
-        check_same(path, {"sizes": sizes}, {"sizes": [form.num_features, actions]})
-        return agent
+        found = [self.normalization[0].size, len(self.layers[-1][1])]
+        check_same(path, {"sizes": found}, {"sizes": [form.num_features, actions]})
 
     def form(self, system: System, noise_std: Any = None) -> Form:
         """The form of its actions and features, told a noise; the training's if None."""
@@ -131,9 +101,6 @@ class TrainedAgent:
         return np.tanh(z) if self.squash else np.clip(z, -1.0, 1.0), state
 
 
-_ARRAYS = ("layers", "recurrent", "normalization")
-
-
 def _remember(
     layer: tuple[Layer, Layer], x: np.ndarray, state: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -147,29 +114,8 @@ def _remember(
     return hidden, (hidden, cell)
 
 
-def _tensors(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return torch.tensor(value)
-    return None if value is None else [_tensors(part) for part in value]
-
-
-def _arrays(value: Any) -> Any:
-    if isinstance(value, torch.Tensor):
-        return value.numpy()
-    return None if value is None else tuple(_arrays(part) for part in value)
-
-
-def _check_version(path: str | Path, trained: str) -> None:
-    here = importlib.metadata.version("stable-baselines3")
-    if trained.partition(".")[0] != here.partition(".")[0]:
-        raise ValueError(
-            f"{path} was trained with stable-baselines3 {trained}; {here} is installed, of another "
-            "major version"
-        )
-
-
 @dataclass(frozen=True)
-class Sb3(Estimator):
+class Sb3(LearnedEstimator, Estimator):
     """An agent that was trained by reinforcement learning with Stable-Baselines3, at work without
     exploration. Its reward in training was made of the true states.
 
@@ -209,31 +155,7 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
         memory = self._form.act(memory, actions)
         return State(memory.xhat, t, u, memory=(memory, hidden))
 
-    def save(self, path: str | Path) -> None:
-        """Write the agent to a file; see `TrainedAgent.save`."""
-        self.trained.save(path)
-
-    @classmethod
-    def load(cls, path: str | Path, system: System) -> Self:
-        """The estimator with the agent in a file, told the noise of its training; see
-        `TrainedAgent.load`."""
-        trained = TrainedAgent.load(path, system)
-        return cls(system, trained.setup["noise_std"], trained=trained)
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """How the agent was trained."""
-        names = ("algorithm", "action_mode", "loss", "iterations", "seconds", "config", "sb3")
-        facts = {name: getattr(self.trained, name) for name in names}
-        return {
-            "trainer": "rl",
-            "reward": "of the true states",
-            "seed": self.trained.config["seed"],
-            **facts,
-        }
-
 
 def setup_of(setup: Setup) -> dict[str, Any]:
     """What a saved agent keeps of a setup, as JSON holds it."""
-    kept = {name: np.asarray(getattr(setup, name)).tolist() for name in SETUP}
-    return json.loads(json.dumps(kept))
+    return plain({name: np.asarray(getattr(setup, name)) for name in SETUP})

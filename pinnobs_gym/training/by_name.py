@@ -8,43 +8,57 @@ from typing import Any
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
-from pinnobs_gym.registry import trainer
+from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
+from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.training.loop import train
+from pinnobs_gym.training.settings import TrainingConfig
+from pinnobs_gym.training.trainer import TRAINING_SEED, Trainer
 
-TRAINING_SEED = 10**6
-"""Seed of the first episode that an estimator trained beforehand learns from; further ones have the
-seeds after it, as many as its trainer's Config says (``episodes``). None is scored on them."""
 
+def trainer_of(
+    name: str, config: TrainingConfig, game: Game, episode: int = TRAINING_SEED
+) -> Trainer[Any, Any]:
+    """The training, not begun, of the trainer of that name on a game.
 
-def train(name: str, config: Any, game: Game, seed: int = TRAINING_SEED, **options: Any) -> Any:
-    """What the trainer of that name makes of a config: an object with `save`.
-
-    A trainer learns from the record of ``config.episodes`` episodes and is given it, with the noise
-    that the setup tells; or, if these are none, it plays episodes itself and is told of which game.
+    A trainer learns from the record of ``config.records`` episodes, or, if these are none, plays
+    episodes itself.
 
     Args:
         name: the trainer's.
         config: its Config.
         game: what is played.
-        seed: of the first episode.
-        options: ``log``, ``checkpoint``, ``resume`` and ``progress``, as the trainer takes them.
+        episode: seed of the first episode.
     """
-    module, source = trainer(name), game.source
-    if not config.episodes:
-        return module.train(source.system, config, game=game, seed=seed, **options)
-    record = game.record(range(seed, seed + config.episodes))
-    noise_std = source.setup.noise_std
-    return module.train(source.system, config, record=record, noise_std=noise_std, **options)
+    cls, source = TRAINERS.resolve(name), game.source
+    given: dict[str, Any] = {"game": game, "episode": episode}
+    if config.records:
+        given = {"record": game.record(range(episode, episode + config.records))}
+    return cls(source.system, config, noise_std=source.setup.noise_std, **given)
+
+
+def train_by_name(
+    name: str, config: TrainingConfig, game: Game, episode: int = TRAINING_SEED, **options: Any
+) -> Trained:
+    """What the trainer of that name makes of a config on a game; see `trainer_of`.
+
+    Args:
+        name: the trainer's.
+        config: its Config.
+        game: what is played.
+        episode: seed of the first episode.
+        options: ``log``, ``checkpoint``, ``resume`` and ``progress`` of `train`.
+    """
+    return train(trainer_of(name, config, game, episode), **options)
 
 
 def load(cls: type[Estimator], path: Path, game: Game) -> Estimator:
-    """The trained estimator in a file, told what the game's setup says of the noise.
+    """The trained estimator in a file, given the noise of the game's setup if it makes use of it.
 
     Raises:
         ValueError: in one line, if it cannot be read or belongs to another system.
     """
-    if cls.needs_training is None:
+    if not issubclass(cls, LearnedEstimator):
         raise ValueError(f"estimator {cls.__name__!r} is not one that is trained first")
-    trained_cls: Any = cls
-    estimator = trained_cls.load(path, game.source.system)
-    told = game.source.setup.noise_std
-    return replace(estimator, noise_std=told) if "noise" in cls.knows else estimator
+    estimator: Any = cls.load(path, game.source.system)
+    noise_std = game.source.setup.noise_std
+    return replace(estimator, noise_std=noise_std) if "noise" in cls.knows else estimator

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 
-import trainers.kkl_autoencoder
-import trainers.kkl_pinn
-import trainers.kkl_supervised
 from benchmarks import Figure, at_most
 from pinnobs_gym import evaluate
 from pinnobs_gym.envs.game import Game
@@ -24,12 +20,17 @@ from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from pinnobs_gym.training.by_name import TRAINING_SEED
+from pinnobs_gym.training.by_name import train_by_name
+from pinnobs_gym.training.loop import train
+from pinnobs_gym.training.trainer import Trainer
+from trainers.kkl_autoencoder import KKLAutoencoderTrainer
+from trainers.kkl_pinn import KKLPinnTrainer
+from trainers.kkl_supervised import KKLSupervisedTrainer
 
-MODULES: dict[str, ModuleType] = {
-    "kkl_supervised": trainers.kkl_supervised,
-    "kkl_pinn": trainers.kkl_pinn,
-    "kkl_autoencoder": trainers.kkl_autoencoder,
+TRAINERS: dict[str, type[Trainer[Any, Any]]] = {
+    "kkl_supervised": KKLSupervisedTrainer,
+    "kkl_pinn": KKLPinnTrainer,
+    "kkl_autoencoder": KKLAutoencoderTrainer,
 }
 SEEDS = range(3)
 """Training seeds, of which the worst counts."""
@@ -79,7 +80,7 @@ def readme_table(lines: Sequence[dict[str, Any]]) -> str:
     table = []
     for name in SYSTEMS.classes():
         cells = []
-        for trainer in MODULES:
+        for trainer in TRAINERS:
             whole, tail, lost = (
                 scores.get(f"{trainer} on {name}, {what}", float("nan"))
                 for what in ("NRMSE", "tail NRMSE", "diverged")
@@ -95,7 +96,7 @@ def readme_table(lines: Sequence[dict[str, Any]]) -> str:
         ("figure", "measured", "asked"),
         [(f["figure"], f"{f['value']:g} {f['unit']}".strip(), f["asked"]) for f in asked],
     )
-    return "\n\n".join([what, first, markdown_table(("system", *MODULES), table)])
+    return "\n\n".join([what, first, markdown_table(("system", *TRAINERS), table)])
 
 
 def accuracy() -> Iterator[Figure]:
@@ -163,14 +164,10 @@ def beyond() -> np.ndarray:
 
 def fitted(name: str, noise_std: float, **settings: Any) -> TrainedKKL:
     """A training on ReverseDuffing."""
-    module = MODULES[name]
+    cls = TRAINERS[name]
     torch.set_num_threads(1)
-    return module.train(
-        ReverseDuffing(),
-        module.Config(**settings),
-        record=played(np.zeros((1, 2)), 0.0),
-        noise_std=noise_std,
-    )
+    record, config = played(np.zeros((1, 2)), 0.0), cls.configured(settings)
+    return train(cls(ReverseDuffing(), config, record=record, noise_std=noise_std))
 
 
 def played(x0: np.ndarray, noise_std: float) -> Record:
@@ -213,7 +210,7 @@ def benchmark() -> Iterator[Figure]:
     """The benchmark's episodes, with the default recipes."""
     for name in SYSTEMS.classes():
         tails, diverged = {}, {}
-        for trainer in MODULES:
+        for trainer in TRAINERS:
             rows = _scored(name, trainer)
             tails[trainer] = float(np.median([row["nrmse_tail"] for row in rows]))
             diverged[trainer] = 100 * float(np.mean([row["diverged"] for row in rows]))
@@ -228,12 +225,11 @@ def benchmark() -> Iterator[Figure]:
 
 
 def _scored(name: str, trainer: str) -> list[dict[str, Any]]:
-    module = MODULES[trainer]
     torch.set_num_threads(1)
     game = Game.of(name)
-    system, setup, record = game.source.system, game.source.setup, game.record([TRAINING_SEED])
-    config = module.Config(budget=BENCHMARK_BUDGET)
-    trained = module.train(system, config, record=record, noise_std=setup.noise_std)
+    system, setup = game.source.system, game.source.setup
+    config = TRAINERS[trainer].configured({"budget": BENCHMARK_BUDGET})
+    trained = train_by_name(trainer, config, game)
     observer: Any = ESTIMATORS.resolve(trainer)
     return evaluate(
         observer(system, setup.noise_std, trained=trained), env_id(name), episodes=EPISODES

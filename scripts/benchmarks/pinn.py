@@ -10,16 +10,16 @@ import numpy as np
 import torch
 
 from benchmarks import Figure, at_most, cpu_seconds
+from benchmarks.plain_network import Network
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network
-from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, Trained
+from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, TrainedNetwork
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
-from trainers.pinn_obs import Config, train
-from trainers.pinn_obs.fast import FastRun
-from trainers.pinn_obs.paper import PaperRun
+from pinnobs_gym.training.loop import train
+from trainers.pinn_obs import Config, PinnObsTrainer, paper, transfer
 
 SEEDS = range(5)
 PAPER_ITERATIONS = 101_431
@@ -67,18 +67,22 @@ class Case:
         noise = std * np.random.default_rng(seed).standard_normal(self.record.y.shape)
         return replace(self, record=replace(self.record, y=self.record.y + noise))
 
+    def trained(self, config: Config, noise_std: float = 0.0) -> TrainedNetwork:
+        """What comes of a training on this record."""
+        return train(PinnObsTrainer(self.system, config, record=self.record, noise_std=noise_std))
+
     def rmse(self, xhat: np.ndarray) -> float:
         """Root mean square of the errors of all states and samples, as in the paper."""
         return float(np.sqrt(np.mean((xhat - self.x) ** 2)))
 
-    def direct(self, trained: Trained) -> float:
+    def direct(self, trained: TrainedNetwork) -> float:
         """RMSE of the network's own estimates."""
         return self.rmse(trained.xhat(self.record.t))
 
-    def replayed(self, trained: Trained) -> float:
+    def replayed(self, trained: TrainedNetwork) -> float:
         """RMSE of the observer with the learned gain; not finite if it diverges."""
         with np.errstate(all="ignore"):
-            return self.rmse(PinnObsReplay.of(self.system, trained).run(self.record).xhat[0])
+            return self.rmse(PinnObsReplay(self.system, trained=trained).run(self.record).xhat[0])
 
 
 def figures(repeats: int) -> Iterator[Figure]:
@@ -105,7 +109,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 def iteration_seconds(case: Case, repeats: int) -> tuple[float, float]:
     """CPU seconds of an iteration of the paper's recipe: in plain autograd, and ours."""
     torch.set_num_threads(1)
-    run = PaperRun(case.system, Config("paper"), case.record, np.zeros(case.system.ny))
+    run = PinnObsTrainer(case.system, paper(), record=case.record, noise_std=0.0)
     peer = plain_iteration(case)
     batch = 10
     times = []
@@ -149,8 +153,8 @@ def seconds_to_paper(case: Case, depth: int, seed: int, limit: float) -> float:
     """CPU seconds of the fast recipe until loss and RMSE are the paper's, looked at every ten
     iterations; infinite if that takes over the limit."""
     spent, start = 0.0, time.process_time()
-    noise = np.zeros(case.system.ny)
-    run = FastRun(case.system, Config(depth=depth, seed=seed), case.record, noise)
+    config = Config(depth=depth, seed=seed)
+    run = PinnObsTrainer(case.system, config, record=case.record, noise_std=0.0)
     while not run.finished():
         for _ in range(10):
             run.step()
@@ -171,7 +175,7 @@ def replays(case: Case, budget: float) -> Iterator[Figure]:
         for seed in SEEDS:
             one = case.noisy(std, seed) if std else case
             config = Config(seed=seed, budget=budget)
-            values.append(one.replayed(train(one.system, config, record=one.record, noise_std=std)))
+            values.append(one.replayed(one.trained(config, std)))
         what = f"ReverseDuffing, replay on the own record, noise {std:g}, RMSE"
         yield at_most(f"{what}, median of {len(SEEDS)} seeds", float(np.median(values)), "", asked)
         yield at_most(f"{what}, worst", max(values), "", asked)
@@ -182,7 +186,7 @@ def transfers(case: Case) -> Iterator[Figure]:
     other = case.elsewhere([1.0, 1.5], [0.0, 0.0])
     own, elsewhere = [], []
     for seed in SEEDS:
-        trained = train(case.system, Config(seed=seed, transfer=True), record=case.record)
+        trained = case.trained(replace(transfer(), seed=seed))
         own.append(case.replayed(trained))
         elsewhere.append(other.replayed(trained))
     what = "ReverseDuffing, gain meant to transfer, RMSE, worst of seeds"
@@ -195,7 +199,7 @@ def paper_setup(name: str) -> Iterator[Figure]:
     case = Case.of(name)
     results = []
     for seed in SEEDS:
-        trained = train(case.system, Config(seed=seed), record=case.record)
+        trained = case.trained(Config(seed=seed))
         results.append((case.direct(trained), case.replayed(trained), trained.seconds))
     direct, replay, seconds = np.median(results, axis=0)
     line = EKF_RMSE[name]

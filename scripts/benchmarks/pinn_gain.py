@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training import by_name
+from pinnobs_gym.training.by_name import train_by_name
 from trainers.pinn_gain import Config
 
 SEEDS = 3
@@ -52,10 +53,10 @@ def of_system(name: str, repeats: int) -> Iterator[Figure]:
     yield from speed(name, trainings[-1], repeats)
 
 
-def trained_on(name: str, seed: int) -> TrainedGain:
+def trained_on(name: str, seed: int) -> Any:
     """A gain trained by the default recipe."""
     config = Config(seed=seed)
-    return by_name.train("pinn_gain", config, Game.of(name))
+    return train_by_name("pinn_gain", config, Game.of(name))
 
 
 def compared(name: str, condition: str, trained: TrainedGain) -> dict[str, float]:

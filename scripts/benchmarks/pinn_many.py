@@ -10,8 +10,8 @@ import torch
 from benchmarks import Figure, at_least, cpu_seconds, median_ratio
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.simulation.record import Record
-from trainers.pinn_obs import Config, train, train_many
-from trainers.pinn_obs.fast import FastRun
+from pinnobs_gym.training.loop import train
+from trainers.pinn_obs import Config, PinnObsTrainer
 from trainers.pinn_obs.objective import Objective
 
 MANY = 64
@@ -30,38 +30,44 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def at_once(source: EpisodeSource, record: Record, repeats: int) -> Figure:
-    """Records per CPU-second of `train_many` over those of `train`, in the first iterations of the
+    """Records per CPU-second of `train_rows` over those of `train`, in the first iterations of the
     fast preset, which all cost the same."""
     system, noise = source.system, source.setup.noise_std
     config = Config(iterations=ITERATIONS)
 
     def single() -> None:
         for i in range(SINGLE):
-            train(system, config, record=record.rows(slice(i, i + 1)), noise_std=noise)
+            row = record.rows(slice(i, i + 1))
+            train(PinnObsTrainer(system, config, record=row, noise_std=noise))
+
+    def together() -> None:
+        PinnObsTrainer.train_rows(system, config, record=record, noise_std=noise)
 
     single()
     ratios = []
     for _ in range(repeats):
         one = cpu_seconds(single) / SINGLE
-        many = cpu_seconds(lambda: train_many(system, config, record=record, noise_std=noise))
+        many = cpu_seconds(together)
         ratios.append(one / (many / MANY))
     where = "on a GPU" if torch.cuda.is_available() else "on the CPU"
-    name = f"{MANY} records by train_many / one by train, records per CPU-second, {where}"
+    name = f"{MANY} records by train_rows / one by train, records per CPU-second, {where}"
     return at_least(name, float(np.median(ratios)), "x", 8.0)
 
 
 def stacked_evaluations(source: EpisodeSource, record: Record, repeats: int) -> Figure:
     """Losses and gradients per CPU-second of the stack that a GPU is given over those of single
-    records, both on the CPU: why `train_many` takes one record after another there."""
-    noise = np.broadcast_to(source.setup.noise_std, source.system.ny)
+    records, both on the CPU: why `train_rows` takes one record after another there."""
+    noise = source.setup.noise_std
     rows = [record.rows(slice(i, i + 1)) for i in range(MANY)]
     config = Config(guide=0.0)  # which takes no part in the time of an evaluation
-    runs = [FastRun(source.system, config, row, noise) for row in rows]
-    stack = Objective.stacked([run.objective for run in runs], "cpu")
-    thetas = torch.as_tensor(np.stack([run.theta for run in runs]))
+    runs = [PinnObsTrainer(source.system, config, record=r, noise_std=noise) for r in rows]
+    objectives = [run.recipe.objective for run in runs]
+    thetas = [run.theta for run in runs]
+    stack = Objective.stacked(objectives, "cpu")
+    stacked = torch.as_tensor(np.stack(thetas))
     ratio = median_ratio(
-        lambda: [run.objective(run.theta) for run in runs],
-        lambda: stack.values(thetas),
+        lambda: [one(theta) for one, theta in zip(objectives, thetas, strict=True)],
+        lambda: stack.values(stacked),
         repeats,
     )
     name = f"{MANY} records stacked / one after another, evaluations per CPU-second, on the CPU"

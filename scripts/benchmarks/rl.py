@@ -21,7 +21,7 @@ from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
 from pinnobs_gym.leaderboard.standings_table import markdown_table
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training import by_name
+from pinnobs_gym.training.by_name import train_by_name
 from trainers.rl import Config
 
 SEEDS = 3
@@ -52,7 +52,7 @@ def figures(repeats: int) -> Iterator[Figure]:
             yield limited(
                 f"over the model alone's {open_loop:.4g}, {about}", over, 0.1 if own else None
             )
-            yield at_most(f"steps of training, {about}", trained.iterations, "", 300_000)
+            yield at_most(f"steps of training, {about}", trained.steps, "", 300_000)
             yield at_most(f"training, {about}", trained.seconds, "CPU s", 600.0)
             if own and not seed:
                 yield reproduced(name, trained)
@@ -93,9 +93,9 @@ def _of(values: dict[str, float], start: str, end: str = "") -> float:
     )
 
 
-def trained_on(name: str, seed: int) -> TrainedAgent:
+def trained_on(name: str, seed: int) -> Any:
     """An agent trained by the default recipe."""
-    return by_name.train("rl", Config(seed=seed), Game.of(name))
+    return train_by_name("rl", Config(seed=seed), Game.of(name))
 
 
 def scores(name: str, trained: TrainedAgent) -> list[Row]:

@@ -8,16 +8,11 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 
-import trainers.kkl_autoencoder
-import trainers.kkl_pinn
-import trainers.kkl_supervised
-import trainers.pinn_obs
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.kkl import KKL
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
@@ -26,14 +21,21 @@ from pinnobs_gym.scoring.metrics import error_scores
 from pinnobs_gym.scoring.provenance import canonical
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.training.loop import train
+from pinnobs_gym.training.trainer import Trainer
+from trainers.kkl_autoencoder import KKLAutoencoderTrainer
+from trainers.kkl_pinn import KKLPinnTrainer
+from trainers.kkl_supervised import KKLSupervisedTrainer
+from trainers.pinn_obs import PinnObsTrainer
 
-METHODS: Mapping[str, ModuleType] = {
-    "pinn_obs": trainers.pinn_obs,
-    "pinn_obs_replay": trainers.pinn_obs,
-    "kkl_pinn": trainers.kkl_pinn,
-    "kkl_supervised": trainers.kkl_supervised,
-    "kkl_autoencoder": trainers.kkl_autoencoder,
+METHODS: Mapping[str, type[Trainer[Any, Any]]] = {
+    "pinn_obs": PinnObsTrainer,
+    "pinn_obs_replay": PinnObsTrainer,
+    "kkl_pinn": KKLPinnTrainer,
+    "kkl_supervised": KKLSupervisedTrainer,
+    "kkl_autoencoder": KKLAutoencoderTrainer,
 }
+"""The trainer of each method."""
 METRICS = ("mse", "rmse", "mae", "smape")
 PRINTED: Mapping[str, tuple[float | None, ...]] = {
     "pinn_obs": (5.56e-6, 0.00236, 0.00175, 1.18),
@@ -63,11 +65,13 @@ class Comparison:
 
     def config(self, method: str) -> Any:
         """A method's recipe."""
-        common = {"seed": self.seed, "budget": self.budget}
+        common: dict[str, Any] = {"seed": self.seed, "budget": self.budget}
         if method.startswith("pinn_obs"):
             transfer = method == "pinn_obs_replay" and self.preset == "fast"
-            return METHODS[method].Config(self.preset, transfer=transfer, **common)
-        return METHODS[method].Config(start="zero", transient=False, noise=False, **common)
+            common |= {"preset": "transfer" if transfer else self.preset}
+        else:
+            common |= {"start": "zero", "transient": False, "noise": False}
+        return METHODS[method].configured(common)
 
     def key(self, method: str, episode: int) -> str:
         """What decides a method's scores on an episode."""
@@ -115,7 +119,7 @@ def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]
     torch.set_num_threads(1)
     record, x = played(comparison.records)
     system = _source().system
-    for method, module in METHODS.items():
+    for method, trainer in METHODS.items():
         config = comparison.config(method)
         keys = [comparison.key(method, i) for i in range(comparison.records)]
         missing = [i for i, key in enumerate(keys) if key not in known]
@@ -123,7 +127,7 @@ def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]
             continue
         if not method.startswith("pinn_obs"):
             first = record.rows(slice(0, 1))
-            trained = module.train(system, config, record=first, noise_std=0.0)
+            trained = train(trainer(system, config, record=first, noise_std=0.0))
             xhat = KKL(system, trained=trained).run(record).xhat
             rows = [_row(comparison, method, i, trained, record.t, x[i], xhat[i]) for i in missing]
             append_lines(results, rows)
@@ -131,9 +135,9 @@ def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]
             continue
         for i in missing:
             own = record.rows(slice(i, i + 1))
-            trained = module.train(system, config, record=own)
+            trained = train(trainer(system, config, record=own, noise_std=0.0))
             replayed = method == "pinn_obs_replay"
-            observer = PinnObsReplay.of(system, trained)
+            observer = PinnObsReplay(system, trained=trained)
             xhat = observer.run(own).xhat[0] if replayed else trained.xhat(record.t)
             append_lines(results, [_row(comparison, method, i, trained, record.t, x[i], xhat)])
             yield f"{method}: record {i} of {comparison.records}, {trained.seconds:.1f} CPU s"

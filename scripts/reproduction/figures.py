@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.scoring.playing import Played
-from trainers.pinn_obs import gain_figure
+from trainers.pinn_obs.pictures import gain_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ def estimates_figure(played: Played, title: str) -> Figure:
     return figure
 
 
-def readable_gain_figure(trained: Trained) -> Figure:
+def readable_gain_figure(trained: TrainedNetwork) -> Figure:
     """The learned gains over the record; those over ten times a state's usual gain, as right after
     t₀, are on a logarithmic scale."""
     L = trained.gain(trained.t)

@@ -13,8 +13,7 @@ import numpy as np
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
 from reproduction.running import REPEATS, SETUP, Job
-from reproduction.tables import Case, Printed, Table
-from trainers.pinn_obs import Config
+from reproduction.tables import Case, Printed, Table, recipe
 
 HEADER = (
     "case",
@@ -88,11 +87,11 @@ def of_case(case: Case, rows: Iterable[Row]) -> list[Row]:
     """The rows of a case, whatever table they were made for; by preset, seed and budget."""
 
     def job(row: Row) -> Job:
-        free = {name: row["config"][name] for name in ("preset", "seed", "budget")}
-        return Job(case, Config(**free, **case.settings), Path())
+        free = {name: row["config"][name] for name in ("seed", "budget")}
+        return Job(case, row["preset"], recipe(row["preset"], case, **free), Path())
 
     def order(row: Row) -> tuple[str, int, float]:
-        return row["config"]["preset"], row["config"]["seed"], _budget(row)
+        return row["preset"], row["config"]["seed"], _budget(row)
 
     return sorted((row for row in rows if job(row).key == row["key"]), key=order)
 
@@ -100,9 +99,9 @@ def of_case(case: Case, rows: Iterable[Row]) -> list[Row]:
 def is_done(job: Job, rows: Iterable[Row]) -> bool:
     """Whether a row holds what the job would give: its own, or that of a training with another
     budget that came to its end within the job's."""
-    budget, seed, preset = job.config.budget, job.config.seed, job.config.preset
+    budget, seed = job.config.budget, job.config.seed
     for row in of_case(job.case, rows):
-        if (row["config"]["preset"], row["config"]["seed"]) == (preset, seed):
+        if (row["preset"], row["config"]["seed"]) == (job.preset, seed):
             ended = not _is_cut(row) and (budget is None or row["seconds"] < budget)
             if ended or row["key"] == job.key:
                 return True
@@ -161,7 +160,7 @@ def _recipe(row: Row) -> str:
     config = row["config"]
     seed = f", seed {config['seed']}" if config["seed"] else ""
     end = f"stopped at {_budget(row):g} s" if _is_cut(row) else "to the end"
-    return f"{config['preset']}{seed}, {end}"
+    return f"{row['preset']}{seed}, {end}"
 
 
 def _is_cut(row: Row) -> bool:

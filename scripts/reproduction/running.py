@@ -7,11 +7,7 @@ import json
 import math
 import os
 import shutil
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,14 +18,15 @@ from machine import processor
 
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, Trained
+from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.provenance import canonical, versions
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.training.log import Log
+from pinnobs_gym.training.loop import train
 from reproduction.figures import estimates_figure, loss_figure, readable_gain_figure
 from reproduction.tables import Case
-from trainers.pinn_obs import Config, train
+from trainers.pinn_obs import Config, PinnObsTrainer
 
 SETUP = "paper"
 SEED = 0
@@ -44,6 +41,8 @@ class Job:
     """A case and how it is to be trained."""
 
     case: Case
+    preset: str
+    """Name of the recipe that the config is made of."""
     config: Config
     out: Path
     """Folder under which all goes."""
@@ -66,7 +65,7 @@ class Job:
         config = self.config
         network = f"{config.depth}x{config.width}-{config.activation}"
         digest = _digest(self.case, replace(config, budget=None))
-        return self.out / f"{self.case.system}-{config.preset}-{network}-{digest}"
+        return self.out / f"{self.case.system}-{self.preset}-{network}-{digest}"
 
     def prepare(self) -> bool:
         """Make the folder; returns whether it has a checkpoint to go on from, its own or that of
@@ -99,11 +98,11 @@ def run(job: Job, progress: bool = False) -> Row:
     """Train a case, going on from its checkpoint if there is one, draw its pictures, and measure.
 
     Returns:
-        A row: ``key``, ``case``, ``system``, ``config``; ``loss``, ``iterations`` made and that of
-        the best loss, ``best_iteration``, to within ``log_every``; training CPU ``seconds``;
-        ``inference_ms``; ``rmse`` and ``mae`` of the network, ``replay_rmse`` and ``replay_mae`` of
-        the observer with its gain, over the whole record in state units; ``date``, ``processor``
-        and ``versions``.
+        A row: ``key``, ``case``, ``system``, ``preset``, ``config``; ``loss``, ``iterations`` made
+        and that of the best loss, ``best_iteration``, to within ``log_every``; training CPU
+        ``seconds``; ``inference_ms``; ``rmse`` and ``mae`` of the network, ``replay_rmse`` and
+        ``replay_mae`` of the observer with its gain, over the whole record in state units;
+        ``date``, ``processor`` and ``versions``.
 
     Raises:
         KeyboardInterrupt: on Ctrl-C; the last checkpoint stays.
@@ -112,18 +111,12 @@ def run(job: Job, progress: bool = False) -> Row:
     game = _game(job)
     system, record = game.source.system, game.record([SEED])
     checkpoint, resume = job.folder / CHECKPOINT, job.prepare()
-    with _stopping() as check, Log(job.folder / "tensorboard") as log:
-        trained = train(
-            system,
-            job.config,
-            record=record,
-            noise_std=game.source.setup.noise_std,
-            log=log,
-            checkpoint=checkpoint,
-            resume=resume,
-            progress=progress,
-        )
-        check()
+    noise_std = game.source.setup.noise_std
+    trainer = PinnObsTrainer(system, job.config, record=record, noise_std=noise_std)
+    with Log(job.folder / "tensorboard") as log:
+        trained = train(trainer, log=log, checkpoint=checkpoint, resume=resume, progress=progress)
+    if trained.ending == "interrupted":  # a training cut short is no result
+        raise KeyboardInterrupt
     trained.save(job.folder / "trained.pt")
     scores, curve = _scores(job, game, trained), loss_curve(job.folder / "tensorboard")
     write_figure(job.folder / "gain.png", readable_gain_figure(trained))
@@ -135,6 +128,7 @@ def run(job: Job, progress: bool = False) -> Row:
         "key": job.key,
         "case": job.case.name,
         "system": job.case.system,
+        "preset": job.preset,
         "config": asdict(job.config),
         "loss": trained.loss,
         "iterations": trained.iterations,
@@ -148,43 +142,19 @@ def run(job: Job, progress: bool = False) -> Row:
     }
 
 
-@contextmanager
-def _stopping() -> Iterator[Callable[[], None]]:
-    """A function that raises KeyboardInterrupt if Ctrl-C came within: `train` ends as though it
-    were done, but a training cut short is no result. Elsewhere than in the main thread, nothing."""
-    stopped: list[bool] = []
-
-    def stop(number: int, frame: object) -> None:
-        stopped.append(True)
-        raise KeyboardInterrupt
-
-    def check() -> None:
-        if stopped:
-            raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield check
-        return
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield check
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def _game(job: Job) -> Game:
     """What is played: the paper's setup."""
     return Game.of(job.case.system, SETUP)
 
 
-def _scores(job: Job, game: Game, trained: Trained) -> Row:
+def _scores(job: Job, game: Game, trained: TrainedNetwork) -> Row:
     """The scores of the network and of its replay, each with a picture."""
     found: Row = {}
     for prefix, picture, cls in (
         ("", "states", PinnObsDirect),
         ("replay_", "replay", PinnObsReplay),
     ):
-        played = play(game, cls.of(game.source.system, trained), [SEED])
+        played = play(game, cls(game.source.system, trained=trained), [SEED])
         row: Row = played.scores.rows()[0]
         found |= {f"{prefix}{name}": row[name] for name in ("rmse", "mae")}
         rmse = f"RMSE {row['rmse']:.3g}" if math.isfinite(row["rmse"]) else "diverges"
@@ -193,7 +163,7 @@ def _scores(job: Job, game: Game, trained: Trained) -> Row:
     return found
 
 
-def inference_ms(trained: Trained) -> float:
+def inference_ms(trained: TrainedNetwork) -> float:
     """Median time in ms to evaluate the network at all times of the record, one thread."""
     taken = []
     for _ in range(REPEATS):

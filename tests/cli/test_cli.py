@@ -281,7 +281,7 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert "after 20 iterations" in printed
     assert "pinn_obs_replay on own record" in printed
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
-    assert len(list(Path("tr").glob("*.png"))) == 2
+    assert len(list(Path("tr").glob("*.png"))) == 4
     before = trained.read_bytes()
     assert run("train", "pinn_obs", *where, *small) == 2
     assert "is there already; --resume goes on with it" in capsys.readouterr().err

@@ -10,10 +10,11 @@ import pytest
 from snippets import ROOT, run_page
 from waiting import PATIENCE
 
-from pinnobs_gym import Setup, System, registry
+from pinnobs_gym import Setup, System
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import stack
@@ -38,7 +39,7 @@ def generated():
 def test_everything_that_is_found_has_a_page(generated):
     _, texts = generated
     names = {"systems": SYSTEMS.classes(), "estimators": ESTIMATORS.classes()}
-    names["trainers"] = registry.trainers()
+    names["trainers"] = TRAINERS.sources
     for kind, found in names.items():
         assert len(found) > 5
         for name in found:
@@ -125,11 +126,11 @@ def test_an_estimator_needs_no_equations(generated):
 def test_a_trainers_page_has_each_preset(generated):
     _, texts = generated
     text = texts["trainers/pinn_obs.md"]
-    assert "| name | fast | paper | meaning |" in text
-    assert "| `depth` | `3` | `9` | Number of hidden layers. |" in text
+    assert "| name | fast | transfer | paper | meaning |" in text
+    assert "| `depth` | `3` | `3` | `9` | Number of hidden layers. |" in text
     assert "[`pinn_obs_replay`](../estimators/pinn_obs_replay.md)" in text
     assert "| `cutoff` | `None` | `None` |" in texts["trainers/kkl_pinn.md"]  # of its base class
-    assert "One of `default`, `faithful`." in texts["trainers/kkl_pinn.md"]
+    assert "| `faithful` | Niazi et al.'s recipe: " in texts["trainers/kkl_pinn.md"]
 
 
 def test_links_of_written_pages_lead_to_files(generated):

@@ -7,15 +7,18 @@ from typing import ClassVar
 import numpy as np
 import torch
 from array_api_compat import array_namespace
+from benchmarks.plain_network import Network
 
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network
+from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimation.learned.trained_file import identity
-from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, matrix, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.log import Log
+from pinnobs_gym.training.loop import train
+from trainers.pinn_obs import PinnObsTrainer
 
 
 def box(nx):
@@ -102,14 +105,23 @@ def constant_gain(system, L, record=None):
     with torch.no_grad():
         network.weights[-1].zero_()
         network.biases[-1][system.nx :] = torch.tensor(L, dtype=torch.float64).flatten()
+    return trained_network(system, network, record)
+
+
+def trained_network(system, network, record=None):
+    """A network as if it were trained."""
     record = record or random_record(system)
     about = identity(system)
-    return Trained(
-        network=network,
+    return TrainedNetwork(
+        architecture=network.architecture,
+        layers=tuple((W.detach().numpy(), b.detach().numpy()) for W, b in network.layers),
         t=record.t,
         y=record.y[0],
+        trainer="pinn_obs",
         system=about["system"],
         parameters=about["parameters"],
+        noise_std=(0.0,) * system.ny,
+        ending="finished",
         config={},
         seed=0,
         loss=0.25,
@@ -118,13 +130,29 @@ def constant_gain(system, L, record=None):
     )
 
 
+def network_of(trained):
+    """A trained network in torch."""
+    network = Network(trained.architecture)
+    with torch.no_grad():
+        for (W, b), (weight, bias) in zip(network.layers, trained.layers, strict=True):
+            W.copy_(torch.from_numpy(weight))
+            b.copy_(torch.from_numpy(bias))
+    return network
+
+
+def train_pinn_obs(system, config, *, record, noise_std=0.0, **options):
+    """What `train` makes of a training of PINN-Obs; by default of outputs without noise."""
+    return train(PinnObsTrainer(system, config, record=record, noise_std=noise_std), **options)
+
+
 def same_weights(one, other):
-    ours, theirs = one.network.state_dict(), other.network.state_dict()
-    return all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    pairs = zip(one.layers, other.layers, strict=True)
+    layers = (zip(*pair, strict=True) for pair in pairs)
+    return all(np.array_equal(a, b) for layer in layers for a, b in layer)
 
 
 def gradient_of(network):
-    """What `backward` left, in the order of `strung`."""
+    """What `backward` left, in the order of `flattened`."""
     pairs = zip(network.weights, network.biases, strict=True)
     zero = [(W.grad, torch.zeros_like(b) if b.grad is None else b.grad) for W, b in pairs]
     return torch.cat([torch.cat([W, b[:, None]], dim=1).flatten() for W, b in zero]).numpy()
@@ -136,6 +164,14 @@ class Interrupting(Log):
     def __init__(self, step):
         super().__init__(None)
         self.at, self.losses = step, []
+
+    active = True
+
+    def figure(self, tag, figure, step):
+        """Nothing is drawn."""
+
+    def hparams(self, params, metrics):
+        """Nothing is kept."""
 
     def scalar(self, tag, value, step):
         if tag == "loss/total":

@@ -15,7 +15,7 @@ from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.rows import Stored
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training import by_name
+from pinnobs_gym.training.by_name import train_by_name
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_a_file_is_read_and_options_change_it(write):
         ('conditions = ["all", "gap"]', "conditions: conditions all gap: 'all' stands alone"),
         (
             'estimators = [{name = "ekf", settings = {huuber = 1}}]',
-            "estimators: setting 'huuber' of 'ekf'; expected one of gate, huber, patience, proc",
+            "estimators: settings of 'ekf': setting 'huuber'; expected one of gate, huber, pat",
         ),
         (
             'estimators = [{name = "ekf", settings = {huber = -1}}]',
@@ -188,7 +188,7 @@ def test_of_two_trainings_at_the_same_time_the_first_counts(tmp_path, monkeypatc
     entry = (Entry("pinn_obs_replay", None, small),)
     (job,) = jobs_of(Suite(("Academic",), entry, ("nominal",)), tmp_path)
     cls = ESTIMATORS.resolve("pinn_obs_replay")
-    train, found = by_name.train, []
+    train, found = train_by_name, []
 
     def slow(*arguments, **options):
         result = train(*arguments, **options)
@@ -199,7 +199,7 @@ def test_of_two_trainings_at_the_same_time_the_first_counts(tmp_path, monkeypatc
             found.append((path, written(path)))
         return result
 
-    monkeypatch.setattr("pinnobs_gym.leaderboard.jobs.job.train", slow)
+    monkeypatch.setattr("pinnobs_gym.leaderboard.jobs.job.train_by_name", slow)
     trained(cls, job)
     path, before = found[1]
     assert list((tmp_path / "trained").iterdir()) == [path]

@@ -12,13 +12,13 @@ import pytest
 import readme
 import reproduce_paper
 from reproduction import comparison, report, running
-from reproduction.tables import TABLES, Case, Printed, Table
+from reproduction.tables import TABLES, Case, Printed, Table, recipe
 
 import pinnobs_gym
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from pinnobs_gym.training.log import Log
-from trainers.pinn_obs import Config
+from trainers.pinn_obs import paper
 
 SMALL = {"depth": 1, "width": 4, "iterations": 60, "points": 40, "checkpoint_every": 10}
 PRINTED = Printed(rmse=0.5, mae=0.25)
@@ -57,10 +57,12 @@ def rows_in(folder):
 def stop_at(monkeypatch, iteration):
     """Ctrl-C at an iteration that is logged."""
     log = Log.scalar
+    heeded = signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored here
 
     def scalar(self, tag, value, step):
-        if step == iteration:
+        if step == iteration and tag == "loss/best":
             signal.raise_signal(signal.SIGINT)
+            signal.signal(signal.SIGINT, heeded)
         log(self, tag, value, step)
 
     monkeypatch.setattr(Log, "scalar", scalar)
@@ -100,13 +102,17 @@ def test_only_the_noted_row_has_an_mae_over_its_rmse():
 
 def test_settings_are_those_of_the_names():
     for case in TABLES["depth"].cases:
-        config = Config("paper", **case.settings)
+        config = of("paper", case)
         assert case.name == f"{config.depth}x{config.width}"
     for case in TABLES["activation"].cases:
-        assert Config("paper", **case.settings) == Config("paper", activation=case.name)
-    weights = [(c.w0, c.w_ode, c.w_y) for c in (Config(**k.settings) for k in weighted())]
+        assert of("paper", case) == replace(paper(), activation=case.name)
+    weights = [(c.w0, c.w_ode, c.w_y) for c in (of("fast", k) for k in weighted())]
     assert weights[0] == (1, 1, 1)
     assert weights[5] == (2, 1, 0.5)
+
+
+def of(preset, case):
+    return recipe(preset, case, seed=0, budget=None)
 
 
 def weighted():
@@ -116,7 +122,7 @@ def weighted():
 def test_a_case_of_two_tables_is_trained_once():
     (wide,) = (case for case in TABLES["depth"].cases if case.name == "9x20")
     (tanh,) = (case for case in TABLES["activation"].cases if case.name == "tanh")
-    jobs = [running.Job(case, Config("fast", **case.settings), Path()) for case in (wide, tanh)]
+    jobs = [running.Job(case, "fast", of("fast", case), Path()) for case in (wide, tanh)]
     assert jobs[0].key == jobs[1].key
     assert jobs[0].folder == jobs[1].folder
 
@@ -148,7 +154,7 @@ def test_a_run_leaves_its_row_table_and_pictures(short, tmp_path, capsys):
 def test_a_second_run_does_only_what_is_missing(short, tmp_path, monkeypatch):
     trained = []
     train = running.train
-    monkeypatch.setattr(running, "train", lambda *a, **k: trained.append(a[1]) or train(*a, **k))
+    monkeypatch.setattr(running, "train", lambda t, **k: trained.append(t.config) or train(t, **k))
     assert command("depth", "--only", "one", out=tmp_path) == 0
     assert command("depth", out=tmp_path) == 0
     assert [config.width for config in trained] == [4, 5]
@@ -162,7 +168,7 @@ def test_a_second_run_does_only_what_is_missing(short, tmp_path, monkeypatch):
 def test_a_stopped_run_goes_on_to_the_same_result(short, tmp_path, monkeypatch, capsys):
     assert command("depth", "--only", "one", out=tmp_path / "whole") == 0
     with monkeypatch.context() as patch:
-        stop_at(patch, 36)
+        stop_at(patch, 35)
         assert command("depth", "--only", "one", out=tmp_path / "stopped") == 130
     assert rows_in(tmp_path / "stopped") == []
     assert "stopped" in capsys.readouterr().err
@@ -195,10 +201,10 @@ def test_a_larger_budget_goes_on_from_a_smaller_one(short, tmp_path, monkeypatch
 def test_a_case_that_fails_does_not_stop_the_others(short, tmp_path, monkeypatch, capsys):
     train = running.train
 
-    def failing(system, config, **options):
-        if config.width == 4:
+    def failing(trainer, **options):
+        if trainer.config.width == 4:
             raise FloatingPointError("not finite")
-        return train(system, config, **options)
+        return train(trainer, **options)
 
     monkeypatch.setattr(running, "train", failing)
     assert command("depth", out=tmp_path) == 1
@@ -233,7 +239,7 @@ def test_the_readme_gets_a_section(short, tmp_path):
         (["depth", "--only", "9x21"], "unknown case '9x21' of depth; known are 15x30, 15x20"),
         (["weights", "--only", "8"], "unknown case '8' of weights; known are 1, 2"),
         (["width"], "unknown table 'width'; known are depth, activation, weights, examples"),
-        (["depth", "--preset", "slow"], "preset='slow'; expected fast or paper"),
+        (["depth", "--preset", "slow"], "preset='slow'; expected one of fast, transfer, paper"),
         (["depth", "--budget", "long"], "budget='long'; expected CPU seconds or none"),
         (["depth", "--budget", "nan"], "budget=nan; expected None or positive seconds"),
         (["depth", "--budget", "-1"], "budget=-1.0; expected None or positive seconds"),

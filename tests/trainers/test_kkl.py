@@ -24,18 +24,28 @@ from pinnobs_gym.estimation.learned.kkl_dynamics import (
 from pinnobs_gym.estimation.learned.kkl_maps import Mlp, Scaling, evaluate
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.kkl import KKLSupervised
+from pinnobs_gym.registry import TRAINERS as REGISTRY
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training.by_name import trainer
+from pinnobs_gym.training.loop import train
 from trainers.kkl.fitting import Equations, Fit, Term
 from trainers.kkl.labels import driven, frequency, initial_states, noise_in_z, simulated, steady
 from trainers.kkl.learned_poles import _response
-from trainers.kkl.run import Run, kept_samples
+from trainers.kkl.pictures import figures
+from trainers.kkl.samples import kept_samples
+from trainers.kkl.two_stages import TwoStageFit
 
 TRAINERS = ("kkl_supervised", "kkl_autoencoder", "kkl_pinn")
 SMALL = {"trajectories": 80, "samples": 40, "iterations": 60, "width": 10, "patience": 1.0}
+
+
+def trained_by(name, system, settings, *, record, noise_std=None, **options):
+    """What the trainer of a name makes of settings."""
+    cls = REGISTRY.resolve(name)
+    config = cls.configured(settings)
+    return train(cls(system, config, record=record, noise_std=noise_std), **options)
 
 
 def linear_T(dynamics, plant=PLANT):
@@ -45,22 +55,20 @@ def linear_T(dynamics, plant=PLANT):
 
 def trained_on(name, system="ReverseDuffing", noise_std=None, part=1.0, **settings):
     """Trained on the sample times of the first part of an episode."""
-    module = trainer(name)
     game = Game.of(system)
     plant, setup, whole = game.source.system, game.source.setup, game.record([10**6])
     n = round(part * whole.num_samples)
     record = Record(whole.t[:n], whole.y[:, :n], whole.u[:, :n], whole.prior)
     told = setup.noise_std if noise_std is None else noise_std
-    config = module.Config(**{**SMALL, **settings})
-    return module.train(plant, config, record=record, noise_std=told), plant, setup, record
+    chosen = {**SMALL, **settings}
+    return trained_by(name, plant, chosen, record=record, noise_std=told), plant, setup, record
 
 
 def trained_on_linear(name, cls=Linear, **settings):
-    module = trainer(name)
-    config = module.Config(**{**SMALL, "cutoff": 1.0, **settings})
+    chosen = {**SMALL, "cutoff": 1.0, **settings}
     t, u = 0.1 * np.arange(80), np.zeros((1, 80, cls().nu))
     record = Record(t, np.zeros((1, 80, 2)), u, Prior(np.zeros((1, 2)), np.eye(2)[None]))
-    return module.train(cls(), config, record=record, noise_std=0.0)
+    return trained_by(name, cls(), chosen, record=record, noise_std=0.0)
 
 
 # --- the dynamics of z
@@ -256,14 +264,12 @@ def test_escaping_samples_are_dropped_counted_and_refused_if_many():
     x0 = np.append(np.linspace(-0.9, 0.9, 19), 2.0)[:, None]
     found = simulated(Cubic(), dynamics, t, x0, np.arange(50))
     assert (found.dropped, found.drawn, found.x.shape[1]) == (1, 20, 19)
-    config = trainer("kkl_supervised").Config(
-        low=(-1.05,), high=(1.05,), **{**SMALL, "iterations": 3, "cutoff": 0.5}
-    )
+    short = {**SMALL, "iterations": 3, "cutoff": 0.5, "low": (-1.05,), "high": (1.05,)}
     t = 0.05 * np.arange(50)
     prior = Prior(np.zeros((1, 1)), np.eye(1)[None])
     record = Record(t, np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), prior)
     with pytest.warns(UserWarning, match=r"of 100 initial states of Cubic escape .* left out"):
-        trained = trainer("kkl_supervised").train(Cubic(), config, record=record)
+        trained = trained_by("kkl_supervised", Cubic(), short, record=record)
     assert 0 < trained.facts["dropped"] <= 10
     assert trained.facts["drawn"] == 100
     x0 = np.linspace(-2, 2, 20)[:, None]
@@ -438,40 +444,47 @@ def test_the_faithful_preset_trains(name, system):
     assert np.isfinite(xhat).all()
 
 
+def test_the_faithful_preset_keeps_what_is_asked_for():
+    """Every setting that is given holds, also where the preset has another: the horizon, too."""
+    cls = REGISTRY.resolve("kkl_autoencoder")
+    assert cls.configured({"preset": "faithful"}).horizon == 0
+    chosen = {"horizon": 2.0, "mode": "continuous", "depth": 3, "noise": True}
+    found = cls.configured({"preset": "faithful", **chosen})
+    assert {name: getattr(found, name) for name in chosen} == chosen
+
+
 @pytest.mark.parametrize("name", TRAINERS)
 def test_the_same_seed_gives_the_same_weights_and_resuming_is_exact(name, tmp_path, monkeypatch):
-    module = trainer(name)
     game = Game.of("ReverseDuffing")
     system, setup, record = game.source.system, game.source.setup, game.record([10**6])
-    config = module.Config(**{**SMALL, "iterations": 40, "checkpoint_every": 10})
+    settings = {**SMALL, "iterations": 40, "checkpoint_every": 10}
     arguments = {"record": record, "noise_std": setup.noise_std}
-    whole = module.train(system, config, **arguments)
+    whole = trained_by(name, system, settings, **arguments)
     steps = {"kkl_supervised": 30, "kkl_autoencoder": 20, "kkl_pinn": 41}[name]  # T*, T, T*
-    original = Run.step
-    made = []
+    original = TwoStageFit.step
 
-    def step(run):
-        if len(made) == steps:
+    def step(fit):
+        if fit.iterations == steps:
             raise KeyboardInterrupt
-        made.append(1)
-        original(run)
+        original(fit)
 
-    monkeypatch.setattr(Run, "step", step)
+    monkeypatch.setattr(TwoStageFit, "step", step)
     path = tmp_path / "checkpoint.pt"
-    part = module.train(system, config, checkpoint=path, **arguments)
-    assert part.iterations < whole.iterations
-    monkeypatch.setattr(Run, "step", original)
-    resumed = module.train(system, config, checkpoint=path, resume=True, **arguments)
-    for name in ("encoder", "decoder"):
-        for layer, other in zip(getattr(whole, name), getattr(resumed, name), strict=True):
+    part = trained_by(name, system, settings, checkpoint=path, **arguments)
+    assert (part.iterations, part.ending) == (steps, "interrupted")
+    monkeypatch.setattr(TwoStageFit, "step", original)
+    resumed = trained_by(name, system, settings, checkpoint=path, resume=True, **arguments)
+    assert resumed.ending == whole.ending == "finished"
+    for network in ("encoder", "decoder"):
+        for layer, other in zip(getattr(whole, network), getattr(resumed, network), strict=True):
             for a, b in zip(layer, other, strict=True):
                 np.testing.assert_array_equal(a, b)
     assert resumed.iterations == whole.iterations
-    other = replace(config, seed=1)
+    other = {**settings, "seed": 1}
     with pytest.raises(ValueError, match=r"trained with seed=0; expected 1"):
-        module.train(system, other, checkpoint=path, resume=True, **arguments)
+        trained_by(name, system, other, checkpoint=path, resume=True, **arguments)
     with pytest.raises(ValueError, match="resume=True without a checkpoint"):
-        module.train(system, config, resume=True, **arguments)
+        trained_by(name, system, settings, resume=True, **arguments)
 
 
 def test_a_budget_ends_the_cosine_and_the_training(ticking):
@@ -507,16 +520,16 @@ def test_the_sweep_chooses_a_cutoff_and_draws_its_curve():
     assert trained.config["cutoff"] == chosen["cutoff"]
     assert len(points) == 7
     assert points[-1]["noise_gain"] > 2 * points[3]["noise_gain"]  # faster filters pass more
-    drawn = trainer("kkl_supervised").figures(plant, trained, record)
+    drawn = figures(plant, trained, record)
     assert set(drawn) == {"radius", "error", "maps", "sweep"}
     driven, plant, _, record = trained_on("kkl_supervised", "InductionMotor", **short)
-    assert set(trainer("kkl_supervised").figures(plant, driven, record)) == {"radius"}
+    assert set(figures(plant, driven, record)) == {"radius"}
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"preset": "best"}, "preset='best'; expected default or faithful"),
+        ({"preset": "best"}, "preset='best'; expected one of default, faithful"),
         ({"cutoff": -1.0}, "cutoff=-1.0; expected None or positive Hz"),
         ({"design": "poles"}, "poles=.*for design='poles'"),
         ({"low": (0.0, 0.0)}, "expected both corners or none"),
@@ -528,7 +541,7 @@ def test_the_sweep_chooses_a_cutoff_and_draws_its_curve():
             "not Schur in discrete time",
         ),
         ({"low": (1.0, 1.0), "high": (-1.0, 2.0)}, "low at most high"),
-        ({"method": "sgd"}, "method='sgd'; expected gauss_newton, adam"),
+        ({"method": "sgd"}, "method='sgd'; expected gauss_newton or adam"),
     ],
 )
 def test_bad_settings_are_one_line(settings, message):
@@ -555,11 +568,10 @@ def test_a_file_of_another_system_or_trainer_is_refused(tmp_path):
 
 
 def test_a_measured_input_is_refused():
-    module = trainer("kkl_supervised")
     game = Game.of("InductionMotor")
     system, record = game.source.system, game.record([10**6])
     with pytest.raises(ValueError, match="InductionMotor has a measured input"):
-        module.train(replace(system, measured_input=True), module.Config(), record=record)
+        trained_by("kkl_supervised", replace(system, measured_input=True), {}, record=record)
     short = Record(record.t[:5], record.y[:, :5], record.u[:, :5], record.prior)
     with pytest.raises(ValueError, match="the record has 5 samples"):
-        module.train(system, module.Config(), record=short)
+        trained_by("kkl_supervised", system, {}, record=short)

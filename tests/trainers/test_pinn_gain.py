@@ -22,14 +22,20 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, output_scale
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from pinnobs_gym.training.by_name import TRAINING_SEED
-from trainers.pinn_gain import Config, train
+from pinnobs_gym.training.loop import train as run
+from pinnobs_gym.training.trainer import TRAINING_SEED
+from trainers.pinn_gain import Config, PinnGainTrainer
 from trainers.pinn_gain.rollout import Model, Moment, predict, update
 from trainers.pinn_gain.smooth import smooth
 
 SMALL = Config(
     episodes=10, held_out=3, width=6, iterations=6, streams=6, chunk=10, check_every=2, log_every=2
 )
+
+
+def train(system, config, *, record, noise_std=None, **options):
+    """What comes of a training."""
+    return run(PinnGainTrainer(system, config, record=record, noise_std=noise_std), **options)
 
 
 def gain_of(system: System, size: float = 0.0, variant: str = "kalman", noise_std=None) -> PinnGain:
@@ -40,10 +46,19 @@ def gain_of(system: System, size: float = 0.0, variant: str = "kalman", noise_st
     layers[-1] = [size * a for a in layers[-1]]
     benchmark = system.setups["benchmark"].noise_std
     told = noise_std or tuple(np.broadcast_to(benchmark, system.ny).tolist())
-    facts = {"noise_std": told, "config": {}, "seed": 0}
     about = {n: identity(system)[n] for n in ("system", "parameters")}
     trained = TrainedGain(
-        tuple(map(tuple, layers)), variant, **about, **facts, loss=1.0, iterations=0, seconds=0.0
+        **about,
+        trainer="pinn_gain",
+        layers=tuple(map(tuple, layers)),
+        variant=variant,
+        noise_std=told,
+        config={},
+        seed=0,
+        loss=1.0,
+        iterations=0,
+        seconds=0.0,
+        ending="finished",
     )
     return PinnGain(system, told, trained=trained)
 
@@ -325,8 +340,6 @@ def test_records_that_cannot_be_trained_on_are_refused(tmp_path):
 
 def test_a_loss_that_never_is_finite_ends_in_one_line(monkeypatch):
     system, record = short_record()
-    from trainers.pinn_gain import run
-
-    monkeypatch.setattr(run.Run, "_loss", lambda self, P, errors: errors.sum() * torch.nan)
+    monkeypatch.setattr(PinnGainTrainer, "_loss", lambda self, P, errors: errors.sum() * torch.nan)
     with pytest.raises(FloatingPointError, match="from seed 0 and the 3 after it"):
         train(system, replace(SMALL, iterations=100), record=record)

@@ -26,10 +26,10 @@ from pinnobs_gym.estimation.checks import check_estimator
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from pinnobs_gym.training.by_name import TRAINING_SEED, train
+from pinnobs_gym.training.by_name import train_by_name, trainer_of
 from pinnobs_gym.training.log import Log
-from trainers.rl import Config
-from trainers.rl.agent import begin, options
+from trainers.rl import Config, RLTrainer
+from trainers.rl.agent import options
 
 DUFFING = Game.of("ReverseDuffing")
 SMALL = {"steps": 512, "rows": 4, "rollout": 16, "batch": 32, "epochs": 2, "width": 8}
@@ -44,13 +44,24 @@ KINDS = [
 
 def small(algorithm: str = "ppo", mode: str = "gain", **changes: Any) -> Config:
     buffer = {"buffer": 1000} if algorithm in ("sac", "td3") else {}
-    given: Any = {**SMALL, **buffer, **changes}
-    return Config(algorithm=algorithm, action_mode=mode, **given).filled()  # pyright: ignore
+    preset = f"{algorithm}_normalized" if mode == "normalized" else algorithm
+    given = {**SMALL, **buffer, "action_mode": mode, **changes}
+    return RLTrainer.configured({"preset": preset, **given})
+
+
+def begun(system: str, config: Config) -> Any:
+    """A training that has not made a step."""
+    return trainer_of("rl", config, Game.of(system))
+
+
+def train_rl(config: Config, game: Game, **options: Any) -> Any:
+    """The agent that comes of a training."""
+    return train_by_name("rl", config, game, **options)
 
 
 @pytest.fixture(scope="module")
 def agent() -> TrainedAgent:
-    return train("rl", small(), DUFFING)
+    return train_rl(small(), DUFFING)
 
 
 def scores(estimator: Sb3) -> list[float]:
@@ -65,8 +76,8 @@ def scores(estimator: Sb3) -> list[float]:
 @pytest.mark.parametrize(("algorithm", "mode"), KINDS)
 def test_actions_are_those_of_sb3(algorithm: str, mode: str) -> None:
     """Without exploration, with normalisation, over steps that a recurrent layer remembers."""
-    training = begin(ReverseDuffing(), small(algorithm, mode), DUFFING, TRAINING_SEED)
-    env, model = training.env, training.model
+    training = begun("ReverseDuffing", small(algorithm, mode))
+    env, model = training.env, training.agent
     rng = np.random.default_rng(0)
     features = env.reset()
     for _ in range(30):
@@ -74,7 +85,7 @@ def test_actions_are_those_of_sb3(algorithm: str, mode: str) -> None:
     generator = torch.Generator().manual_seed(1)
     for parameter in model.policy.parameters():  # weights as if trained
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
-    kept = training.agent(0.0, 0.0)
+    kept = training.result()
     state, theirs = kept.begin(4), None
     env.training = False
     for _ in range(5):
@@ -95,14 +106,13 @@ def test_actions_are_those_of_sb3(algorithm: str, mode: str) -> None:
 )
 def test_conforms(system: str, mode: str) -> None:
     plant = SYSTEMS.resolve(system)()
-    training = begin(plant, small(mode=mode), Game.of(system), TRAINING_SEED)
-    check_estimator(Sb3(plant, trained=training.agent(0.0, 0.0)))
+    check_estimator(Sb3(plant, trained=begun(system, small(mode=mode)).result()))
 
 
 def test_the_estimator_is_the_agent_in_its_env() -> None:
     """The estimates of a record are those that the env scores when the agent plays it."""
-    training = begin(ReverseDuffing(), small(rows=3, batch=48), DUFFING, TRAINING_SEED)
-    kept = training.agent(0.0, 0.0)
+    training = begun("ReverseDuffing", small(rows=3, batch=48))
+    kept = training.result()
     env: Any = training.env.unwrapped.env  # pyright: ignore
     observations, infos = env.reset(seed=9)
     estimator = Sb3(ReverseDuffing(), kept.setup["noise_std"], trained=kept)
@@ -124,7 +134,7 @@ def test_the_estimator_is_the_agent_in_its_env() -> None:
 def test_the_best_gain_of_a_schedule_is_learned() -> None:
     """In 8,192 steps the agent comes from the model alone (NRMSE about one) to a small tail."""
     config = Config(steps=8192, rows=32, batch=256, check_every=4096, held_out=8)
-    learned = train("rl", config, DUFFING)
+    learned = train_rl(config, DUFFING)
     rows = evaluate(
         Sb3(ReverseDuffing(), learned.setup["noise_std"], trained=learned),
         DUFFING.name.env_id,
@@ -135,14 +145,14 @@ def test_the_best_gain_of_a_schedule_is_learned() -> None:
 
 
 def test_same_seed_same_agent(agent: TrainedAgent) -> None:
-    again, other = train("rl", small(), DUFFING), train("rl", small(seed=1), DUFFING)
+    again, other = train_rl(small(), DUFFING), train_rl(small(seed=1), DUFFING)
     assert agent.loss == again.loss != other.loss
     assert np.array_equal(agent.layers[0][0], again.layers[0][0])
 
 
 def test_logs_in_sb3s_layout(tmp_path: Path) -> None:
     with Log(tmp_path) as log:
-        train("rl", small(), DUFFING, log=log)
+        train_rl(small(), DUFFING, log=log)
     found = EventAccumulator(str(tmp_path))
     found.Reload()
     tags = set(found.Tags()["scalars"])
@@ -152,17 +162,18 @@ def test_logs_in_sb3s_layout(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("ticking")
 def test_ends_on_its_budget() -> None:
-    ended = train("rl", small(steps=10**9, budget=0.3), DUFFING)
-    assert ended.iterations <= 120  # the time is looked at after each step of its four rows
+    ended = train_rl(small(steps=10**9, budget=0.3), DUFFING)
+    assert ended.ending == "budget"
+    assert ended.steps <= 64 * 30  # the time is looked at after each rollout
     assert 0.3 <= ended.seconds < 0.6
     assert np.isfinite(ended.loss)
 
 
 def test_resumes(tmp_path: Path) -> None:
     checkpoint = tmp_path / "agent.pt"
-    first = train("rl", small(), DUFFING, checkpoint=checkpoint)
-    more = train("rl", small(steps=1024), DUFFING, checkpoint=checkpoint, resume=True)
-    assert (first.iterations, more.iterations) == (512, 1024)
+    first = train_rl(small(), DUFFING, checkpoint=checkpoint)
+    more = train_rl(small(steps=1024), DUFFING, checkpoint=checkpoint, resume=True)
+    assert (first.steps, more.steps) == (512, 1024)
     assert more.loss <= first.loss
     assert more.seconds > first.seconds
 
@@ -174,7 +185,7 @@ def test_resumes(tmp_path: Path) -> None:
 def test_a_loaded_agent_has_the_same_scores_to_the_bit(
     tmp_path: Path, algorithm: str, mode: str
 ) -> None:
-    trained = train("rl", small(algorithm, mode, steps=128), DUFFING)
+    trained = train_rl(small(algorithm, mode, steps=128), DUFFING)
     trained.save(tmp_path / "agent.pt")
     loaded = Sb3.load(tmp_path / "agent.pt", ReverseDuffing())
     made = Sb3(ReverseDuffing(), trained.setup["noise_std"], trained=trained)
@@ -214,7 +225,7 @@ def test_through_the_command(tmp_path: Path, capsys: Any) -> None:
         ({"action_mode": "correction"}, None),
         ({"action_mode": "normalized"}, r"sizes=\[4, 2\]; expected \[2, 2\]"),
         ({"action_mode": "x"}, "unknown action_mode 'x'"),
-        ({"normalization": None}, "without the normalisation of its features"),
+        ({"normalization": None}, "is not a saved TrainedAgent"),
     ],
 )
 def test_bad_files(
@@ -238,44 +249,45 @@ def test_other_files(tmp_path: Path, agent: TrainedAgent) -> None:
     with pytest.raises(ValueError, match="is damaged or no file of saved weights"):
         TrainedAgent.load(path, ReverseDuffing())
     torch.save({"facts": json.dumps({}), "normalization": []}, path)
-    with pytest.raises(ValueError, match="is not a saved agent"):
+    with pytest.raises(ValueError, match="is not a saved TrainedAgent"):
         TrainedAgent.load(path, ReverseDuffing())
 
 
 def test_bad_checkpoints(tmp_path: Path) -> None:
     checkpoint = tmp_path / "agent.pt"
     go_on = {"checkpoint": checkpoint, "resume": True}
-    with pytest.raises(ValueError, match=r"the checkpoint file .* is missing"):
-        train("rl", small(), DUFFING, **go_on)
-    train("rl", small(steps=64), DUFFING, checkpoint=checkpoint)
+    with pytest.raises(ValueError, match=r"cannot read .*agent"):
+        train_rl(small(), DUFFING, **go_on)
+    train_rl(small(steps=64), DUFFING, checkpoint=checkpoint)
     academic = Game.of("Academic")
     with pytest.raises(ValueError, match="trained with system='ReverseDuffing'; expected 'Acad"):
-        train("rl", small(), academic, **go_on)
+        train_rl(small(), academic, **go_on)
     with pytest.raises(ValueError, match="action_mode='gain'; expected 'correction'"):
-        train("rl", small(mode="correction"), DUFFING, **go_on)
-    with pytest.raises(ValueError, match="is damaged or no checkpoint of sac"):
-        train("rl", small("sac"), DUFFING, **go_on)
-    (tmp_path / "agent.pt.vecnormalize.pkl").unlink()
-    with pytest.raises(ValueError, match=r"the normalisation file .* is missing"):
-        train("rl", small(), DUFFING, **go_on)
+        train_rl(small(mode="correction"), DUFFING, **go_on)
+    with pytest.raises(ValueError, match="algorithm='ppo'; expected 'sac'"):
+        train_rl(small("sac"), DUFFING, **go_on)
+    checkpoint.write_bytes(b"zip")
+    with pytest.raises(ValueError, match="is damaged or no file of saved weights"):
+        train_rl(small(), DUFFING, **go_on)
     with pytest.raises(ValueError, match="without a checkpoint"):
-        train("rl", small(), DUFFING, resume=True)
+        train_rl(small(), DUFFING, resume=True)
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"algorithm": "dqn"}, "algorithm='dqn'; expected ppo or sac"),
-        ({"action_mode": "estimate"}, "action_mode='estimate'; expected gain or"),
+        ({"algorithm": "dqn"}, "algorithm='dqn'; expected ppo, sac"),
+        ({"action_mode": "estimate"}, "action_mode='estimate'; expected gain, correction or"),
         ({"steps": 0}, "steps=0; expected a whole number"),
         ({"stack": 3}, "stack=3; expected 1, since there is a prediction"),
         ({"gamma": 1.5}, "gamma=1.5; expected a number from 0 to 1"),
         ({"batch": 500}, "batch=500; expected a divisor of rows·rollout = 4096"),
+        ({"algorithm": "sac"}, "buffer=0; expected a positive whole number with sac; its preset"),
     ],
 )
 def test_bad_settings(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        Config(**arguments).filled()
+        Config(**arguments)
 
 
 # Scripts and hyperparameter files
@@ -290,7 +302,7 @@ def test_the_zoos_files_name_all_envs_and_hold_our_defaults(algorithm: str) -> N
     made = {name: ast.literal_eval(value) for name, value in re.findall(r"(\w+):\"(.*?)\"", text)}
     assert set(made) == {"action_mode", "reward"}
     assert set(read) == {env_id(cls) for cls in SYSTEMS.classes().values()}
-    config = Config(algorithm=algorithm).filled()  # pyright: ignore
+    config = RLTrainer.configured({"preset": algorithm})
     chosen = options(config, 2)
     for name, held in read.items():
         assert make(name, **made).action_space.high.max() == 1
@@ -310,7 +322,7 @@ def test_the_script_trains_scores_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["--system", "ReverseDuffing", "--episodes", "3", "--out", str(tmp_path)]
-    arguments += [f"--{n.replace('_', '-')}={v}" for n, v in SMALL.items()]
+    arguments += ["--steps", "4096"]
 
     def run(*more: str) -> str:
         monkeypatch.setattr(sys, "argv", ["train_rl.py", *arguments, *more])
@@ -319,9 +331,9 @@ def test_the_script_trains_scores_and_goes_on(
 
     first = run()
     lines = [line.split()[:3] for line in first.splitlines()[1:]]
-    assert [line[1] for line in lines] == ["open_loop", "ekf", "ppo"]
+    assert [line[1] for line in lines] == ["open_loop", "ekf", "ppo,"]
     files = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.glob("*.pt")}
     assert run() == first
     assert files == {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.glob("*.pt")}
-    with pytest.raises(SystemExit, match=r"train_rl: error: .*trained with width=8; expected 9"):
-        run("--width=9")
+    with pytest.raises(SystemExit, match=r"train_rl: error: .*with steps=4096; expected 8192"):
+        run("--steps=8192")

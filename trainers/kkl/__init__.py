@@ -7,8 +7,7 @@ inputs (the motor) is not autonomous: its T is told u(t), whose values are the p
 input, and how long ago z began, and starts at the first sample instead of in the infinite past;
 nothing is integrated backward, along which a dissipative plant would run away.
 
-`dynamics` has (A, B) and the exact integration of z, `labels` the simulated states and their T(x),
-`networks` the maps T and T*, `observer` the estimator and its file, `config` the settings,
-`fitting` one training of one network, `run` that of both, `course` how it begins, goes on and
-ends, `pictures` the figures.
+`config` has the settings, `labels` the simulated states and their T(x), `samples` these as scaled
+tensors, `fitting` one training of one network, `two_stages` that of both, `trainer` what the three
+trainers share, `pictures` the figures.
 """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pinnobs_gym.estimation.learned.kkl_maps import Mlp
+from pinnobs_gym.estimation.learned.trained_file import with_tensors
 
 Method: TypeAlias = Literal["gauss_newton", "adam"]
 
@@ -168,23 +169,23 @@ class Fit:
             start += p.numel()
 
     def state(self) -> dict[str, Any]:
-        """All that changes, as tensors and plain values."""
+        """All that changes, as arrays and plain values."""
         return {
             "iteration": self.iteration,
             "damping": self._damping,
-            "H": self._H,
-            "parameters": [p.detach().clone() for p in self.net.parameters],
+            "H": None if self._H is None else self._H.cpu().numpy(),
+            "parameters": [p.detach().cpu().numpy() for p in self.net.parameters],
             "adam": copy.deepcopy(self._adam.state_dict()),
-            "generator": self.generator.get_state(),
+            "generator": self.generator.get_state().numpy(),
         }
 
-    def take_up(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly from what `state` gave."""
         self.iteration, self._damping = state["iteration"], state["damping"]
         device = self.net.parameters[0].device
-        self._H = None if state["H"] is None else state["H"].to(device)
+        self._H = None if state["H"] is None else torch.from_numpy(state["H"]).to(device)
         with torch.no_grad():
             for p, kept in zip(self.net.parameters, state["parameters"], strict=True):
-                p.copy_(kept)
-        self._adam.load_state_dict(state["adam"])
-        self.generator.set_state(state["generator"].cpu())
+                p.copy_(torch.from_numpy(kept))
+        self._adam.load_state_dict(with_tensors(state["adam"]))
+        self.generator.set_state(torch.from_numpy(state["generator"]))

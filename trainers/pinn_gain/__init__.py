@@ -9,101 +9,261 @@ gain is told through R.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from pinnobs_gym.estimators.pinn_gain import TrainedGain
+from pinnobs_gym.estimation.learned.gain_network import memory_size, shapes
+from pinnobs_gym.estimation.learned.trained_file import with_tensors
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.pinn_gain import Layers, TrainedGain
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System, vector
-from pinnobs_gym.training.log import SILENT, Log
-from pinnobs_gym.training.loop import bar, interruption
-from trainers.pinn_gain.checkpoint import restore, save
+from pinnobs_gym.simulation.system import System, output_scale, vector
+from pinnobs_gym.training.trainer import Trainer
 from trainers.pinn_gain.config import Config
-from trainers.pinn_gain.run import Run
+from trainers.pinn_gain.held_out import HeldOut
+from trainers.pinn_gain.rollout import Model
+from trainers.pinn_gain.smooth import smooth
+from trainers.pinn_gain.streams import Data, Streams
 
-__all__ = ["Config", "train"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_SAMPLES = 10
 """The shortest records that are trained on."""
+_RESTARTS = 3
+_PATIENCE = 10
+"""Chunks in a row without a finite loss after which training begins again."""
+_WARM_UP = 20
+"""Iterations over which Adam's step grows to its full size."""
+_AVERAGE = 0.98
+"""What the moving average of the weights keeps from one iteration to the next."""
+_SLOW = 5.0
+"""Weight w of the size of scaled errors beside their logarithm."""
+_RESOLUTION = 1e-3
+"""Scaled error below which an error is hardly made smaller."""
 
 
-def train(
-    system: System,
-    config: Config,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None = None,
-    log: Log = SILENT,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    progress: bool = False,
-) -> TrainedGain:
-    """Train a gain on the records of a batch of episodes.
+@dataclass(frozen=True, eq=False)
+class Best:
+    """The weights of the least held-out loss so far."""
+
+    loss: float
+    """See `HeldOut.loss`."""
+    iteration: int
+    """The iteration after which they were found; 0 is the EKF itself."""
+    seed: int
+    """What these weights began from."""
+    layers: Layers
+
+
+class PinnGainTrainer(Trainer[Config, TrainedGain]):
+    """Trains a gain on the records of a batch of ``config.episodes`` episodes.
 
     It begins as the EKF, and the weights of the least error on the records held out are kept, the
-    first ones among them. Ctrl-C ends it early and keeps them as well. If the loss leaves the
-    finite numbers for long, it begins again from the next seed, three times at most. On a CPU the
-    same seed gives the same weights.
-
-    Args:
-        system: the model.
-        config: the recipe.
-        record: the samples of ``config.episodes`` episodes and their prior; NaN is a missing
-            output.
-        noise_std: standard deviation of the output noise in output units, shape (ny,) or one number
-            for all; the benchmark's if None.
-        log: where curves go.
-        checkpoint: a file to keep the training's state in, written again as it goes on.
-        resume: go on from that file, exactly.
-        progress: show a bar with the loss in the terminal.
-
-    Raises:
-        ValueError: in one line, if the records cannot be trained on or the model does not explain
-            them, or the checkpoint is missing, damaged, or of another system, record or config
-            (`Config` may differ in ``iterations``, ``budget``, ``checkpoint_every`` and
-            ``log_every``).
-        FloatingPointError: if the loss does not stay finite from any of four seeds.
+    first ones among them. If the loss leaves the finite numbers for long, training begins again
+    from the next seed, three times at most.
     """
-    _check(system, record, config)
-    if resume and checkpoint is None:
-        raise ValueError("resume=True without a checkpoint; name its file")
-    told = system.setups["benchmark"].noise_std if noise_std is None else noise_std
-    run = Run(system, config, record, vector(told, system.ny, "noise_std"))
-    if resume and checkpoint is not None:
-        restore(run, checkpoint)
-    try:
-        with bar(config.iterations if progress else None) as show, interruption() as stopped:
-            while not run.finished() and not stopped:
-                run.step()
-                if run.iteration % config.log_every == 0:
-                    _log(log, run)
-                    show(run.iteration, f"loss {run.value:.3g} held out {run.latest:.3f} of EKF's")
-                if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
-                    save(run, checkpoint)
-        if checkpoint is not None:
-            save(run, checkpoint)
-    except KeyboardInterrupt:  # amid a step: the last checkpoint stays as it is
-        pass
-    trained = run.result()
-    log.hparams(
-        {"system": trained.system, **trained.config},
-        {"end/loss": trained.loss, "end/iterations": float(trained.iterations)},
-    )
-    return trained
+
+    name = "pinn_gain"
+    presets = {"default": Config}
+
+    def start(self) -> None:
+        config, system, record = self.config, self.system, self.record
+        _check(system, record, config)
+        ekf = EKF(system, noise_std=tuple(self.noise_std.tolist()))
+        self.std = np.sqrt(ekf.output_variance)
+        scale = torch.tensor(vector(system.scale, system.nx, "scale"))[:, None]
+        size = torch.tensor(output_scale(system))[:, None]
+        self.model = Model(system, config.variant, scale, size, torch.tensor(ekf.tuning()[0]))
+        smoothed = smooth(record, ekf)
+        usable = np.flatnonzero(smoothed.explained)
+        self.usable = len(usable)
+        learned = usable[usable < record.batch - config.held_out]
+        held = usable[usable >= record.batch - config.held_out]
+        if not len(learned) or not len(held):
+            raise ValueError(
+                f"the model of {type(system).__name__} explains the outputs of {self.usable} of "
+                f"{record.batch} records; expected some to learn from and some to hold out"
+            )
+        self.data = Data.of(system, record, smoothed, learned)
+        facts = self.facts(loss=1.0, seed=config.seed)
+        self.held_out = HeldOut(self.model, Data.of(system, record, smoothed, held), facts)
+        self.best: Best | None = None
+        self.stuck = False
+        self.loss, self.gradient, self.latest = math.nan, math.nan, math.nan
+        self._begin(attempt=0)
+
+    @property
+    def seed(self) -> int:
+        """What the present weights began from."""
+        return self.config.seed + self.attempt
+
+    def _begin(self, attempt: int) -> None:
+        """Draw the weights and streams of an attempt."""
+        self.attempt, self.failures, self.since = attempt, 0, 0
+        generator = torch.Generator().manual_seed(self.seed)
+        config, system = self.config, self.system
+        self.parameters: list[Tensor] = []
+        sizes = shapes(config.variant, system.nx, system.ny, config.width)
+        for rows, columns in sizes:
+            W = torch.randn(rows, columns, generator=generator, dtype=torch.float64)
+            last = len(self.parameters) == 2 * len(sizes) - 2
+            W = W * (0.0 if last else columns**-0.5)
+            self.parameters += [W, torch.zeros(rows, dtype=torch.float64)]
+        self.average = [p.clone() for p in self.parameters]
+        for parameter in self.parameters:
+            parameter.requires_grad_()
+        self._optimiser = torch.optim.Adam(self.parameters, lr=config.learning_rate)
+        first = 1.0 if config.variant == "kalman" else 0.0
+        memory = memory_size(config.variant, system.ny, config.width), first
+        chunk = min(config.chunk, self.record.num_samples)
+        sizes = (config.streams, chunk)
+        self.streams = Streams(self.model, self.data, self.std, *sizes, memory, self.seed)
+        if self.best is None:
+            self._validate()
+
+    def step(self) -> None:
+        """Roll all streams over one chunk, and make a step of Adam."""
+        weights = list(zip(self.parameters[::2], self.parameters[1::2], strict=True))
+        with np.errstate(all="ignore"):  # streams that are lost begin anew
+            moments, errors = self.streams.roll(weights)
+        loss = self._loss([moment.P for moment in moments], errors)
+        self.iteration += 1
+        self.since += 1
+        self.loss = loss.item()
+        self._optimiser.zero_grad()
+        if math.isfinite(self.loss):
+            loss.backward()
+            self.gradient = float(torch.nn.utils.clip_grad_norm_(self.parameters, 1.0))
+        if math.isfinite(self.loss) and math.isfinite(self.gradient):
+            self.failures = 0
+            for group in self._optimiser.param_groups:
+                group["lr"] = self.config.learning_rate * min(1.0, self.since / _WARM_UP)
+            self._optimiser.step()
+            kept = min(_AVERAGE, 1 - 1 / (1 + self.since / 2))
+            for average, parameter in zip(self.average, self.parameters, strict=True):
+                average.lerp_(parameter.detach(), 1 - kept)
+        else:
+            self.failures += 1
+        self.streams.continue_from(moments[-1])
+        if self.failures == _PATIENCE:
+            self._restart()
+        elif self.iteration % self.config.check_every == 0:
+            self._validate()
+
+    def _loss(self, covariances: list[Tensor], errors: Tensor) -> Tensor:
+        """The mean over streams of log e + we, e the root mean square scaled error of a chunk: the
+        first counts all streams alike, the second those that are slow to settle. And that of the
+        likelihood of the errors under the covariance's diagonal, its tails made heavy."""
+        size = (errors.square().mean((0, 1)) + _RESOLUTION**2).sqrt()
+        loss = (size.log() + _SLOW * size).mean()
+        if self.config.variant == "gru" or not self.config.consistency:
+            return loss
+        variance = torch.stack([torch.diagonal(P).T for P in covariances])
+        variance = variance / self.model.scale**2 + 1e-10
+        surprise = 4 * torch.log1p(errors.square() / (4 * variance)) + variance.log()
+        return loss + self.config.consistency * surprise.mean()
+
+    def _validate(self) -> None:
+        """Find the loss of the averaged weights on the records held out, and keep the weights if it
+        is the least so far."""
+        layers = layers_of(self.average)
+        loss = self.held_out.loss(layers)
+        if self.best is None or loss < self.best.loss:
+            self.best = Best(loss, self.iteration, self.seed, layers)
+        self.latest = loss
+
+    def _restart(self) -> None:
+        if self.attempt == _RESTARTS:
+            self.stuck = True
+        else:
+            self._begin(self.attempt + 1)
+
+    def finished(self) -> bool:
+        """Whether the iterations are used up, or no seed gives finite losses."""
+        return self.iteration >= self.config.iterations or self.stuck
+
+    def progress(self) -> float:
+        return self.iteration / self.config.iterations
+
+    def status(self) -> str:
+        return f"loss {self.loss:.3g} held out {self.latest:.3f} of EKF's"
+
+    def curves(self) -> Mapping[str, float]:
+        assert self.best is not None
+        return {
+            "loss/train": self.loss,
+            "loss/gradient": self.gradient,
+            "loss/held_out": self.latest,
+            "loss/best": self.best.loss,
+        }
+
+    def result(self) -> TrainedGain:
+        """The network of the least held-out loss.
+
+        Raises:
+            FloatingPointError: in one line, if no seed gave finite losses for long.
+        """
+        if self.iteration % self.config.check_every and not self.stuck:
+            self._validate()
+        assert self.best is not None
+        if self.stuck and self.best.iteration == 0:
+            raise FloatingPointError(
+                f"the loss of pinn_gain on {type(self.system).__name__} left the finite numbers "
+                f"from seed {self.config.seed} and the {self.attempt} after it; try a lower "
+                "learning_rate"
+            )
+        return TrainedGain(
+            **self.facts(loss=self.best.loss, seed=self.best.seed),
+            layers=self.best.layers,
+            variant=self.config.variant,
+        )
+
+    def figures(self, trained: TrainedGain) -> dict[str, Figure]:
+        return {}
+
+    def state(self) -> dict[str, Any]:
+        assert self.best is not None
+        return {
+            "counts": {name: getattr(self, name) for name in _COUNTS},
+            "best": {f.name: getattr(self.best, f.name) for f in fields(Best)},
+            "streams": self.streams.state(),
+            "parameters": [p.detach().numpy() for p in self.parameters],
+            "average": [p.numpy() for p in self.average],
+            "optimiser": self._optimiser.state_dict(),
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        self._begin(state["counts"]["attempt"])
+        self.best = Best(**state["best"])
+        for name in _COUNTS:
+            setattr(self, name, state["counts"][name])
+        with torch.no_grad():
+            for mine, kept in zip(self.parameters, state["parameters"], strict=True):
+                mine.copy_(torch.from_numpy(kept))
+        self.average = [torch.from_numpy(kept) for kept in state["average"]]
+        self._optimiser.load_state_dict(with_tensors(state["optimiser"]))
+        self.streams.load_state(state["streams"])
 
 
-def _log(log: Log, run: Run) -> None:
-    assert run.best is not None
-    log.scalar("loss/train", run.value, run.iteration)
-    log.scalar("loss/gradient", run.gradient, run.iteration)
-    log.scalar("loss/held_out", run.latest, run.iteration)
-    log.scalar("loss/best", run.best.loss, run.iteration)
+_COUNTS = ("attempt", "failures", "since", "stuck", "latest")
+"""What is counted, and the latest held-out loss."""
+
+
+def layers_of(parameters: list[Tensor]) -> Layers:
+    """The same as NumPy arrays, in pairs."""
+    arrays = [p.detach().numpy().copy() for p in parameters]
+    return tuple(zip(arrays[::2], arrays[1::2], strict=True))
 
 
 def _check(system: System, record: Record, config: Config) -> None:
-    """Whether the record can be trained on."""
+    """Check that a record can be trained on."""
     name = type(system).__name__
     sizes = (("y", record.y, system.ny), ("u", record.u, system.nu))
     for symbol, array, size in (*sizes, ("xhat0", record.prior.mean, system.nx)):

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import get_args
 
 from pinnobs_gym.estimation.learned.gain_network import Variant
-from pinnobs_gym.training.loop import expect
+from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_setting, check_whole
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(TrainingConfig):
     """The recipe of a gain shared by all episodes."""
+
+    may_change = ("iterations",)
 
     variant: Variant = "kalman"
     """A network that corrects a Kalman gain, or a recurrent network that gives the gain alone."""
@@ -32,10 +34,6 @@ class Config:
     """Step of Adam, after a short warm-up constant; the weights that count are a moving average."""
     consistency: float = 0.1
     """Weight of the likelihood of the errors under the covariance, beside their size."""
-    seed: int = 0
-    """What the weights, the streams and their noise are drawn from."""
-    budget: float | None = None
-    """CPU seconds after which training stops, those before a resumption included."""
     check_every: int = 25
     """Iterations from one look at the records held out to the next."""
     checkpoint_every: int = 50
@@ -43,20 +41,16 @@ class Config:
     log_every: int = 5
     """Iterations from one point of the logged curves to the next."""
 
+    @property
+    def records(self) -> int:
+        return self.episodes
+
     def __post_init__(self) -> None:
-        known = get_args(Variant)
-        expect(self, "variant", " or ".join(known), lambda v: v in known)
-        whole = ("width", "iterations", "streams", "chunk", "held_out")
-        for name in (*whole, "check_every", "checkpoint_every", "log_every"):
-            expect(self, name, "a whole number of at least 1", lambda v: v == int(v) and v >= 1)
-        least = self.held_out + 1
-        expect(
-            self,
-            "episodes",
-            f"a whole number over held_out={self.held_out}",
-            lambda v: v == int(v) >= least,
-        )
-        expect(self, "seed", "a whole number of at least 0", lambda v: v == int(v) and v >= 0)
-        expect(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
-        expect(self, "consistency", "a number of at least 0", lambda v: 0 <= v < math.inf)
-        expect(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
+        self.check_shared()
+        check_choice(self, "variant", get_args(Variant))
+        whole = ("width", "iterations", "streams", "chunk", "held_out", "check_every")
+        check_whole(self, whole)
+        expected = f"a whole number over held_out={self.held_out}"
+        check_setting(self, "episodes", expected, lambda v: v == int(v) > self.held_out)
+        check_setting(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
+        check_setting(self, "consistency", "a number of at least 0", lambda v: 0 <= v < math.inf)

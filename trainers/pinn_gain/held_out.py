@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from pinnobs_gym.estimation.learned.gain_network import Variant, shapes
@@ -23,13 +26,12 @@ class HeldOut:
     Args:
         model: what is rolled out.
         data: the records.
-        noise_std: standard deviations of the output noise that training is told, shape (ny,).
+        facts: of the training; their noise is that of level one.
     """
 
-    def __init__(self, model: Model, data: Data, noise_std: np.ndarray) -> None:
-        self._model, self._data = model, data
-        self._told = tuple(noise_std.tolist())
-        std = np.sqrt(EKF(model.system, self._told).output_variance)
+    def __init__(self, model: Model, data: Data, facts: Mapping[str, Any]) -> None:
+        self._model, self._data, self._facts = model, data, facts
+        std = np.sqrt(EKF(model.system, facts["noise_std"]).output_variance)
         count = len(data.x)
         rows = np.tile(np.arange(count), len(LEVELS))
         self._std = np.repeat(np.multiply.outer(std, LEVELS), count, axis=1)  # (ny, rows)
@@ -50,8 +52,8 @@ class HeldOut:
     def _errors(self, layers: Layers, variant: Variant) -> np.ndarray:
         """Root mean square scaled errors (windows, rows)."""
         data, rows = self._data, self._rows
-        trained = TrainedGain(layers, variant, "", {}, self._told, {}, 0, 1.0, 0, 0.0)
-        gain = PinnGain(self._model.system, self._told, trained=trained)
+        trained = TrainedGain(**self._facts, layers=layers, variant=variant)
+        gain = PinnGain(self._model.system, trained.noise_std, trained=trained)
         state = gain.begin(Prior(data.mean[rows], data.cov[rows]), self._std**2)
         square = np.empty((len(data.t), len(rows)))
         with np.errstate(all="ignore"):

@@ -132,9 +132,9 @@ class Streams:
         xhat = torch.where(new, moment.xhat, predicted.xhat)
         return Moment(xhat, torch.where(new, moment.P, predicted.P), moment.memory)
 
-    def go_on(self, last: Moment) -> None:
-        """Take up the estimates at the end of a chunk; some streams, those that are at an end and
-        those that are lost begin anew."""
+    def continue_from(self, last: Moment) -> None:
+        """Go on from the estimates at the end of a chunk; some streams, those that are at an end
+        and those that are lost begin anew."""
         self.xhat, self.P = last.xhat.detach().numpy().copy(), last.P.detach().numpy().copy()
         self.memory = last.memory.detach().numpy().copy()
         x = self.data.x[self.record, self.position + self.chunk - 1].T
@@ -146,14 +146,14 @@ class Streams:
         self.begin((self.rng.random(len(over)) < RESTART) | over | ~sound)
 
     def state(self) -> dict[str, Any]:
-        """All that `take_up` needs."""
-        arrays = {n: torch.tensor(getattr(self, n)) for n in _ARRAYS}
+        """All that `load_state` needs."""
+        arrays = {n: getattr(self, n) for n in _ARRAYS}
         return {"arrays": arrays, "rng": self.rng.bit_generator.state}
 
-    def take_up(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what `state` gave."""
         for name in _ARRAYS:
-            setattr(self, name, state["arrays"][name].numpy().copy())
+            setattr(self, name, state["arrays"][name].copy())
         self.rng.bit_generator.state = state["rng"]
 
 

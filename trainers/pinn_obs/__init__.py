@@ -6,186 +6,247 @@ Nonlinear Dynamical Systems". Equation numbers are the paper's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from pinnobs_gym.estimators.pinn_obs import Trained
+from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System, vector
-from pinnobs_gym.training.log import SILENT, Log
-from pinnobs_gym.training.loop import bar, interruption
-from trainers.pinn_obs.config import Config
-from trainers.pinn_obs.fast import FastRun
-from trainers.pinn_obs.paper import PaperRun
-from trainers.pinn_obs.progress import described, gain_figure, log_end, log_terms
-from trainers.pinn_obs.run import Run
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.training.log import Log
+from pinnobs_gym.training.loop import deferred_interrupt, train
+from pinnobs_gym.training.trainer import Trainer
+from trainers.pinn_obs.config import Config, fast, paper, transfer
+from trainers.pinn_obs.fast_recipe import FastRecipe
+from trainers.pinn_obs.minimum import Best, Mark, Method
+from trainers.pinn_obs.paper_recipe import PaperRecipe
+from trainers.pinn_obs.passes import unflattened
+from trainers.pinn_obs.pictures import figures
+from trainers.pinn_obs.recipe import Recipe
 from trainers.pinn_obs.stacked import advance
 
-__all__ = ["Config", "gain_figure", "train", "train_many", "train_rows"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_SAMPLES = 10
 """The shortest record that is trained on."""
-_RUNS: dict[str, type[Run]] = {"adam": PaperRun, "ssbroyden": FastRun}
+_RECIPES: dict[str, type[Recipe]] = {"adam": PaperRecipe, "ssbroyden": FastRecipe}
+_RESTARTS = 3
+_TERMS = ("initial", "equation", "output")
 
 
-def train(
-    system: System,
-    config: Config,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None = None,
-    log: Log = SILENT,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    progress: bool = False,
-) -> Trained:
-    """Train PINN-Obs on the record of one episode.
+class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
+    """Trains PINN-Obs on the record of one episode.
 
-    The weights of the least training loss are kept. Ctrl-C ends it early and keeps them as well.
-    If the loss leaves the finite numbers, it begins again from the next seed, three times at most.
-    On a CPU the same seed gives the same weights.
-
-    Args:
-        system: the model.
-        config: the recipe.
-        record: the samples of one episode and the initial estimate; NaN is a missing output.
-        noise_std: standard deviation of the output noise in output units, shape (ny,) or one number
-            for all; zero if None. The paper's recipe makes no use of it.
-        log: where curves and figures go.
-        checkpoint: a file to keep the training's state in, written again as it goes on.
-        resume: go on from that file, exactly.
-        progress: show a bar with the terms of the loss in the terminal.
-
-    Raises:
-        ValueError: in one line, if the record cannot be trained on, or the checkpoint is missing,
-            damaged, or of another system, record or config (`Config` may differ in ``iterations``,
-            ``budget``, ``checkpoint_every`` and ``log_every``).
-        FloatingPointError: if the loss does not stay finite from any of four seeds.
+    The weights of the least training loss are kept. If the loss leaves the finite numbers, training
+    begins again from the next seed, three times at most. The paper's recipe makes no use of the
+    noise.
     """
-    _check(system, record, config)
-    if resume and checkpoint is None:
-        raise ValueError("resume=True without a checkpoint; name its file")
-    noise = vector(0.0 if noise_std is None else noise_std, system.ny, "noise_std")
-    run = _RUNS[config.optimiser](system, config, record, noise)
-    if resume and checkpoint is not None:
-        run.restore(checkpoint)
-    try:
-        with bar(config.iterations if progress else None) as show, interruption() as stopped:
-            while not run.finished() and not (stopped and run.best):
-                _iterate(run, log, checkpoint, show if progress else None)
-        if checkpoint is not None and run.best is not None:
-            run.save(checkpoint)
-    except KeyboardInterrupt:  # amid a step: the last checkpoint stays as it is
-        if run.best is None:
-            raise
-    trained = run.result()
-    log_end(log, system, trained, run)
-    return trained
 
+    name = "pinn_obs"
+    presets = {"fast": fast, "transfer": transfer, "paper": paper}
 
-def train_many(
-    system: System,
-    config: Config,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None = None,
-) -> list[Trained]:
-    """Train PINN-Obs on each row of a record, of one episode each, with one seed; see `train`.
+    def start(self) -> None:
+        _check(self.system, self.record, self.config)
+        recipe = _RECIPES[self.config.optimiser]
+        self.recipe = recipe(self.system, self.config, self.record, self.noise_std)
+        self._kept: Best | None = None  # of attempts that ended in a loss that is not finite
+        self._begin(attempt=0)
 
-    With a GPU the fast recipe trains on all rows at once, each until its own patience, iterations
-    or budget end it (of the CPU seconds of all); see `Config.device`. Otherwise it is one row after
-    another, exactly as by `train`: on a CPU that is the fastest. After Ctrl-C rows keep the best
-    weights that they have, be it those of their first iteration.
+    def _begin(self, attempt: int) -> None:
+        """Draw the weights of an attempt."""
+        self.attempt = attempt
+        self.best: Best | None = None
+        self.mark = Mark(math.inf, self.iteration)
+        self.stuck = False
+        seed = self.config.seed + attempt
+        self._first = self.recipe.draw(torch.Generator().manual_seed(seed))
+        self._method: Method | None = None
 
-    Args:
-        system: the model.
-        config: the recipe.
-        record: the samples of all episodes.
-        noise_std: see `train`.
-    """
-    rows = [record.rows(slice(i, i + 1)) for i in range(record.batch)]
-    for row in rows:
-        _check(system, row, config)
-    noise = vector(0.0 if noise_std is None else noise_std, system.ny, "noise_std")
-    device, kind = _device(config), _RUNS[config.optimiser]
-    with interruption() as stopped:
-        if device != "cpu" and config.optimiser == "ssbroyden":
-            runs = [kind(system, config, row, noise) for row in rows]
-            advance(runs, device, stopped)
-            return [run.result() for run in runs]
-        found = []
+    @property
+    def theta(self) -> np.ndarray:
+        """The iteration's weights (n,)."""
+        return self._first if self._method is None else self._method.x
+
+    def step(self) -> None:
+        """Make one iteration, of which the first only looks at the weights that were drawn."""
+        lower = True
+        if self._method is None:
+            self._method = self.recipe.begin(self._first)
+        else:
+            lower = self._method.step(self.recipe.objective)
+        self.took(self._method.f, self._method.x, lower)
+
+    def took(self, loss: float, theta: np.ndarray, lower: bool = True) -> None:
+        """Count an iteration that ended at weights theta (n,), and keep them if their loss is the
+        least; ``lower`` is false if there is none lower to be found."""
+        self.iteration += 1
+        self.stuck = not lower
+        if not math.isfinite(loss):
+            self._restart()
+        elif self.best is None or loss < self.best.loss:
+            if loss < (1 - self.config.improvement) * self.mark.loss:
+                self.mark = Mark(loss, self.iteration)
+            self.best = Best(loss, self.iteration, self.config.seed + self.attempt, theta)
+
+    def _restart(self) -> None:
+        """Begin again from the next seed; what was best so far is kept. After the third time there
+        is no other, and the training ends."""
+        self._keep()
+        if self.attempt == _RESTARTS:
+            self.stuck = True
+        else:
+            self._begin(self.attempt + 1)
+
+    def _keep(self) -> None:
+        if self.best is not None and (self._kept is None or self.best.loss < self._kept.loss):
+            self._kept = self.best
+
+    def finished(self) -> bool:
+        """Whether the iterations or the patience are used up, or nothing lower can be found."""
+        since = self.iteration - self.mark.iteration
+        return (
+            self.iteration >= self.config.iterations or since >= self.config.patience or self.stuck
+        )
+
+    def progress(self) -> float:
+        return self.iteration / self.config.iterations
+
+    def status(self) -> str:
+        parts = zip(_TERMS, self._terms(self.theta).tolist(), strict=True)
+        text = " ".join(f"{name} {value:.2e}" for name, value in parts)
+        best = f"{self.best.loss:.2e}" if self.best else "none"
+        return f"{text} best {best}"
+
+    def curves(self) -> Mapping[str, float]:
+        terms = self._terms(self.theta)
+        found = {f"loss/{name}": float(term) for name, term in zip(_TERMS, terms, strict=True)}
+        found["loss/total"] = self._total(terms)
+        if self.best is not None:
+            found["loss/best"] = self.best.loss
+        if (loss := self.recipe.held_out(self.theta)) is not None:
+            found["loss/held_out"] = loss
+        return found
+
+    def _terms(self, theta: np.ndarray) -> np.ndarray:
+        """The three terms of the loss (3,) at weights theta (n,), unweighted, in the system's own
+        units."""
+        return self.recipe.objective.terms(theta)
+
+    def _total(self, terms: np.ndarray) -> float:
+        """The paper's loss from its terms (3,)."""
+        return float(terms @ [self.config.w0, self.config.w_ode, self.config.w_y])
+
+    def state(self) -> dict[str, Any]:
+        # The attempt stands for the state of chance: nothing is drawn after the weights.
+        assert self.best is not None
+        assert self._method is not None
+        return {
+            "attempt": self.attempt,
+            "stuck": self.stuck,
+            "mark": asdict(self.mark),
+            "best": asdict(self.best),
+            "method": self.recipe.method_state(self._method),
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        self._begin(state["attempt"])
+        self.best, self.mark = Best(**state["best"]), Mark(**state["mark"])
+        self.stuck = state["stuck"]
+        best = self.best.theta, self.best.loss
+        self._method = self.recipe.load_method(state["method"], best)
+
+    def result(self) -> TrainedNetwork:
+        """The network of the least loss of all attempts.
+
+        Raises:
+            FloatingPointError: in one line, if no loss was finite.
+        """
+        self._keep()
+        best = self._kept
+        if best is None:
+            advice = "; try a lower learning_rate" if self.config.optimiser == "adam" else ""
+            raise FloatingPointError(
+                f"the loss of PINN-Obs on {type(self.system).__name__} left the finite numbers from"
+                f" seed {self.config.seed} and the {self.attempt} after it{advice}"
+            )
+        return TrainedNetwork(
+            **self.facts(loss=self._total(self._terms(best.theta)), seed=best.seed),
+            architecture=self.recipe.architecture,
+            layers=unflattened(self.recipe.architecture, best.theta),
+            t=self.record.t.copy(),
+            y=self.record.y[0].copy(),
+            covariance=self.recipe.covariance(best.theta),
+        )
+
+    def figures(self, trained: TrainedNetwork) -> dict[str, Figure]:
+        return figures(self.system, trained)
+
+    @classmethod
+    def train_rows(
+        cls,
+        system: System,
+        config: Config,
+        *,
+        record: Record,
+        noise_std: Sequence[float] | float | None = None,
+        folder: Path | None = None,
+    ) -> list[TrainedNetwork]:
+        """Train on each row of a record, of one episode each, with one seed.
+
+        With a GPU and no folder the fast recipe trains on all rows at once, each until its own
+        patience, iterations or budget end it (of the CPU seconds of all); see `Config.device`.
+        Otherwise it is one row after another, exactly as by `train`: on a CPU that is the fastest.
+        After Ctrl-C rows keep the best weights that they have, be it those of their first
+        iteration.
+
+        Args:
+            system: the model.
+            config: the recipe; its seed is that of every row.
+            record: the samples of all episodes.
+            noise_std: see `Trainer`.
+            folder: where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained
+                network; nothing is kept without one.
+        """
+        rows = [record.rows(slice(i, i + 1)) for i in range(record.batch)]
         for row in rows:
-            run = kind(system, config, row, noise)
-            while not run.finished() and not (stopped and run.best):
-                run.step()
-            found.append(run.result())
+            _check(system, row, config)
+        device = _device(config)
+
+        def begun(row: Record) -> PinnObsTrainer:
+            return cls(system, config, record=row, noise_std=noise_std)
+
+        with deferred_interrupt() as interrupt:
+            if folder is None and device != "cpu" and config.optimiser == "ssbroyden":
+                trainers = [begun(row) for row in rows]
+                advance(trainers, device, interrupt)
+                return [trainer.result() for trainer in trainers]
+            if folder is None:
+                return [train(begun(row)) for row in rows]
+            found = []
+            for i, row in enumerate(rows):
+                place = folder / f"row-{i}"
+                with Log(place) as log:
+                    trained = train(begun(row), log=log, checkpoint=place / "checkpoint.pt")
+                trained.save(place / "trained.pt")
+                found.append(trained)
         return found
 
 
-def train_rows(
-    system: System,
-    config: Config,
-    *,
-    record: Record,
-    noise_std: Sequence[float] | float | None = None,
-    folder: Path | None = None,
-) -> list[Trained]:
-    """Train on each row of a record, and keep what comes of it in a folder if one is given.
-
-    Args:
-        system: the model.
-        config: the recipe; its seed is that of every row.
-        record: the samples of all episodes.
-        noise_std: see `train`.
-        folder: where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained
-            network, by `train`; without one nothing is kept, and `train_many` is used.
-    """
-    if folder is None:
-        return train_many(system, config, record=record, noise_std=noise_std)
-    found = []
-    for i in range(record.batch):
-        place = folder / f"row-{i}"
-        with Log(place) as log:
-            trained = train(
-                system,
-                config,
-                record=record.rows(slice(i, i + 1)),
-                noise_std=noise_std,
-                log=log,
-                checkpoint=place / "checkpoint.pt",
-            )
-        trained.save(place / "trained.pt")
-        found.append(trained)
-    return found
-
-
 def _device(config: Config) -> str:
-    there = torch.cuda.is_available()
-    if config.device == "cuda" and not there:
+    present = torch.cuda.is_available()
+    if config.device == "cuda" and not present:
         raise ValueError("device='cuda'; torch finds no GPU here")
-    return "cuda" if there and config.device != "cpu" else "cpu"
-
-
-def _iterate(
-    run: Run, log: Log, checkpoint: Path | None, show: Callable[[int, str], None] | None
-) -> None:
-    """One iteration, and what is to be shown and kept of it."""
-    config = run.config
-    told = run.iteration % config.log_every == 0
-    run.step()
-    if told:
-        log_terms(log, run)
-        if show is not None:
-            show(run.iteration, described(run))
-    if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
-        run.save(checkpoint)
+    return "cuda" if present and config.device != "cpu" else "cpu"
 
 
 def _check(system: System, record: Record, config: Config) -> None:
-    """Whether the record can be trained on."""
+    """Check that a record can be trained on."""
     name = type(system).__name__
     if (np.diff(record.t.astype(config.dtype)) <= 0).any():
         raise ValueError(
@@ -207,6 +268,6 @@ def _check(system: System, record: Record, config: Config) -> None:
         raise ValueError(
             f"y holds infinite numbers; {name} needs finite ones, or NaN where missing"
         )
-    there = [column[~np.isnan(column)] for column in y.T]
-    if not any(len(column) and np.ptp(column) > 0 for column in there):
+    present = [column[~np.isnan(column)] for column in y.T]
+    if not any(len(column) and np.ptp(column) > 0 for column in present):
         raise ValueError(f"y of {name} does not vary over the record; there is nothing to learn")

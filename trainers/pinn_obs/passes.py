@@ -8,13 +8,13 @@ once in torch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from array_api_compat import array_namespace, device
 
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network
+from pinnobs_gym.estimation.learned.mlp import Architecture, Layers
 from pinnobs_gym.simulation.system import Array
 
 _CHUNK = 2000
@@ -59,22 +59,30 @@ _ACTIVATIONS: dict[str, Callable[[Array, Array, Array, Array], None]] = {
 """Each activation at z, written with its first and second derivative into the other three."""
 
 
-def strung(network: Network) -> np.ndarray:
+def draw_layers(
+    architecture: Architecture, generator: torch.Generator
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Random weights (fan_out, fan_in), drawn as Glorot & Bengio (2010) propose for tanh ("Xavier",
+    normal), and biases (fan_out,) of zero, layer by layer."""
+    dtype, layers = architecture.torch_dtype, []
+    for fan_out, fan_in in architecture.shapes:
+        weight = torch.empty(fan_out, fan_in, dtype=dtype)
+        torch.nn.init.xavier_normal_(weight, generator=generator)
+        layers.append((weight, torch.zeros(fan_out, dtype=dtype)))
+    return layers
+
+
+def flattened(layers: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> np.ndarray:
     """All weights of a network in one vector (n,): layer by layer the rows of its weights, each
     with its bias at the end."""
-    pairs = zip(network.weights, network.biases, strict=True)
-    rows = [torch.cat([W, b[:, None]], dim=1).flatten() for W, b in pairs]
+    rows = [torch.cat([W, b[:, None]], dim=1).flatten() for W, b in layers]
     return torch.cat(rows).detach().numpy()
 
 
-def unstrung(architecture: Architecture, theta: np.ndarray) -> Network:
-    """The network with weights theta (n,)."""
-    network = Network(architecture)
-    with torch.no_grad():
-        for k, layer in enumerate(_layers(architecture, theta)):
-            network.weights[k].copy_(torch.from_numpy(layer[:, :-1]))
-            network.biases[k].copy_(torch.from_numpy(layer[:, -1]))
-    return network
+def unflattened(architecture: Architecture, theta: np.ndarray) -> Layers:
+    """Copies of the weights and biases of each layer in theta (n,), as estimators hold them."""
+    parts = _layers(architecture, theta)
+    return tuple((part[:, :-1].copy(), part[:, -1].copy()) for part in parts)
 
 
 def inputs_of(architecture: Architecture, t: np.ndarray) -> np.ndarray:

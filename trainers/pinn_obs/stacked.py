@@ -11,11 +11,13 @@ two devices.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pinnobs_gym.training.loop import Interrupt, ended_now
 from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Objective
 from trainers.pinn_obs.quasi_newton import (
@@ -26,33 +28,37 @@ from trainers.pinn_obs.quasi_newton import (
     trials,
     update_weights,
 )
-from trainers.pinn_obs.run import Run
+
+if TYPE_CHECKING:
+    from trainers.pinn_obs import PinnObsTrainer
 
 
-def advance(runs: Sequence[Run], device: str, stopped: Sequence[bool]) -> None:
-    """Train all runs until each is finished, or something is in ``stopped``; those whose networks
-    or points differ in number go one batch after another.
+def advance(trainers: Sequence[PinnObsTrainer], device: str, interrupt: Interrupt) -> None:
+    """Train all until each has ended, or Ctrl-C is pressed; those whose networks or points differ
+    in number go one batch after another.
 
-    A run that is finished leaves its batch. The CPU seconds of a run are those of its whole batch.
+    One that has ended leaves its batch. The CPU seconds of each are those of its whole batch.
     """
-    batches: dict[tuple, list[Run]] = {}
-    for run in runs:
-        while not run.finished() and run.best is None:  # the first iteration, and its restarts
-            run.step()
-        sizes = (*run.architecture.shapes, len(run.objective.points.t))
-        batches.setdefault(sizes, []).append(run)
+    batches: dict[tuple, list[PinnObsTrainer]] = {}
+    for trainer in trainers:
+        while not trainer.finished() and trainer.best is None:  # the first iteration; its restarts
+            trainer.step()
+        recipe = trainer.recipe
+        sizes = (*recipe.architecture.shapes, len(recipe.objective.points.t))
+        batches.setdefault(sizes, []).append(trainer)
     for batch in batches.values():
-        live = [run for run in batch if not run.finished()]
+        live = [trainer for trainer in batch if not ended_now(trainer, interrupt)]
         state: Minimisations | None = None
-        while live and not stopped:
+        while live:
             if state is None:
-                thetas = np.stack([run.theta for run in live])
-                state = Minimisations([run.objective for run in live], thetas, device)
-            made, ended = state.round()
+                thetas = np.stack([trainer.theta for trainer in live])
+                objectives = [trainer.recipe.objective for trainer in live]
+                state = Minimisations(objectives, thetas, device)
+            made, stuck = state.round()
             x = state.x
-            for i in (*made, *ended):
+            for i in (*made, *stuck):
                 live[i].took(state.f[i], x[i], lower=i in made)
-            left = [i for i, run in enumerate(live) if not run.finished()]
+            left = [i for i, trainer in enumerate(live) if not ended_now(trainer, interrupt)]
             if len(left) < len(live):
                 live = [live[i] for i in left]
                 state.keep(left)

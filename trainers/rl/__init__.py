@@ -8,87 +8,199 @@ regression of the prediction's error on the innovation: what Kalman's gain is.
 
 from __future__ import annotations
 
-import time
-from pathlib import Path
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimators.sb3 import TrainedAgent
-from pinnobs_gym.simulation.system import System
-from pinnobs_gym.training.log import SILENT, Log
-from pinnobs_gym.training.loop import bar, interruption
-from trainers.rl.config import Config
+import numpy as np
+import stable_baselines3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
 
-__all__ = ["Config", "train"]
+from pinnobs_gym.estimation.learned.trained import content_of, from_content
+from pinnobs_gym.estimation.learned.trained_file import with_tensors
+from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent, setup_of
+from pinnobs_gym.scoring.metrics import score
+from pinnobs_gym.scoring.playing import play
+from pinnobs_gym.training.trainer import Trainer
+from trainers.rl.agent import first_seed, learning_rate, make_agent, make_env, policy_layers
+from trainers.rl.config import PRESETS, Config
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+HELD_OUT = 500_000
+"""From the first seed of the training to that of the episodes held out."""
+RESUMED = 10**9
+"""From the first seed of a training to those of episodes that are played after a resumption."""
+_STATISTICS = ("mean", "var", "count")
 
 
-def train(
-    system: System,
-    config: Config,
-    *,
-    game: Game,
-    seed: int,
-    log: Log = SILENT,
-    checkpoint: Path | None = None,
-    resume: bool = False,
-    progress: bool = False,
-) -> TrainedAgent:
-    """Train an agent on episodes that it plays itself.
+class RLTrainer(Trainer[Config, TrainedAgent]):
+    """Trains an agent on episodes that it plays itself.
 
-    The agent of the least error on episodes held out is kept. Ctrl-C ends training early and keeps
-    it as well. On a CPU the same seed gives the same agent.
-
-    Args:
-        system: the model.
-        config: the recipe.
-        game: what is played.
-        seed: of the first episode; no one is scored on these.
-        log: where curves go, in SB3's own layout.
-        checkpoint: a file to keep SB3's agent in, written again as training goes on; its
-            normalisation lies beside it, ending in ``.vecnormalize.pkl``, and the best agent so
-            far, ending in ``.best.pt``. The first two are SB3's own formats, which can hold code:
-            resume your own files only.
-        resume: go on from that file, with new episodes; replay buffers are filled anew.
-        progress: show a bar in the terminal.
-
-    Raises:
-        ValueError: in one line, if settings do not fit each other, recurrent_ppo is wanted without
-            sb3-contrib, or the checkpoint or its normalisation is missing or damaged, or of another
-            system, algorithm, action mode or major version of SB3.
+    The agent of the least error on episodes held out is kept. The measure is the geometric mean of
+    two medians over these episodes, of the NRMSE over the whole and over the last quarter, states
+    that no output tells apart counting as one; episodes that left the finite numbers count as
+    infinite. A training that is resumed plays new episodes, and fills replay buffers anew.
     """
-    # Everything that looks for estimators imports this module: SB3 is only loaded where it is used.
-    from stable_baselines3.common.logger import Logger, configure
 
-    from trainers.rl.agent import begin, restore
-    from trainers.rl.watch import Watch
+    name = "rl"
+    presets = PRESETS
 
-    if resume and checkpoint is None:
-        raise ValueError("resume=True without a checkpoint; name its file")
-    config = config.filled()
-    begun = time.process_time()
-    if resume and checkpoint is not None:
-        training = restore(system, config, game, seed, checkpoint)
-    else:
-        training = begin(system, config, game, seed)
-    model = training.model
-    folder = log.folder
-    model.set_logger(
-        Logger(None, []) if folder is None else configure(str(folder), ["tensorboard"])
-    )
-    assert config.rows is not None
-    assert config.rollout is not None
-    rollout = config.rows * config.rollout
-    whole = max(1, config.steps // rollout) * rollout  # SB3 would round up
-    left = whole - model.num_timesteps
-    with bar(config.steps if progress else None) as show, interruption() as stopped:
-        watch = Watch(training, begun, checkpoint, show, stopped)
-        try:
-            if left > 0:
-                model.learn(left, callback=watch, reset_num_timesteps=not model.num_timesteps)
-        except KeyboardInterrupt:  # the second, amid a step
-            pass
-    best = watch.result()
-    log.hparams(
-        {"system": best.system, **best.config},
-        {"end/held_out": best.loss, "end/steps": float(best.iterations)},
-    )
-    return best
+    def start(self) -> None:
+        self.env = make_env(self.config, self.game, self.episode)
+        self.agent: Any = make_agent(self.config, self.env)
+        self._logged: dict[str, float] = {}
+        self.agent.set_logger(Logger(None, [_Values(self._logged)]))
+        self.rollout = self.config.rows * self.config.rollout
+        self.best: TrainedAgent | None = None
+        self.latest = math.nan
+        self._validated = 0
+
+    @property
+    def steps(self) -> int:
+        """Steps so far, those of all rows together."""
+        return self.agent.num_timesteps
+
+    @property
+    def whole(self) -> int:
+        """All steps of the training: as many whole rollouts as the config's steps hold."""
+        return max(1, self.config.steps // self.rollout) * self.rollout
+
+    def step(self) -> None:
+        """Play one rollout and improve the agent by it."""
+        rate = learning_rate(self.config, (self.steps + self.rollout) / self.whole)
+        self.agent.lr_schedule = lambda _: rate
+        first = not self.steps
+        look = _EachStep(self._validate_if_due)
+        self.agent.learn(self.rollout, callback=look, reset_num_timesteps=first)
+        self.iteration += 1
+
+    def _validate_if_due(self) -> None:
+        if self.steps - self._validated >= self.config.check_every:
+            self._validate()
+
+    def _validate(self) -> None:
+        """Score the agent as it is on the episodes held out, and keep it if it is the best."""
+        self._validated = self.steps
+        estimator = Sb3(
+            self.system, tuple(self.noise_std.tolist()), trained=self._trained(math.nan)
+        )
+        first = self.episode + HELD_OUT
+        played = play(self.game, estimator, range(first, first + self.config.held_out))
+        scores = score(played.system, played.record, played.truth, played.estimates)
+        parts = ("nrmse_modulo", "nrmse_tail_modulo")
+        medians = {part: float(np.median(getattr(scores, part))) for part in parts}
+        self.latest = math.sqrt(math.prod(medians.values()))
+        if self.best is None or self.latest < self.best.loss:
+            self.best = self._trained(self.latest)
+        self._logged |= {f"held_out/{name}": value for name, value in medians.items()}
+        self._logged["held_out/diverged"] = float(scores.diverged.mean())
+        self._logged["held_out/best"] = self.best.loss
+
+    def _trained(self, loss: float) -> TrainedAgent:
+        """What an estimator needs of the agent as it is now."""
+        layers, squash, recurrent = policy_layers(self.agent.policy)
+        statistics: Any = self.env.obs_rms
+        return TrainedAgent(
+            **self.facts(loss=loss, seed=self.config.seed),
+            layers=layers,
+            recurrent=recurrent,
+            normalization=(statistics.mean.copy(), statistics.var.copy()),
+            clip=float(self.env.clip_obs),
+            activation="tanh",
+            squash=squash,
+            algorithm=self.config.algorithm,
+            action_mode=self.config.action_mode,
+            stack=self.config.stack,
+            setup=setup_of(self.game.source.setup),
+            sb3=stable_baselines3.__version__,
+            steps=self.steps,
+        )
+
+    def finished(self) -> bool:
+        return self.steps >= self.whole
+
+    def progress(self) -> float:
+        return self.steps / self.whole
+
+    def status(self) -> str:
+        best = math.nan if self.best is None else self.best.loss
+        return f"{self.steps} steps, held out {self.latest:.4g}, best {best:.4g}"
+
+    def curves(self) -> Mapping[str, float]:
+        return self._logged
+
+    def state(self) -> dict[str, Any]:
+        names = self.agent._get_torch_save_params()[1]
+        statistics = {"features": self.env.obs_rms, "returns": self.env.ret_rms}
+        return {
+            "steps": self.steps,
+            "parameters": self.agent.get_parameters(),
+            "variables": {name: getattr(self.agent, name).detach() for name in names},
+            "statistics": {
+                what: {name: getattr(each, name) for name in _STATISTICS}
+                for what, each in statistics.items()
+            },
+            "best": content_of(self.best),
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        self.agent.num_timesteps = self._validated = state["steps"]
+        self.agent.set_parameters(with_tensors(state["parameters"]), device="cpu")
+        for name, value in with_tensors(state["variables"]).items():
+            getattr(self.agent, name).data.copy_(value)
+        found: Any = self.env.obs_rms, self.env.ret_rms
+        for each, what in zip(found, ("features", "returns"), strict=True):
+            for name in _STATISTICS:
+                setattr(each, name, state["statistics"][what][name])
+        if state["best"] is not None:
+            self.best = from_content(TrainedAgent, state["best"])
+        # Other episodes than those played so far: the state of the env is not kept.
+        self.env.seed(first_seed(self.config, self.episode + RESUMED + self.steps))
+
+    def result(self) -> TrainedAgent:
+        """The best agent, with what all of the training took."""
+        if self.best is None or self._validated != self.steps:
+            self._validate()
+        assert self.best is not None
+        facts = self.facts(loss=self.best.loss, seed=self.config.seed)
+        return replace(self.best, **facts, steps=self.steps)
+
+    def figures(self, trained: TrainedAgent) -> dict[str, Figure]:
+        return {}
+
+
+class _EachStep(BaseCallback):
+    """Calls a function after each step of the rows."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        super().__init__()
+        self._call = call
+
+    def _on_step(self) -> bool:
+        self._call()
+        return True
+
+
+class _Values(KVWriter):
+    """Keeps the latest numbers that SB3 logs."""
+
+    def __init__(self, values: dict[str, float]) -> None:
+        self._values = values
+
+    def write(
+        self,
+        key_values: dict[str, Any],
+        key_excluded: dict[str, tuple[str, ...]],
+        step: int = 0,
+    ) -> None:
+        numbers = (int, float, np.number)
+        self._values |= {
+            name: float(value) for name, value in key_values.items() if isinstance(value, numbers)
+        }
+
+    def close(self) -> None:
+        """Nothing is open."""

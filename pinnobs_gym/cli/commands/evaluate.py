@@ -18,7 +18,7 @@ from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
-from pinnobs_gym.training import by_name
+from pinnobs_gym.training.by_name import load
 from pinnobs_gym.training.log import Log
 
 
@@ -54,7 +54,7 @@ class Evaluate:
         options = settings_of(cls, self.set)
         if self.video is not None:
             check_video(self.video)
-        trained = None if self.checkpoint is None else by_name.load(cls, self.checkpoint, game)
+        trained = None if self.checkpoint is None else load(cls, self.checkpoint, game)
         estimator = make_estimator(trained or cls, game, options)
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import tyro
 
-from pinnobs_gym import registry
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.output import write_figure
@@ -19,10 +17,13 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import acceptance
 from pinnobs_gym.scoring.playing import Played, play
-from pinnobs_gym.training import by_name
+from pinnobs_gym.training.by_name import load, trainer_of
 from pinnobs_gym.training.log import Log
+from pinnobs_gym.training.loop import train
+from pinnobs_gym.training.trainer import TRAINING_SEED, Trainer
 
 ConfigType = TypeVar("ConfigType")
 
@@ -34,12 +35,14 @@ class Train(Generic[ConfigType]):
     system: str
     """Name or module:Class of the system."""
     config: ConfigType
-    """The trainer's choices."""
+    """The trainer's settings."""
+    preset: str
+    """Whose settings are taken where none are given."""
     setup: str = "benchmark"
     """Setup that is played."""
     condition: str = "nominal"
     """Condition, such as load_step."""
-    episode: int = by_name.TRAINING_SEED
+    episode: int = TRAINING_SEED
     """Seed of the episode that is learned from, or of the first of several."""
     out: Path = Path("runs/train")
     """Folder of checkpoints, trained files, pictures and TensorBoard log."""
@@ -50,10 +53,10 @@ class Train(Generic[ConfigType]):
 def run(arguments: Sequence[str]) -> int:
     """Train with the trainer named first; returns the command's exit status."""
     if not arguments or arguments[0].startswith("-"):
-        raise ValueError(f"name a trainer first: pinnobs train {' | '.join(registry.trainers())}")
+        raise ValueError(f"name a trainer first: pinnobs train {' | '.join(TRAINERS.sources)}")
     name = arguments[0]
-    module = registry.trainer(name)
-    chosen = _chosen_training(name, module.Config, arguments[1:])
+    cls = TRAINERS.resolve(name)
+    chosen = _chosen_training(cls, arguments[1:])
     check_writable(chosen.out)
     game = Game.of(chosen.system, chosen.setup, chosen.condition)
     title = game.name.file_stem
@@ -65,32 +68,23 @@ def run(arguments: Sequence[str]) -> int:
             raise ValueError(
                 f"{earlier} is there already; --resume goes on with it, --out names another folder"
             )
+    trainer = trainer_of(name, chosen.config, game, chosen.episode)
     with Log(chosen.out / "tensorboard" / stem.name) as log:
-        result = by_name.train(
-            name,
-            chosen.config,
-            game,
-            chosen.episode,
-            log=log,
-            checkpoint=checkpoint,
-            resume=chosen.resume,
-            progress=True,
-        )
-        result.save(path)
-        pictures = {}
-        if hasattr(module, "figures"):
-            pictures = module.figures(game.source.system, result, game.record([chosen.episode]))
-        for kind, figure in pictures.items():
-            log.figure(f"trained/{kind}", figure, result.iterations)
-            write_figure(stem.with_name(f"{stem.name}-{kind}.png"), figure)
+        result = train(trainer, log=log, checkpoint=checkpoint, resume=chosen.resume, progress=True)
+    result.save(path)
+    pictures = trainer.figures(result)
+    for kind, figure in pictures.items():
+        write_figure(stem.with_name(f"{stem.name}-{kind}.png"), figure)
+    by = {"budget": ", all of its budget", "interrupted": "; stopped by Ctrl-C"}
     console.print(
         f"loss {result.loss:.3g} after {result.iterations} iterations, {result.seconds:.1f} CPU s"
+        + by.get(result.ending, "")
     )
     for kind in pictures:
         console.print(f"picture: {stem.with_name(f'{stem.name}-{kind}.png')}", soft_wrap=True)
-    for label, cls in ESTIMATORS.classes().items():
-        if cls.needs_training == name:
-            estimator = by_name.load(cls, path, game)
+    for label, kind_of in ESTIMATORS.classes().items():
+        if kind_of.needs_training == name:
+            estimator = load(kind_of, path, game)
             own = _report_training(label, estimator, game, chosen.episode, result.loss)
             picture = stem.with_name(f"{stem.name}-{label}.png")
             write_figure(picture, own.figure(f"{label}: {title}"))
@@ -102,16 +96,19 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _chosen_training(name: str, config: type, arguments: Sequence[str]) -> Train[Any]:
+def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> Train[Any]:
     """The command line of a training; what a preset says is its default."""
-    make: Callable[[], Any] = config
-    for option, value in pairwise(arguments):
-        if option == "--preset":
-            make = partial(config, preset=value)
-    default = Train(system=tyro.MISSING, config=make())
-    kind: Any = Train[type(default.config)]
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default=next(iter(cls.presets)))
+    preset: str = first.parse_known_args(arguments)[0].preset
+    config = cls.configured({"preset": preset})
+    kind: Any = Train[type(config)]
     return parse(
-        kind, f"train {name}", arguments, default=default, config=(tyro.conf.OmitArgPrefixes,)
+        kind,
+        f"train {cls.name}",
+        arguments,
+        default=Train(system=tyro.MISSING, config=config, preset=preset),
+        config=(tyro.conf.OmitArgPrefixes,),
     )
 
 

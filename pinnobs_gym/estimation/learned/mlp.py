@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, TypeAlias, get_args
@@ -10,7 +10,6 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 import torch
 from array_api_compat import array_namespace
-from torch import Tensor, nn
 
 from pinnobs_gym.simulation.system import Array
 
@@ -46,7 +45,7 @@ _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 
 @dataclass(frozen=True)
 class Architecture:
-    """The sizes of a `Network`."""
+    """The sizes of a multilayer perceptron t ↦ (x̂(t), L(t))."""
 
     nx: int
     """Number of states."""
@@ -120,65 +119,19 @@ class Architecture:
         return xp.stack(values, axis=-1), xp.stack(rates, axis=-1)
 
 
-class Network(nn.Module):
-    """A multilayer perceptron t ↦ (x̂(t), L(t)) (Farkane et al., PINN-Obs, "Proposed Adaptive
-    PINN-Based Model").
-
-    Its input is the time in s as it is, not scaled, as in the paper, unless the architecture says
-    otherwise. The weights are drawn as Glorot & Bengio (2010) propose for tanh ("Xavier", normal),
-    the biases begin at zero.
-
-    Args:
-        architecture: the sizes.
-        generator: where the weights are drawn from; one of seed 0 if None, never torch's own.
-    """
-
-    def __init__(
-        self, architecture: Architecture, generator: torch.Generator | None = None
-    ) -> None:
-        super().__init__()
-        generator = generator or torch.Generator().manual_seed(0)
-        self.architecture = architecture
-        dtype = architecture.torch_dtype
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for fan_out, fan_in in architecture.shapes:
-            weight = torch.empty(fan_out, fan_in, dtype=dtype)
-            self.weights.append(nn.init.xavier_normal_(weight, generator=generator))
-            self.biases.append(torch.zeros(fan_out, dtype=dtype))
-        self._activation = _ACTIVATIONS[architecture.activation]
-        self._scale = None
-        if architecture.scale is not None:
-            self._scale = torch.tensor(architecture.scale, dtype=dtype)
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimates x̂ (..., nx) in state units and gains L (..., nx, ny) at times t (...) in s."""
-        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
-        a, _ = self.architecture.features(t)
-        for W, b in hidden:
-            a = self._activation(nn.functional.linear(a, W, b))
-        return self._split(nn.functional.linear(a, weight, bias))
-
-    def _split(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        nx, ny = self.architecture.nx, self.architecture.ny
-        if self._scale is not None:
-            out = out * self._scale
-        return out[..., :nx], out[..., nx:].unflatten(-1, (nx, ny))
-
-
-Layers: TypeAlias = Sequence[tuple[np.ndarray, np.ndarray]]
-"""Weights (fan_out, fan_in) and biases (fan_out,) of each layer, in float64."""
-
-
-def layers_of(network: Network) -> Layers:
-    """A copy of the network's weights for `evaluate`."""
-    pairs = zip(network.weights, network.biases, strict=True)
-    return [(W.detach().double().numpy(), b.detach().double().numpy()) for W, b in pairs]
+Layers: TypeAlias = tuple[tuple[np.ndarray, np.ndarray], ...]
+"""Weights (fan_out, fan_in) and biases (fan_out,) of each layer."""
 
 
 def evaluate(
     architecture: Architecture, layers: Layers, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `Network.forward` returns, in NumPy and float64: for few times far faster than torch."""
+    """Estimates x̂ (..., nx) in state units and gains L (..., nx, ny) at times t (...) in s (Farkane
+    et al., PINN-Obs, "Proposed Adaptive PINN-Based Model"), computed in float64.
+
+    The network's input is the time in s as it is, as in the paper, unless the architecture says
+    otherwise.
+    """
     activation = _ACTIVATIONS[architecture.activation]
     a, _ = architecture.features(np.asarray(t, dtype=float))
     *hidden, (weight, bias) = layers

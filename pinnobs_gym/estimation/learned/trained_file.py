@@ -1,4 +1,7 @@
-"""Files of trained weights: written whole or not at all, read without running code, and checked."""
+"""Files of trained weights: written whole or not at all, read without running code, and checked.
+
+Torch is imported when a file is read or written: what merely names a trained object needs none.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +14,57 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import torch
+import numpy as np
 
 from pinnobs_gym.simulation.system import System
 
 
 def identity(system: System) -> dict[str, Any]:
-    """What a file of weights must agree with: the system's class name, parameters (as JSON holds
-    them) and sizes."""
-    parameters = json.loads(json.dumps(system.parameters, default=_plain))
+    """What a file of weights must agree with: the system's class name, parameters and sizes."""
     name = type(system).__name__
-    return {"system": name, "parameters": parameters, "nx": system.nx, "ny": system.ny}
+    return {
+        "system": name,
+        "parameters": plain(system.parameters),
+        "nx": system.nx,
+        "ny": system.ny,
+    }
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else repr(value)
+def plain(value: Any) -> Any:
+    """A value as JSON holds it: lists for tuples and arrays."""
+    return json.loads(json.dumps(value, default=_as_json))
+
+
+def _as_json(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else repr(value)
+
+
+def with_tensors(value: Any) -> Any:
+    """The same nested value with tensors for NumPy arrays, as `write` takes it."""
+    import torch
+
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value, order="C"))
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {name: with_tensors(each) for name, each in value.items()}
+    if isinstance(value, tuple | list):
+        return type(value)(with_tensors(each) for each in value)
+    return value
+
+
+def with_arrays(value: Any) -> Any:
+    """The same nested value with NumPy arrays for tensors."""
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        return value.numpy()
+    if isinstance(value, Mapping):
+        return {name: with_arrays(each) for name, each in value.items()}
+    if isinstance(value, tuple | list):
+        return type(value)(with_arrays(each) for each in value)
+    return value
 
 
 def check_same(path: str | Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
@@ -49,6 +88,8 @@ def write(path: str | Path, content: Mapping[str, Any]) -> None:
     Raises:
         ValueError: in one line, if the file cannot be written.
     """
+    import torch
+
     path = Path(path)
     temporary = path.with_name(f"{path.name}.{uuid4().hex}.part")
     buffer = io.BytesIO()
@@ -70,6 +111,8 @@ def read(path: str | Path) -> dict[str, Any]:
     Raises:
         ValueError: in one line, if there is no such file or it is something else or damaged.
     """
+    import torch
+
     try:
         content = torch.load(Path(path), map_location="cpu", weights_only=True)
     except OSError as error:

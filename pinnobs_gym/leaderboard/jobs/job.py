@@ -12,13 +12,13 @@ from typing import Any, Self
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.registry import trainer
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes
 from pinnobs_gym.scoring.provenance import canonical, now, versions
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder
-from pinnobs_gym.training.by_name import load, train
+from pinnobs_gym.training.by_name import load, train_by_name
 from pinnobs_gym.training.log import Log
 
 
@@ -105,7 +105,7 @@ def run_job(job: Job) -> None:
     options = dict(job.settings)
     chosen: Estimator | type[Estimator] = cls
     if cls.trains_on_record is not None:
-        recipe = trainer(cls.trains_on_record).Config(**job.training)
+        recipe = TRAINERS.resolve(cls.trains_on_record).configured(job.training)
         stem = job.game.name.file_stem
         place = f"{stem}-{cls.trains_on_record}-{_digest(recipe)}-episode{job.seed}"
         options = {"config": recipe, "folder": job.folder / "trained" / place}
@@ -124,12 +124,12 @@ def run_job(job: Job) -> None:
 def trained(cls: type[Estimator], job: Job) -> Estimator:
     """The estimator trained on episodes that are never scored, loaded if that was done before."""
     name = str(cls.needs_training)
-    recipe = trainer(name).Config(**{**cls.recipe, **job.training})
+    recipe = TRAINERS.resolve(name).configured({**cls.recipe, **job.training})
     label = f"{job.game.name.file_stem}-{name}-{_digest(recipe)}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = train(name, recipe, job.game, log=log)
+            result = train_by_name(name, recipe, job.game, log=log)
         if not path.exists():  # of two that trained at the same time, the first counts
             result.save(path)
     return load(cls, path, job.game)

@@ -14,7 +14,7 @@ from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
-from pinnobs_gym.registry import trainer
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.rows import Stored, game_of
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
@@ -166,20 +166,18 @@ def _check_settings(
     game: Game,
     training: Mapping[str, Any],
 ) -> None:
-    """Whether the estimator takes its settings, or its trainer its own."""
-    name = cls.needs_training or cls.trains_on_record
-    made: Any = cls if name is None else trainer(name).Config
-    aside = {f.name for f in fields(Estimator)}
-    known = sorted(f.name for f in fields(made) if f.init and f.repr and f.name not in aside)
-    for setting in (*entry.settings, *training):
-        if setting not in known:
-            told = f"setting {setting!r} of {entry.name!r}; expected one of {', '.join(known)}"
-            raise suite.wrong("estimators", told)
+    """Check the settings of an estimator, or those of its trainer."""
+    trainer = cls.needs_training or cls.trains_on_record
     try:
-        if name is None:
-            cls.for_setup(game.source.system, game.source.setup, **entry.settings)
-        else:
-            made(**{**cls.recipe, **training})
+        if trainer is not None:
+            TRAINERS.resolve(trainer).configured({**cls.recipe, **training})
+            return
+        aside = {f.name for f in fields(Estimator)}
+        known = sorted(f.name for f in fields(cls) if f.init and f.repr and f.name not in aside)
+        for setting in entry.settings:
+            if setting not in known:
+                raise ValueError(f"setting {setting!r}; expected one of {', '.join(known)}")
+        cls.for_setup(game.source.system, game.source.setup, **entry.settings)
     except (ValueError, TypeError) as error:
-        told = f"settings of {entry.name!r}: {error}"
-        raise suite.wrong("estimators" if entry.settings else "budgets", told) from error
+        message = f"settings of {entry.name!r}: {error}"
+        raise suite.wrong("estimators" if entry.settings else "budgets", message) from error

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from benchmarks.plain_network import Network
 from small_trainings import (
     Failing,
     Interrupting,
@@ -12,18 +13,18 @@ from small_trainings import (
     gradient_of,
     random_record,
     same_weights,
+    train_pinn_obs,
 )
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network
-from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, Trained
+from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.scoring import acceptance
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.systems import SYSTEMS
-from trainers.pinn_obs import Config, train
-from trainers.pinn_obs.config import PRESETS
+from trainers.pinn_obs import Config, PinnObsTrainer
 from trainers.pinn_obs.objective import Lead, Objective, Weights
-from trainers.pinn_obs.passes import strung
+from trainers.pinn_obs.passes import flattened
 from trainers.pinn_obs.points import fast_frequencies, points_of
 
 SMALL = Config(depth=2, width=8, iterations=60, log_every=10)
@@ -67,13 +68,15 @@ def test_the_gradient_by_hand_is_that_of_autograd(activation, samples):
         scale=tuple(rng.uniform(0.5, 2, 9)),
     )
     network = Network(architecture, torch.Generator().manual_seed(1))
-    loss, gradient = Objective(architecture, system, points, weights, lead)(strung(network))
+    loss, gradient = Objective(architecture, system, points, weights, lead)(
+        flattened(network.layers)
+    )
     expected_loss, expected = by_autograd(network, system, points, weights, lead)
     assert loss == pytest.approx(expected_loss, rel=1e-12)
     assert abs(expected).max() > 0.1
     np.testing.assert_allclose(gradient, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
     single = Objective(replace(architecture, dtype="float32"), system, points, weights, lead)
-    loss, gradient = single(strung(network).astype("float32"))
+    loss, gradient = single(flattened(network.layers).astype("float32"))
     assert gradient.dtype == np.float32
     assert loss == pytest.approx(expected_loss, rel=1e-5)
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * abs(expected).max())
@@ -125,7 +128,9 @@ def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
 def test_noise_is_not_fitted():
     game = Game.of("Academic")
     system, setup, record = game.source.system, game.source.setup, game.record([3])
-    trained = train(system, Config(iterations=500), record=record, noise_std=setup.noise_std)
+    trained = train_pinn_obs(
+        system, Config(iterations=500), record=record, noise_std=setup.noise_std
+    )
     output = system.h(record.t, trained.xhat(record.t), record.u[0]) - record.y[0]
     later = record.t > 5
     assert output[later].std() == pytest.approx(0.02, rel=0.15)
@@ -136,8 +141,8 @@ def test_every_known_system_can_be_trained_on():
         game = Game.of(name)
         system, record = game.source.system, game.record([0])
         record.y[0, ::7] = np.nan
-        start = train(system, replace(SMALL, iterations=2), record=record, noise_std=0.1)
-        end = train(system, replace(SMALL, iterations=30), record=record, noise_std=0.1)
+        start = train_pinn_obs(system, replace(SMALL, iterations=2), record=record, noise_std=0.1)
+        end = train_pinn_obs(system, replace(SMALL, iterations=30), record=record, noise_std=0.1)
         assert end.loss < start.loss, name
         assert np.isfinite(end.xhat(record.t)).all()
         assert cls.__name__ == end.system
@@ -146,25 +151,25 @@ def test_every_known_system_can_be_trained_on():
 def test_resuming_goes_on_exactly(tmp_path):
     system, record = duffing()
     path = tmp_path / "checkpoint.pt"
-    straight = train(system, SMALL, record=record)
+    straight = train_pinn_obs(system, SMALL, record=record)
     part = replace(SMALL, iterations=45, checkpoint_every=20)
-    train(system, part, record=record, checkpoint=path, log=Interrupting(31))
-    resumed = train(system, SMALL, record=record, checkpoint=path, resume=True)
+    train_pinn_obs(system, part, record=record, checkpoint=path, log=Interrupting(31))
+    resumed = train_pinn_obs(system, SMALL, record=record, checkpoint=path, resume=True)
     assert (resumed.iterations, resumed.loss) == (60, straight.loss)
     assert same_weights(resumed, straight)
     with pytest.raises(ValueError, match="noise_std"):
-        train(system, SMALL, record=record, checkpoint=path, resume=True, noise_std=0.1)
+        train_pinn_obs(system, SMALL, record=record, checkpoint=path, resume=True, noise_std=0.1)
     other = replace(SMALL, gain_penalty=0.5)
     with pytest.raises(ValueError, match=r"gain_penalty=0\.1; expected 0\.5"):
-        train(system, other, record=record, checkpoint=path, resume=True)
+        train_pinn_obs(system, other, record=record, checkpoint=path, resume=True)
 
 
 def test_a_file_gives_the_same_network_back(tmp_path):
     system, record = duffing()
-    trained = train(system, SMALL, record=record)
+    trained = train_pinn_obs(system, SMALL, record=record)
     trained.save(tmp_path / "weights.pt")
-    again = Trained.load(tmp_path / "weights.pt", system)
-    assert again.network.architecture == trained.network.architecture
+    again = TrainedNetwork.load(tmp_path / "weights.pt", system)
+    assert again.architecture == trained.architecture
     assert np.array_equal(again.xhat(record.t), trained.xhat(record.t))
     assert np.array_equal(again.gain(record.t), trained.gain(record.t))
     assert trained.covariance is not None
@@ -174,8 +179,8 @@ def test_a_file_gives_the_same_network_back(tmp_path):
 def test_patience_and_budget_end_training(ticking):
     system, record = duffing()
     config = replace(SMALL, iterations=10**6, patience=5, improvement=0.5)
-    assert train(system, config, record=record).iterations < 1000
-    brief = train(system, replace(config, patience=10**6, budget=0.2), record=record)
+    assert train_pinn_obs(system, config, record=record).iterations < 1000
+    brief = train_pinn_obs(system, replace(config, patience=10**6, budget=0.2), record=record)
     assert brief.iterations <= 20  # the time is looked at after each
     assert 0.2 <= brief.seconds < 0.3
 
@@ -183,29 +188,29 @@ def test_patience_and_budget_end_training(ticking):
 def test_a_loss_that_is_not_finite_begins_again():
     Failing.calls.clear()
     config = replace(SMALL, seed=5, guide=0.0)
-    trained = train(Failing(bad=1), config, record=random_record(Failing()))
+    trained = train_pinn_obs(Failing(bad=1), config, record=random_record(Failing()))
     assert trained.seed == 6
     Failing.calls.clear()
     with pytest.raises(FloatingPointError, match=r"Failing .*seed 5"):
-        train(Failing(bad=10**6), config, record=random_record(Failing()))
+        train_pinn_obs(Failing(bad=10**6), config, record=random_record(Failing()))
     Failing.calls.clear()
     with pytest.warns(UserWarning, match="no smoother follows this record of Failing"):
-        train(Failing(bad=1), SMALL, record=random_record(Failing()))
+        train_pinn_obs(Failing(bad=1), SMALL, record=random_record(Failing()))
 
 
-def test_presets_fill_what_is_not_given():
-    for preset, values in PRESETS.items():
-        config = Config(preset, width=7)
-        assert config.width == 7
-        assert {name: getattr(config, name) for name in values} == dict(values)
-    assert Config().optimiser == "ssbroyden"
+def test_presets_are_whole_recipes_of_which_settings_are_changed():
+    paper = PinnObsTrainer.configured({"preset": "paper", "width": 7})
+    assert (paper.width, paper.depth, paper.optimiser, paper.guide) == (7, 9, "adam", 0.0)
+    assert PinnObsTrainer.configured({}) == Config()
+    assert PinnObsTrainer.configured({"preset": "transfer"}).transfer
     for change, message in (
-        ({"preset": "best"}, "preset='best'; expected fast or paper"),
+        ({"preset": "best"}, "preset='best'; expected one of fast, transfer, paper"),
         ({"dtype": "float32"}, "dtype='float32'; expected float64"),
         ({"preset": "paper", "gain_penalty": 1.0}, r"gain_penalty=1\.0; expected 0"),
+        ({"deepness": 3}, "setting 'deepness'; expected one of activation, budget, "),
     ):
         with pytest.raises(ValueError, match=message):
-            Config(**change)
+            PinnObsTrainer.configured(change)
 
 
 @pytest.mark.parametrize("setup", ["benchmark", "paper"])

@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from benchmarks.plain_network import Network
+from small_trainings import train_pinn_obs
 
 from pinnobs_gym import Setup, System
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network, evaluate, layers_of
+from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
 from pinnobs_gym.estimation.smoother import backward, flows
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.simulation.model import model_step_jacobian
@@ -17,7 +19,7 @@ from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from trainers.pinn_obs import Config, train
+from trainers.pinn_obs import Config, fast, transfer
 from trainers.pinn_obs.guide import observer_gain
 from trainers.pinn_obs.smoother import DRIFT, forward, smooth
 
@@ -136,7 +138,8 @@ def test_numpy_evaluates_the_network_as_torch_does(activation):
     t = np.linspace(0, 2, 7)
     with torch.no_grad():
         expected = [part.numpy() for part in network(torch.from_numpy(t))]
-    for found, part in zip(evaluate(architecture, layers_of(network), t), expected, strict=True):
+        layers = tuple((W.numpy(), b.numpy()) for W, b in network.layers)
+    for found, part in zip(evaluate(architecture, layers, t), expected, strict=True):
         np.testing.assert_allclose(found, part, rtol=1e-13, atol=1e-13)
 
 
@@ -156,8 +159,8 @@ def test_from_any_seed_direct_estimates_and_replay_find_the_states(name):
     tail, scale = slice(3 * len(x) // 4, None), np.asarray(system.scale)
     for seed in (0, 1):
         config = Config(iterations=500, seed=seed)
-        trained = train(system, config, record=record, noise_std=setup.noise_std)
-        replayed = PinnObsReplay.of(system, trained).run(record).xhat[0]
+        trained = train_pinn_obs(system, config, record=record, noise_std=setup.noise_std)
+        replayed = PinnObsReplay(system, trained=trained).run(record).xhat[0]
         for xhat in (trained.xhat(record.t), replayed):
             assert np.sqrt(np.mean(((xhat - x)[tail] / scale) ** 2)) < 0.01
         assert trained.covariance is not None
@@ -175,7 +178,7 @@ def test_a_record_too_long_for_the_points_is_told():
     record = Record(t, y, np.zeros((1, len(t), 0)), prior)
     config = Config(iterations=1, points=300)
     with pytest.warns(UserWarning, match=r"points=300 .* 200 s: they swing 127 times; .*=10\d\d"):
-        train(system, config, record=record)
+        train_pinn_obs(system, config, record=record)
 
 
 def test_a_gain_meant_for_other_records_beats_one_that_is_not():
@@ -188,8 +191,9 @@ def test_a_gain_meant_for_other_records_beats_one_that_is_not():
     prior = Prior(np.zeros((1, 2)), record.prior.cov)
     other = replace(record, y=system.h(record.t, x, record.u[0])[None], prior=prior)
     rmse = []
-    for transfer in (False, True):
-        trained = train(system, Config(iterations=300, transfer=transfer), record=record)
-        replayed = PinnObsReplay.of(system, trained).run(other).xhat[0]
+    for preset in (fast, transfer):
+        config = replace(preset(), iterations=300)
+        trained = train_pinn_obs(system, config, record=record)
+        replayed = PinnObsReplay(system, trained=trained).run(other).xhat[0]
         rmse.append(np.sqrt(np.mean((replayed - x) ** 2)))
     assert rmse[1] < 0.7 * rmse[0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from benchmarks.plain_network import Network
 from scipy.integrate import solve_ivp
 from small_trainings import (
     Failing,
@@ -15,22 +16,25 @@ from small_trainings import (
     constant_gain,
     duffing,
     gradient_of,
+    network_of,
     played,
     random_record,
     same_weights,
+    train_pinn_obs,
+    trained_network,
 )
 
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network
-from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, Trained
+from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
-from trainers.pinn_obs import Config, train
+from trainers.pinn_obs import Config, paper
 from trainers.pinn_obs.adam import Adam
 from trainers.pinn_obs.objective import Objective, Weights
-from trainers.pinn_obs.passes import Passes, inputs_of, strung, unstrung
+from trainers.pinn_obs.passes import Passes, draw_layers, flattened, inputs_of, unflattened
 from trainers.pinn_obs.points import samples_of
 
-SMALL = Config("paper", depth=2, width=8, iterations=60, log_every=10)
+SMALL = replace(paper(), depth=2, width=8, iterations=60, log_every=10)
 
 
 # The network
@@ -46,7 +50,7 @@ def test_the_rate_is_the_derivative_of_the_estimate(activation):
             bias.normal_(generator=generator)
     t = torch.linspace(-3, 20, 28, dtype=torch.float64).requires_grad_()
     inputs = inputs_of(network.architecture, t.detach().numpy())
-    out, rate = Passes(network.architecture, inputs, np.ones(9)).forward(strung(network))
+    out, rate = Passes(network.architecture, inputs, np.ones(9)).forward(flattened(network.layers))
     xhat, L = network(t)
     assert L.shape == (28, 3, 2)
     expected = torch.cat([xhat, L.flatten(1)], dim=1).detach().numpy()
@@ -62,14 +66,15 @@ def test_weights_in_one_vector_make_the_same_network_again():
     with torch.no_grad():
         for k, bias in enumerate(network.biases):
             bias.fill_(k + 0.5)
-    again = unstrung(network.architecture, strung(network))
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, again.state_dict()[name])
+    again = unflattened(network.architecture, flattened(network.layers))
+    for layer, other in zip(network.layers, again, strict=True):
+        for value, found in zip(layer, other, strict=True):
+            assert np.array_equal(value.detach(), found)
 
 
 def test_weights_are_drawn_as_glorot_and_bengio_propose():
-    network = Network(Architecture(2, 1, 3, 400), torch.Generator().manual_seed(0))
-    for weight, bias in zip(network.weights, network.biases, strict=True):
+    layers = draw_layers(Architecture(2, 1, 3, 400), torch.Generator().manual_seed(0))
+    for weight, bias in layers:
         expected = math.sqrt(2 / sum(weight.shape))
         assert weight.std().item() == pytest.approx(expected, rel=5 / math.sqrt(weight.numel()))
         assert not bias.any()
@@ -77,8 +82,7 @@ def test_weights_are_drawn_as_glorot_and_bengio_propose():
 
 def test_torchs_own_random_numbers_are_left_alone():
     before = torch.get_rng_state()
-    Network(Architecture(2, 1), torch.Generator().manual_seed(0))
-    train(*duffing_args(), record=duffing()[1])
+    train_pinn_obs(*duffing_args(), record=duffing()[1])
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -139,7 +143,7 @@ def test_the_loss_and_its_gradient_are_those_of_autograd(missing):
         record.y[0, [2, 5, 5, 9], [0, 0, 1, 1]] = np.nan
     network = Network(Architecture(3, 2, 2, 6, dtype="float64"), torch.Generator().manual_seed(4))
     chosen = np.array([1, 2, 5, 6, 9, 11])  # t₀ is not among them
-    points, theta = samples_of(system, record, chosen), strung(network)
+    points, theta = samples_of(system, record, chosen), flattened(network.layers)
     expected = reference_terms(
         network,
         record,
@@ -235,9 +239,8 @@ def test_replay_solves_the_observer_equation(missing):
 def test_replay_takes_the_gain_of_the_time():
     system = Spring(measured_input=True)
     record = random_record(system, 30)
-    trained = constant_gain(system, [[0.0], [0.0]])
     network = Network(Architecture(2, 1, 1, 3, "sine", "float64"), torch.Generator().manual_seed(0))
-    trained = replace(trained, network=network)
+    trained = trained_network(system, network)
     xhat = PinnObsReplay(system, trained=trained).run(record).xhat[0]
     t, y, u = record.t, record.y[0, :, 0], record.u[0, :, 0]
 
@@ -267,21 +270,22 @@ def test_a_row_that_blows_up_is_marked_and_harms_no_other():
 @pytest.fixture(scope="module")
 def trained():
     system, record = duffing()
-    return train(system, SMALL, record=record)
+    return train_pinn_obs(system, SMALL, record=record)
 
 
 def test_a_file_gives_the_same_estimator_back(trained, tmp_path):
     system, record = duffing()
     for cls in (PinnObsReplay, PinnObsDirect):
-        estimator = cls.of(system, trained)
+        estimator = cls(system, trained=trained)
         estimator.save(tmp_path / "new" / "weights.pt")
         again = cls.load(tmp_path / "new" / "weights.pt", system)
         assert np.array_equal(again.run(record).xhat, estimator.run(record).xhat)
         assert again.training == estimator.training
         assert again.training["config"] == dataclasses.asdict(SMALL)
-        for f in dataclasses.fields(Trained):
-            if f.name != "network":
+        for f in dataclasses.fields(TrainedNetwork):
+            if f.name != "layers":
                 assert np.array_equal(getattr(again.trained, f.name), getattr(trained, f.name))
+        assert same_weights(again.trained, trained)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["weights.pt"]
 
 
@@ -299,13 +303,13 @@ def test_a_file_of_something_else_is_refused_in_one_line(trained, tmp_path):
     path = tmp_path / "weights.pt"
     trained.save(path)
     with pytest.raises(ValueError, match="trained with system='ReverseDuffing'; expected 'Spring'"):
-        Trained.load(path, Spring())
+        TrainedNetwork.load(path, Spring())
     constant_gain(Spring(), [[1.0], [2.0]]).save(path)
     with pytest.raises(ValueError, match=r"trained with stiffness=4\.0; expected 5\.0"):
-        Trained.load(path, Spring(5.0))
-    assert Trained.load(path, Spring(4)).gain(np.array(1.0)).tolist() == [[1.0], [2.0]]
+        TrainedNetwork.load(path, Spring(5.0))
+    assert TrainedNetwork.load(path, Spring(4)).gain(np.array(1.0)).tolist() == [[1.0], [2.0]]
     with pytest.raises(ValueError, match=r"cannot read .*nowhere"):
-        Trained.load(tmp_path / "nowhere", Spring())
+        TrainedNetwork.load(tmp_path / "nowhere", Spring())
     whole = path.read_bytes()
     torch.save([1, 2], tmp_path / "list.pt")
     torch.save({"facts": "{}"}, tmp_path / "empty.pt")
@@ -314,7 +318,7 @@ def test_a_file_of_something_else_is_refused_in_one_line(trained, tmp_path):
     torch.save({"facts": Bomb(tmp_path / "it ran")}, tmp_path / "code.pt")
     for name in ("list.pt", "empty.pt", "text.pt", "short.pt", "code.pt"):
         with pytest.raises(ValueError, match=name) as caught:
-            Trained.load(tmp_path / name, Spring())
+            TrainedNetwork.load(tmp_path / name, Spring())
         assert "\n" not in str(caught.value)
     assert not (tmp_path / "it ran").exists()
     with pytest.raises(ValueError, match="cannot write"):
@@ -324,7 +328,7 @@ def test_a_file_of_something_else_is_refused_in_one_line(trained, tmp_path):
 def test_direct_estimates_belong_to_one_record(trained):
     system, record = duffing()
     direct = PinnObsDirect(system, trained=trained)
-    expected = trained.network(torch.tensor(record.t, dtype=torch.float32))[0].detach().numpy()
+    expected = network_of(trained)(torch.tensor(record.t, dtype=torch.float32))[0].detach().numpy()
     np.testing.assert_allclose(direct.run(record).xhat[0], expected, rtol=1e-4, atol=1e-4)
     noisy = replace(record, y=record.y + 1e-9)
     with pytest.raises(ValueError, match=r"record's y is not .*pinn_obs_replay"):
@@ -340,13 +344,16 @@ def test_direct_estimates_belong_to_one_record(trained):
 
 def test_the_papers_recipe_lowers_the_loss():
     system, record = duffing()
-    start = train(system, Config("paper", iterations=1), record=record)
-    assert train(system, Config("paper", iterations=600), record=record).loss < start.loss / 2
+    start = train_pinn_obs(system, replace(paper(), iterations=1), record=record)
+    assert (
+        train_pinn_obs(system, replace(paper(), iterations=600), record=record).loss
+        < start.loss / 2
+    )
 
 
 def test_training_finds_the_output_and_the_initial_estimate():
     system, record = duffing(duration=4.0)
-    trained = train(system, Config("paper", depth=3, iterations=1500), record=record)
+    trained = train_pinn_obs(system, replace(paper(), depth=3, iterations=1500), record=record)
     xhat = trained.xhat(record.t)
     error = xhat[:, 0] - record.y[0, :, 0]
     # Seeds 0 to 3 reach 0.12 to 0.18, and 0.02 to 0.08.
@@ -360,17 +367,19 @@ def test_every_known_system_can_be_trained_on():
         setup = replace(setup, x0_low=setup.x0_high, duration=setup.dt * 30)
         config = replace(SMALL, iterations=30, dtype="float64")
         record = played(system, setup, 0.01)
-        start = train(system, replace(config, iterations=1), record=record)
-        assert train(system, config, record=record).loss < start.loss, name
+        start = train_pinn_obs(system, replace(config, iterations=1), record=record)
+        assert train_pinn_obs(system, config, record=record).loss < start.loss, name
 
 
 def test_the_weights_of_the_loss_and_the_training_samples_are_those_asked_for():
     system, record = duffing()
     config = replace(SMALL, iterations=1, w0=0.5, w_ode=2.0, w_y=3.0, dtype="float64")
-    trained = train(system, config, record=record)
+    trained = train_pinn_obs(system, config, record=record)
 
     def terms(chosen):
-        return np.array([term.item() for term in duffing_terms(trained.network, record, chosen)])
+        return np.array(
+            [term.item() for term in duffing_terms(network_of(trained), record, chosen)]
+        )
 
     chosen = np.sort(np.random.default_rng(0).permutation(201)[:121])  # 60 % of 201
     assert trained.loss == pytest.approx(terms(chosen) @ [0.5, 2.0, 3.0], rel=1e-12)
@@ -379,15 +388,15 @@ def test_the_weights_of_the_loss_and_the_training_samples_are_those_asked_for():
 
 def test_the_seed_decides_the_weights(trained):
     system, record = duffing()
-    assert same_weights(train(system, SMALL, record=record), trained)
-    assert not same_weights(train(system, replace(SMALL, seed=1), record=record), trained)
+    assert same_weights(train_pinn_obs(system, SMALL, record=record), trained)
+    assert not same_weights(train_pinn_obs(system, replace(SMALL, seed=1), record=record), trained)
 
 
 def test_missing_outputs_are_no_obstacle():
     system, record = duffing()
     record.y[0, ::3] = np.nan
-    start = train(system, replace(SMALL, iterations=1), record=record)
-    end = train(system, replace(SMALL, iterations=200), record=record)
+    start = train_pinn_obs(system, replace(SMALL, iterations=1), record=record)
+    end = train_pinn_obs(system, replace(SMALL, iterations=200), record=record)
     assert end.loss < 0.8 * start.loss
     assert np.isfinite(end.xhat(record.t)).all()
 
@@ -396,21 +405,21 @@ def test_ctrl_c_keeps_the_best_weights():
     system, record = duffing()
     config = replace(SMALL, iterations=10**6, learning_rate=0.3, log_every=1, dtype="float64")
     log = Interrupting(20)
-    trained = train(system, config, record=record, log=log)
+    trained = train_pinn_obs(system, config, record=record, log=log)
     assert trained.iterations == 20
     assert trained.loss == pytest.approx(min(log.losses), rel=1e-12)
     assert trained.loss < log.losses[-1]  # so that the last weights are not the best
     chosen = np.sort(np.random.default_rng(0).permutation(201)[:121])
-    terms = duffing_terms(trained.network, record, chosen)
+    terms = duffing_terms(network_of(trained), record, chosen)
     assert sum(term.item() for term in terms) == pytest.approx(trained.loss, rel=1e-12)
 
 
 def test_patience_and_budget_end_training(ticking):
     system, record = duffing()
     config = replace(SMALL, iterations=10**6, log_every=1)
-    stuck = train(system, replace(config, patience=7, learning_rate=1e-30), record=record)
+    stuck = train_pinn_obs(system, replace(config, patience=7, learning_rate=1e-30), record=record)
     assert stuck.iterations == 1 + 7
-    brief = train(system, replace(config, budget=0.2), record=record)
+    brief = train_pinn_obs(system, replace(config, budget=0.2), record=record)
     assert brief.iterations <= 20  # the time is looked at after each
     assert 0.2 <= brief.seconds < 0.3
 
@@ -422,13 +431,13 @@ def test_resuming_goes_on_exactly(tmp_path):
     system, record = duffing()
     path = tmp_path / "checkpoint.pt"
     config = replace(SMALL, learning_rate=0.03, iterations=80)
-    straight = train(system, config, record=record)
-    train(system, replace(config, iterations=40), record=record, checkpoint=path)
-    resumed = train(system, config, record=record, checkpoint=path, resume=True)
+    straight = train_pinn_obs(system, config, record=record)
+    train_pinn_obs(system, replace(config, iterations=40), record=record, checkpoint=path)
+    resumed = train_pinn_obs(system, config, record=record, checkpoint=path, resume=True)
     assert resumed.loss == straight.loss
     assert resumed.iterations == 80
     assert same_weights(resumed, straight)
-    once_more = train(system, config, record=record, checkpoint=path, resume=True)
+    once_more = train_pinn_obs(system, config, record=record, checkpoint=path, resume=True)
     assert (once_more.iterations, once_more.loss) == (80, straight.loss)
     assert same_weights(once_more, straight)
 
@@ -437,9 +446,9 @@ def test_an_interrupted_training_resumes_from_its_last_checkpoint(tmp_path):
     system, record = duffing()
     path = tmp_path / "checkpoint.pt"
     config = replace(SMALL, iterations=80, checkpoint_every=30, log_every=1)
-    straight = train(system, config, record=record)
-    train(system, config, record=record, checkpoint=path, log=Interrupting(50))
-    resumed = train(system, config, record=record, checkpoint=path, resume=True)
+    straight = train_pinn_obs(system, config, record=record)
+    train_pinn_obs(system, config, record=record, checkpoint=path, log=Interrupting(50))
+    resumed = train_pinn_obs(system, config, record=record, checkpoint=path, resume=True)
     assert (resumed.iterations, resumed.loss) == (80, straight.loss)
     assert same_weights(resumed, straight)
 
@@ -447,10 +456,10 @@ def test_an_interrupted_training_resumes_from_its_last_checkpoint(tmp_path):
 def test_another_trainings_checkpoint_is_refused(tmp_path):
     system, record = duffing()
     path = tmp_path / "checkpoint.pt"
-    train(system, replace(SMALL, iterations=5), record=record, checkpoint=path)
+    train_pinn_obs(system, replace(SMALL, iterations=5), record=record, checkpoint=path)
 
     def resume(system=system, config=SMALL, record=record, path=path):
-        train(system, config, record=record, checkpoint=path, resume=True)
+        train_pinn_obs(system, config, record=record, checkpoint=path, resume=True)
 
     with pytest.raises(ValueError, match="trained with width=8; expected 9"):
         resume(config=replace(SMALL, width=9))
@@ -462,7 +471,7 @@ def test_another_trainings_checkpoint_is_refused(tmp_path):
         resume(path=tmp_path / "nowhere")
     with pytest.raises(ValueError, match="resume=True without a checkpoint"):
         resume(path=None)
-    train(system, SMALL, record=record).save(path)
+    train_pinn_obs(system, SMALL, record=record).save(path)
     with pytest.raises(ValueError, match=r"checkpoint\.pt"):
         resume()
 
@@ -472,13 +481,14 @@ def test_another_trainings_checkpoint_is_refused(tmp_path):
 
 def test_a_loss_that_is_not_finite_begins_again_three_times():
     Failing.calls.clear()
-    calls = 1 + 3  # the first iteration's terms are logged
-    trained = train(Failing(bad=calls), replace(SMALL, seed=5), record=random_record(Failing()))
+    trained = train_pinn_obs(
+        Failing(bad=3), replace(SMALL, seed=5), record=random_record(Failing())
+    )
     assert trained.seed == 8
     assert np.isfinite(trained.loss)
     Failing.calls.clear()
     with pytest.raises(FloatingPointError, match=r"Failing .*seed 5") as caught:
-        train(Failing(bad=calls + 1), replace(SMALL, seed=5), record=random_record(Failing()))
+        train_pinn_obs(Failing(bad=4), replace(SMALL, seed=5), record=random_record(Failing()))
     assert "\n" not in str(caught.value)
 
 
@@ -499,7 +509,7 @@ def with_y(y):
 )
 def test_a_record_that_cannot_be_trained_on_is_refused(record, message):
     with pytest.raises(ValueError, match=message) as caught:
-        train(Spring(), SMALL, record=record)
+        train_pinn_obs(Spring(), SMALL, record=record)
     assert "\n" not in str(caught.value)
 
 
@@ -528,7 +538,7 @@ def test_a_config_out_of_range_names_the_value(change):
         Config(**change)
 
 
-# Trained on every record it is given
+# TrainedNetwork on every record it is given
 
 
 def test_each_row_is_trained_on_alone(tmp_path):
@@ -537,9 +547,9 @@ def test_each_row_is_trained_on_alone(tmp_path):
     estimator = PinnObs(system, config=SMALL, folder=tmp_path)
     xhat = estimator.run(record).xhat
     for i in range(2):
-        alone = train(system, SMALL, record=record.rows(np.array([i])))
+        alone = train_pinn_obs(system, SMALL, record=record.rows(np.array([i])))
         assert np.array_equal(xhat[i], alone.xhat(record.t))
-        kept = Trained.load(tmp_path / f"row-{i}" / "trained.pt", system)
+        kept = TrainedNetwork.load(tmp_path / f"row-{i}" / "trained.pt", system)
         assert same_weights(kept, alone)
         assert any("tfevents" in path.name for path in (tmp_path / f"row-{i}").iterdir())
     assert not np.array_equal(xhat[0], xhat[1])
@@ -547,9 +557,9 @@ def test_each_row_is_trained_on_alone(tmp_path):
 
 def test_the_bar_shows_where_training_stands(capsys):
     system, record = duffing()
-    train(system, SMALL, record=record, progress=True)
+    train_pinn_obs(system, SMALL, record=record, progress=True)
     shown = capsys.readouterr().out
-    assert "51/60" in shown
+    assert "60 iterations" in shown
     assert "best" in shown
 
 
@@ -560,7 +570,7 @@ def test_a_loss_that_leaves_the_finite_numbers_late_costs_nothing_found_before(
     """Also where it does so in the very last iteration."""
     system, record = duffing()
     config = replace(SMALL, iterations=29, learning_rate=1e-2)
-    before = train(system, config, record=record)
+    before = train_pinn_obs(system, config, record=record)
     calls, own = [], Objective.__call__
 
     def sometimes(*arguments):
@@ -569,7 +579,7 @@ def test_a_loss_that_leaves_the_finite_numbers_late_costs_nothing_found_before(
         return loss * (math.nan if len(calls) == 30 else 1.0), gradient
 
     monkeypatch.setattr(Objective, "__call__", sometimes)
-    after = train(system, replace(config, iterations=iterations), record=record)
+    after = train_pinn_obs(system, replace(config, iterations=iterations), record=record)
     assert after.loss <= before.loss
     if iterations == 30:
         assert after.loss == before.loss
@@ -580,4 +590,4 @@ def test_times_that_single_precision_cannot_tell_apart_are_refused():
     system, record = duffing()
     late = Record(record.t + 1.7e9, record.y, record.u, record.prior)
     with pytest.raises(ValueError, match="are the same in float32; subtract the first"):
-        train(system, SMALL, record=late)
+        train_pinn_obs(system, SMALL, record=late)

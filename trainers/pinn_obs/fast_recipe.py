@@ -11,14 +11,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from pinnobs_gym.estimation.learned.mlp import Architecture, Network
+from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
 from pinnobs_gym.estimators.pinn_obs import Covariance
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
+from trainers.pinn_obs.config import Config
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
-from trainers.pinn_obs.minimum import FIRST_STEP
+from trainers.pinn_obs.minimum import FIRST_STEP, Method
 from trainers.pinn_obs.objective import Lead, Objective, Weights
+from trainers.pinn_obs.passes import draw_layers, flattened, unflattened
 from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
 from trainers.pinn_obs.quasi_newton import Inverse, QuasiNewton
-from trainers.pinn_obs.run import Run
+from trainers.pinn_obs.recipe import Recipe
 
 UNITS = 20
 """Units of time in a record; one is the paper's second."""
@@ -36,7 +40,7 @@ _NOISY = 5
 """How many times as many samples are looked at if they are noisy."""
 
 
-class FastRun(Run):
+class FastRecipe(Recipe):
     """Self-scaled Broyden steps on the loss in scaled quantities.
 
     States are counted in `System.scale`, outputs in what that does to them, and time in twentieths
@@ -51,8 +55,11 @@ class FastRun(Run):
     the gains towards zero.
     """
 
-    def _architecture(self) -> Architecture:
-        config, system, t = self.config, self.system, self.record.t
+    def __init__(
+        self, system: System, config: Config, record: Record, noise_std: np.ndarray
+    ) -> None:
+        self.config, self.system, self.record, self.noise_std = config, system, record, noise_std
+        t = record.t
         noisy = bool(self.noise_std.any())
         most = config.points * (_NOISY if noisy else 1)
         self.points, samples = points_of(system, self.record, most)
@@ -77,7 +84,7 @@ class FastRun(Run):
         frequencies = fast_frequencies(self.record)
         self._check_resolution(frequencies, len(samples.t), most)
         decays = [interval * part for part in _DECAYS[0]] + [length * part for part in _DECAYS[1]]
-        architecture = Architecture(
+        self.architecture = Architecture(
             system.nx,
             system.ny,
             config.depth,
@@ -89,8 +96,7 @@ class FastRun(Run):
             frequencies=frequencies,
             scale=(*x_scale, *(_GAIN * per_gain).ravel()),
         )
-        self.objective = Objective(architecture, system, self.points, weights, lead)
-        return architecture
+        self.objective = Objective(self.architecture, system, self.points, weights, lead)
 
     def _check_resolution(self, frequencies: tuple[float, ...], samples: int, most: int) -> None:
         """Warn of a record so long that the samples looked at do not resolve its outputs."""
@@ -118,49 +124,41 @@ class FastRun(Run):
             config.gain_penalty * each[..., None] / (L_scale**2 + L**2),
         )
 
-    def _drawn(self, generator: torch.Generator) -> Network:
-        network = Network(self.architecture, generator)
-        with torch.no_grad():  # neurons with their middles all over the record
-            weight, bias = network.weights[0], network.biases[0]
-            slopes = _SLOPES * torch.randn(len(bias), generator=generator, dtype=bias.dtype)
-            middles = 2 * torch.rand(len(bias), generator=generator, dtype=bias.dtype) - 1
-            weight[:, 0], bias[:] = slopes, -slopes * middles
-        return network
+    def draw(self, generator: torch.Generator) -> np.ndarray:
+        layers = draw_layers(self.architecture, generator)
+        weight, bias = layers[0]  # neurons with their middles all over the record
+        slopes = _SLOPES * torch.randn(len(bias), generator=generator, dtype=bias.dtype)
+        middles = 2 * torch.rand(len(bias), generator=generator, dtype=bias.dtype) - 1
+        weight[:, 0], bias[:] = slopes, -slopes * middles
+        return flattened(layers)
 
-    def _begun(self, theta: np.ndarray) -> QuasiNewton:
+    def begin(self, theta: np.ndarray) -> QuasiNewton:
         return QuasiNewton.start(self.objective, theta, first=FIRST_STEP)
 
-    def held_out(self) -> None:
+    def held_out(self, theta: np.ndarray) -> None:
         return None
 
-    def covariance(self, network: Network) -> Covariance | None:
+    def covariance(self, theta: np.ndarray) -> Covariance | None:
         """The smoother's, which is Laplace's approximation for the estimates that the guide leads
         to, and the square of how far the network is from them."""
         if self.guide is None:
             return None
-        t, smoothed = self.guide.t, self.guide.smoothed
-        with torch.no_grad():
-            away = network(torch.from_numpy(t))[0].numpy() - smoothed
+        t, layers = self.guide.t, unflattened(self.architecture, theta)
+        away = evaluate(self.architecture, layers, t)[0] - self.guide.smoothed
         return Covariance(t, self.guide.P + away[:, :, None] * away[:, None, :])
 
-    def _state(self) -> dict[str, Any]:
-        method = self._method
+    def method_state(self, method: Method) -> dict[str, Any]:
         assert isinstance(method, QuasiNewton)
-        parts: dict[str, Any] = {"gradient": torch.from_numpy(method.gradient)}
+        parts: dict[str, Any] = {"gradient": method.gradient, "direction": method.direction}
         if method.H is not None:
-            parts |= {"H_scale": method.H.scale, "H_middle": torch.from_numpy(method.H.middle)}
-            parts |= {"H": torch.from_numpy(method.H.matrix.T)}  # C's order, like all tensors'
-            parts["H_vectors"] = torch.from_numpy(method.H.vectors.T)
-        if method.direction is not None:
-            parts["direction"] = torch.from_numpy(method.direction)
+            parts |= {"H_scale": method.H.scale, "H_middle": method.H.middle}
+            parts |= {"H": method.H.matrix.T, "H_vectors": method.H.vectors.T}  # in C's order
         return parts
 
-    def _resumed(self, state: Mapping[str, Any]) -> QuasiNewton:
-        assert self.best is not None
+    def load_method(self, state: Mapping[str, Any], best: tuple[np.ndarray, float]) -> QuasiNewton:
         H = None
         if "H" in state:
-            matrix, vectors = state["H"].numpy().T, state["H_vectors"].numpy().T
-            H = Inverse(matrix, state["H_scale"], vectors, state["H_middle"].numpy())
-        direction = state["direction"].numpy() if "direction" in state else None
-        here = self.best.theta, self.best.loss, state["gradient"].numpy()
-        return QuasiNewton(*here, H, direction, first=FIRST_STEP)
+            vectors, middle = state["H_vectors"].T, state["H_middle"]
+            H = Inverse(state["H"].T, state["H_scale"], vectors, middle)
+        here = *best, state["gradient"]
+        return QuasiNewton(*here, H, state["direction"], first=FIRST_STEP)

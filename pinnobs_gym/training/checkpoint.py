@@ -1,0 +1,75 @@
+"""Files from which an interrupted training goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.estimation.learned.trained_file import (
+    check_same,
+    identity,
+    plain,
+    read,
+    with_arrays,
+    with_tensors,
+    write,
+)
+from pinnobs_gym.training.settings import ALWAYS_MAY_CHANGE
+from pinnobs_gym.training.trainer import Trainer
+
+
+def save_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
+    """Write all that `load_checkpoint` needs to go on exactly.
+
+    Raises:
+        ValueError: in one line, if the file cannot be written.
+    """
+    content = {
+        "checkpoint": _identity(trainer),
+        "record": _record(trainer),
+        "iteration": trainer.iteration,
+        "seconds": trainer.seconds,
+        "state": trainer.state(),
+    }
+    write(path, with_tensors(content))
+
+
+def load_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
+    """Go on with the training of a checkpoint, in a trainer that was made anew.
+
+    Raises:
+        ValueError: in one line, if it cannot be read or belongs to another training.
+    """
+    saved = with_arrays(read(path))
+    try:
+        check_same(path, saved["checkpoint"], _identity(trainer))
+        for name, array in _record(trainer).items():
+            if not np.array_equal(saved["record"][name], array, equal_nan=True):
+                raise ValueError(f"{path} was trained on another record: its {name} differs")
+        trainer.continue_from(int(saved["iteration"]), float(saved["seconds"]))
+        trainer.load_state(saved["state"])
+    except (KeyError, TypeError, AttributeError, RuntimeError, IndexError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{path} is not a checkpoint of this trainer: {reason}") from None
+
+
+def _identity(trainer: Trainer[Any, Any]) -> dict[str, Any]:
+    """What a checkpoint must agree with."""
+    free = (*ALWAYS_MAY_CHANGE, *trainer.config.may_change)
+    config = {name: v for name, v in asdict(trainer.config).items() if name not in free}
+    facts = {**identity(trainer.system), "trainer": trainer.name}
+    if not trainer.has_record:
+        facts |= {"game": trainer.game.name._asdict(), "episode": trainer.episode}
+    noise_std = trainer.noise_std.tolist()
+    return {**facts, "noise_std": noise_std, "config": plain(config)}
+
+
+def _record(trainer: Trainer[Any, Any]) -> Mapping[str, np.ndarray]:
+    if not trainer.has_record:
+        return {}
+    record = trainer.record
+    return {"t": record.t, "y": record.y, "u": record.u, "xhat0": record.prior.mean}

@@ -1,0 +1,265 @@
+"""The fit of T, then that of T*."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pinnobs_gym.estimation.learned.kkl_dynamics import at_rest
+from pinnobs_gym.estimation.learned.kkl_maps import Layers, Mlp, evaluate
+from pinnobs_gym.simulation.system import output_scale
+from trainers.kkl.config import KKLConfig
+from trainers.kkl.fitting import Equations, Fit, Objective, Term
+from trainers.kkl.samples import Samples
+
+Stage: TypeAlias = Literal["T", "T*", "done"]
+
+_USUAL = 0.95
+"""Weight of the past in the mean squared error of each part."""
+_SHARE = 0.02
+"""Part of the mean squared error that is added to each part's before it is divided by."""
+
+
+@dataclass(eq=False)
+class Best:
+    """The weights of the least validation error."""
+
+    error: float
+    iteration: int
+    layers: Layers
+    made: int = 0
+    """Steps that were made in all."""
+
+
+class TwoStageFit:
+    """A fit of T to the trainer's equations, then of T* to x at the z that occur online.
+
+    Args:
+        samples: what is fitted to.
+        config: the recipe.
+        encoding: makes the equations that T is fitted to.
+    """
+
+    def __init__(
+        self, samples: Samples, config: KKLConfig, encoding: Callable[[Samples], Objective]
+    ) -> None:
+        self._begun, self._earlier = time.process_time(), 0.0
+        self.samples, self.config, self._encoding = samples, config, encoding
+        self.latest = np.nan
+        self.best: dict[str, Best] = {}
+        self._begin("T")
+
+    @property
+    def seconds(self) -> float:
+        """CPU seconds so far."""
+        return self._earlier + time.process_time() - self._begun
+
+    @property
+    def iterations(self) -> int:
+        """Steps so far, for both networks."""
+        return self.fit.iteration + (self.best["T"].made if self.stage != "T" else 0)
+
+    @property
+    def encoder(self) -> Layers:
+        """T's best weights."""
+        return self.best["T"].layers
+
+    @property
+    def decoder(self) -> Layers:
+        """T*'s best weights; if T is not done, as they are drawn, so that there are some."""
+        if self.stage == "T":
+            self.best["T"].made = self.fit.iteration
+            self._begin("T*")
+        return self.best["T*"].layers
+
+    def finished(self) -> bool:
+        """Whether both networks are trained."""
+        return self.stage == "done"
+
+    def step(self) -> None:
+        """Make a step of the present network; the next one's turn if that was the last."""
+        self.fit.step(self._stage_progress)
+        if self.fit.iteration % self.config.check_every == 0:
+            self._validate()
+        if self._stage_over():
+            self._validate()
+            self.best[self.stage].made = self.fit.iteration
+            if self.stage == "T":
+                self._begin("T*")
+            else:
+                self.stage = "done"
+
+    def progress(self) -> float:
+        """How much of the whole fit is over, from 0 to 1."""
+        share = self.config.share / (1 + self.config.share)
+        if self.stage == "T":
+            return share * min(self._stage_progress, 1.0)
+        return 1.0 if self.finished() else share + (1 - share) * min(self._stage_progress, 1.0)
+
+    def _begin(self, stage: Stage) -> None:
+        """Draw the network of a stage."""
+        self.stage: Stage = stage
+        self._stage_start = self.seconds
+        config, samples = self.config, self.samples
+        generator = torch.Generator().manual_seed(2 * config.seed + (stage == "T*"))
+        if stage == "T":
+            inputs = samples.x_scaling
+            if samples.driven:
+                inputs = inputs.beside(samples.clock_scaling)
+            outputs = samples.z_scaling
+        else:
+            inputs, outputs = samples.whitening.beside(samples.clock_scaling), samples.x_scaling
+        shape = (config.depth, config.width, config.activation)
+        net = Mlp(inputs, outputs, *shape, generator, samples.dtype, samples.device)
+        if stage == "T":
+            objective = self._encoding(samples)
+            self._checked = _held_equations(objective, config.seed)
+        else:
+            if samples.labels is None:  # T is what it is now
+                samples.z = samples.tensor(samples.whitening.scaled(self._own_z()))
+            objective = self._decoding
+            parts = int(samples.parts[-1]) + 1
+            self._mse = torch.ones(parts, dtype=samples.dtype, device=samples.device)
+        self.fit = Fit(net, objective, config.method, config.learning_rate, generator)
+        self._validate()
+
+    def _own_z(self) -> np.ndarray:
+        """The z along the episodes if T is right: T(x(t)) + Φ(t)(z₀ − T(x₀)), or T(t, x(t)) of a
+        driven plant."""
+        data, map_of = self.samples.data, self.encoder
+        if self.samples.driven:
+            clock = self.samples.clock(data.t, data.u)[:, None]
+            x = np.concatenate(
+                [data.x, np.broadcast_to(clock, (*data.x.shape[:2], clock.shape[-1]))], axis=-1
+            )
+            return evaluate(map_of, self.config.activation, x)
+        T, T0 = (evaluate(map_of, self.config.activation, x) for x in (data.x, data.x0))
+        first = self.samples.t[0]
+        y0 = self.samples.system.h(first, data.x0, np.asarray(self.samples.system.input(first)))
+        z0 = y0 @ at_rest(self.samples.dynamics, self.config.start).T
+        if self.config.start == "prior":
+            z0 = z0 + evaluate(map_of, self.config.activation, self.samples.prior)
+        return T + np.einsum("kij,bj->kbi", data.flow, z0 - T0)
+
+    def _decoding(self, generator: torch.Generator) -> Sequence[Equations]:
+        """x̂ = x at samples of all parts of the episode, whose errors are divided by what is usual
+        there: else the transient, which is never small, is all that counts."""
+        samples = self.samples
+        k, i = samples.draw(generator, samples.system.nx)
+        rows = samples.z_noise.shape[1]
+        j = torch.randint(rows, (len(k),), generator=generator).to(samples.device)
+        a = torch.cat([samples.z[k, i] + samples.z_noise[k, j], samples.times[k]], dim=-1)
+        target, part = samples.x[k, i], samples.parts.to(samples.device)[k]
+        with torch.no_grad():
+            square = (self.fit.net(a) - target).square().mean(dim=-1)
+            count = torch.bincount(part, minlength=len(self._mse))
+            found = torch.zeros_like(self._mse).index_add_(0, part, square) / count.clamp(min=1)
+            self._mse = torch.where(count > 0, _USUAL * self._mse + (1 - _USUAL) * found, self._mse)
+            usual = self._mse + _SHARE * self._mse.mean()
+            weight = (usual.mean() / usual).sqrt()[part][:, None]
+        return [Equations([Term(a)], target, weight)]
+
+    @property
+    def _stage_progress(self) -> float:
+        """How much of the present network's training is over: by steps, or by CPU time if there is
+        a budget and that is further."""
+        config = self.config
+        steps = config.iterations * (config.share if self.stage == "T" else 1.0)
+        done = self.fit.iteration / steps
+        if config.budget is not None:
+            left = config.budget - self._stage_start
+            mine = left * config.share / (1 + config.share) if self.stage == "T" else left
+            spent = self.seconds - self._stage_start
+            done = max(done, spent / max(mine, 1e-9))
+        return done
+
+    def traded(self) -> dict[str, float]:
+        """What a cut-off trades; see `trainers.kkl.trainer.KKLTrainer`."""
+        noisy, clean = (self._held_squares(noise).cpu().numpy() for noise in (True, False))
+        t = self.samples.data.t
+        late = t >= t[0] + 0.75 * (t[-1] - t[0])
+        end, without = noisy[late].mean(), clean[late].mean()
+        above = np.flatnonzero(noisy > 4 * end)
+        scale = self.samples.noise_std / output_scale(self.samples.system)
+        own = float(np.sqrt(np.mean(scale**2)))
+        return {
+            "noisy": float(np.sqrt(end)),
+            "clean": float(np.sqrt(without)),
+            "noise_gain": float(np.sqrt(max(end - without, 0.0))) / own if own else 0.0,
+            "convergence": float(t[above[-1]]) if len(above) else 0.0,
+        }
+
+    def _stage_over(self) -> bool:
+        best = self.best[self.stage]
+        config = self.config
+        steps = config.iterations * (config.share if self.stage == "T" else 1.0)
+        waited = (self.fit.iteration - best.iteration) / steps
+        return self._stage_progress >= 1 or (waited >= config.patience and self.fit.iteration > 0)
+
+    def _validate(self) -> None:
+        """Find the error on what is held out, and keep the weights if it is the least so far."""
+        with torch.no_grad():
+            self.latest = self._held_error()
+        best = self.best.get(self.stage)
+        if best is None or self.latest < best.error:
+            self.best[self.stage] = Best(self.latest, self.fit.iteration, self.fit.net.layers())
+
+    def _held_error(self) -> float:
+        net = self.fit.net
+        if self.stage == "T":
+            found = [e.residual(net).square().mean() for e in self._checked]
+            return float(torch.stack(found).sum())
+        square = self._held_squares(noise=True)
+        parts = torch.zeros_like(self._mse).index_add_(
+            0, self.samples.parts.to(self.samples.device), square
+        )
+        count = torch.bincount(self.samples.parts, minlength=len(parts)).to(self.samples.device)
+        return float((parts / count).log().mean().exp())
+
+    def _held_squares(self, noise: bool) -> Tensor:
+        """Mean squared scaled errors of x̂ on the episodes held out, (kept,)."""
+        with torch.no_grad():
+            z = self.samples.z[:, self.samples.held]
+            if noise:
+                z = z + self.samples.z_noise[:, : self.samples.held.stop]
+            clock = self.samples.times[:, None].expand(-1, z.shape[1], -1)
+            error = self.fit.net(torch.cat([z, clock], -1)) - self.samples.x[:, self.samples.held]
+            return error.square().mean((1, 2))
+
+    def state(self) -> dict[str, Any]:
+        """All that `load_state` needs to go on exactly; the samples are simulated anew."""
+        return {
+            "stage": self.stage,
+            "seconds": self.seconds,
+            "stage_start": self._stage_start,
+            "best": {
+                stage: {f.name: getattr(best, f.name) for f in fields(Best)}
+                for stage, best in self.best.items()
+            },
+            "usual": self._mse.cpu().numpy() if self.stage == "T*" else None,
+            "fit": self.fit.state(),
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` gave."""
+        self.best = {stage: Best(**found) for stage, found in state["best"].items()}
+        kept = dict(self.best)
+        if state["stage"] != "T":
+            self._begin("T*")
+        self.fit.load_state(state["fit"])
+        self.best, self.stage = kept, state["stage"]
+        if state["usual"] is not None:
+            self._mse = torch.from_numpy(state["usual"]).to(self.samples.device)
+        self._earlier += state["seconds"]
+        self._stage_start = state["stage_start"]
+
+
+def _held_equations(objective: Objective, seed: int) -> list[Equations]:
+    generator = torch.Generator().manual_seed(seed + 10**6)
+    return [e for _ in range(5) for e in objective(generator)]

@@ -1,0 +1,67 @@
+"""The paper's recipe: Adam on a random part of the samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import System
+from trainers.pinn_obs.adam import Adam
+from trainers.pinn_obs.config import Config
+from trainers.pinn_obs.minimum import Method
+from trainers.pinn_obs.objective import Objective, Weights
+from trainers.pinn_obs.passes import draw_layers, flattened
+from trainers.pinn_obs.points import samples_of
+from trainers.pinn_obs.recipe import Recipe
+
+
+class PaperRecipe(Recipe):
+    """Adam on all training samples at once, the terms' weights those of the config."""
+
+    def __init__(
+        self, system: System, config: Config, record: Record, noise_std: np.ndarray
+    ) -> None:
+        self.config, self.system, self.record = config, system, record
+        sizes = (system.nx, system.ny, config.depth, config.width)
+        self.architecture = Architecture(*sizes, config.activation, config.dtype)
+        order = np.random.default_rng(config.seed).permutation(record.num_samples)
+        count = max(1, round(config.train_fraction * len(order)))
+        self.objective = self._loss_on(order[:count])
+        left = order[count:]
+        self._held_out = self._loss_on(left) if len(left) else None
+
+    def _loss_on(self, samples: np.ndarray) -> Objective:
+        """The paper's loss on samples of these indices (num_samples,)."""
+        config, nx, ny = self.config, self.system.nx, self.system.ny
+        each = np.full(nx, config.w0), np.full(nx, config.w_ode), np.full(ny, config.w_y)
+        points = samples_of(self.system, self.record, samples)
+        return Objective(self.architecture, self.system, points, Weights(*each))
+
+    def draw(self, generator: torch.Generator) -> np.ndarray:
+        return flattened(draw_layers(self.architecture, generator))
+
+    def begin(self, theta: np.ndarray) -> Adam:
+        return Adam.start(self.objective, theta, self.config.learning_rate)
+
+    def held_out(self, theta: np.ndarray) -> float | None:
+        if self._held_out is None:
+            return None
+        config = self.config
+        terms = self._held_out.terms(theta)
+        return float(terms @ [config.w0, config.w_ode, config.w_y])
+
+    def covariance(self, theta: np.ndarray) -> None:
+        return None
+
+    def method_state(self, method: Method) -> dict[str, Any]:
+        assert isinstance(method, Adam)
+        names = ("x", "f", "gradient", "mean", "square", "steps")
+        return {name: getattr(method, name) for name in names}
+
+    def load_method(self, state: Mapping[str, Any], best: tuple[np.ndarray, float]) -> Adam:
+        return Adam(**state, learning_rate=self.config.learning_rate)
