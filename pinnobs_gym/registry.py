@@ -14,7 +14,7 @@ import pkgutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cached_property
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -54,17 +54,22 @@ class Registry(Generic[T]):
         """The classes that are imported."""
         self._all_imported = False
 
-    @property
+    @cached_property
     def sources(self) -> dict[str, Origin]:
-        """The names that the sources of the package show, without importing any of them."""
-        return _shown(self._package, self._attributes)
+        """The names that the sources of the package show, without importing any of them; a warning
+        for each file that is no Python, or gives a name that another has."""
+        return _shown(self._kind, self._package, self._attributes)
 
     def classes(self) -> dict[str, type[T]]:
-        """All classes by name, sorted; imports their modules on the first call."""
+        """All classes by name, sorted; imports their modules on the first call, with a warning for
+        each that cannot be."""
         if not self._all_imported:
             self._all_imported = True
             for name in self.sources:
-                self._take(name)
+                try:
+                    self._take(name)
+                except ValueError as error:
+                    warnings.warn(str(error), stacklevel=2)
             self.plug_ins()
         return dict(sorted(self._known.items()))
 
@@ -89,7 +94,12 @@ class Registry(Generic[T]):
             ValueError: if another class has its name.
         """
         if not self._is_one(cls):
-            raise TypeError(f"{cls!r} is not a concrete subclass of {self._base.__name__}")
+            base = self._base
+            if not (isinstance(cls, type) and issubclass(cls, base)):
+                raise TypeError(f"{cls!r} is not a subclass of {base.__name__}")
+            abstract: frozenset[str] = getattr(cls, "__abstractmethods__", frozenset())
+            lacking = ", ".join(sorted(abstract))
+            raise TypeError(f"{cls.__name__} lacks what a {base.__name__} has to define: {lacking}")
         name = self.name_of(cls)
         taken = self._owner(name)
         if taken is not None and taken != (cls.__module__, cls.__qualname__):
@@ -113,6 +123,12 @@ class Registry(Generic[T]):
             self.plug_ins()
         if spec not in self._known:
             known = ", ".join(sorted({*self._known, *self.sources}))
+            if not known:  # as of a folder of that name in the working folder
+                place = ", ".join(importlib.import_module(self._package).__path__)
+                raise ValueError(
+                    f"unknown {self._kind} {spec!r}; there is none in {place}, which is imported "
+                    f"as {self._package}"
+                )
             raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}")
         return self._known[spec]
 
@@ -160,8 +176,19 @@ class Registry(Generic[T]):
         return None if cls is None else (cls.__module__, cls.__qualname__)
 
     def _take(self, name: str) -> None:
-        """Import the class that a source shows under a name."""
-        module = importlib.import_module(self.sources[name].module)
+        """Import the class that a source shows under a name.
+
+        Raises:
+            ValueError: in one line, if its module cannot be imported.
+        """
+        origin = self.sources[name].module
+        try:
+            module = importlib.import_module(origin)
+        except Exception as error:  # whatever the file raises
+            kind = type(error).__name__
+            raise ValueError(
+                f"cannot load {self._kind} {name!r} from {origin}: {kind}: {error}"
+            ) from error
         for cls in vars(module).values():
             if (
                 self._is_one(cls)
@@ -174,20 +201,30 @@ class Registry(Generic[T]):
         return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
 
 
-@cache
-def _shown(package: str, attributes: tuple[str, ...]) -> dict[str, Origin]:
+def _shown(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, Origin]:
     """What `Registry.sources` returns."""
-    found = {}
+    found: dict[str, Origin] = {}
     for module in _modules(package):
-        for node in ast.parse(_source(module)).body:
+        try:
+            tree = ast.parse(_source(module))
+        except SyntaxError as error:
+            told = f"{module}, line {error.lineno}, is no Python: {error.msg}"
+            warnings.warn(f"left out as a {kind}: {told}", stacklevel=3)
+            continue
+        for node in tree.body:
             if isinstance(node, ast.ClassDef):
                 constants = _constants(node)
                 if constants.keys() & set(attributes):
-                    found[constants.get("name", node.name)] = Origin(module, constants)
+                    name = constants.get("name", node.name)
+                    if name in found:
+                        other = f"{found[name].module} has one of that name"
+                        told = f"{node.name!r} in {module}: {other}"
+                        warnings.warn(f"left out as a {kind}: {told}", stacklevel=3)
+                        continue
+                    found[name] = Origin(module, constants)
     return dict(sorted(found.items()))
 
 
-@cache
 def _modules(package: str) -> tuple[str, ...]:
     """Dotted names of the modules of a package, sorted; the package alone is imported."""
     path = importlib.import_module(package).__path__

@@ -116,8 +116,41 @@ def test_names_are_read_without_importing_and_resolved_alone(zoo):
     assert zoo.resolve("another name").state_names == ("z",)
     assert zoo.resolve("Decay").__name__ == "Decay"
     assert "zoo_package.broken" not in sys.modules
-    with pytest.raises(RuntimeError, match="imported"):
+    message = "cannot load system 'Broken' from zoo_package.broken: RuntimeError: imported"
+    with pytest.raises(ValueError, match=message):
         zoo.resolve("Broken")
+
+
+def test_one_bad_file_harms_no_other(zoo, tmp_path):
+    folder = tmp_path / "zoo_package"
+    (folder / "half.py").write_text("x = 1\nclass Half(")
+    (folder / "second.py").write_text(PLUG_IN)
+    with pytest.warns(UserWarning, match="left out as a system") as caught:
+        names = list(zoo.sources)
+    assert names == ["Broken", "Decay", "another name", "no system"]
+    told = [str(warning.message) for warning in caught]
+    assert told == [
+        "left out as a system: zoo_package.half, line 2, is no Python: '(' was never closed",
+        "left out as a system: 'Decay' in zoo_package.second: zoo_package.first has one of that "
+        "name",
+    ]
+    assert zoo.sources["Decay"].module == "zoo_package.first"
+    with pytest.warns(UserWarning, match="cannot load system 'Broken' from zoo_package.broken"):
+        assert "Decay" in zoo.classes()
+
+
+def test_what_is_none_is_told_why():
+    with pytest.raises(TypeError, match="Half lacks what a System has to define: f, h"):
+        SYSTEMS.register(type("Half", (System,), {}))
+    with pytest.raises(TypeError, match="'int'> is not a subclass of System"):
+        SYSTEMS.register(int)  # pyright: ignore
+
+
+def test_a_package_that_hides_ours_is_named(tmp_path, monkeypatch):
+    (tmp_path / "hidden_zoo").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"unknown system 'A'; there is none in .*hidden_zoo"):
+        made("hidden_zoo").resolve("A")
 
 
 def test_what_a_registry_forgets(zoo):

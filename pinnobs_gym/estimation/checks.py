@@ -48,7 +48,10 @@ def check_estimator(estimator: Estimator) -> None:
 
     Raises:
         CheckFailed: if any fails, with a line for each: its name, what was found and expected.
+        TypeError: in one line, if it is not an instance.
     """
+    if not isinstance(estimator, Estimator):
+        raise TypeError(f"{estimator!r} is not an instance of an Estimator; expected one")
     run_all(ESTIMATOR_CHECKS, estimator)
 
 

@@ -118,20 +118,24 @@ class Estimator(ABC):
 
     def run(self, record: Record) -> Estimates:
         """The estimates over whole records: `update` in a loop."""
-        state = self.reset(record.prior)
+        state = self._state_from("reset", self.reset(record.prior))
         columns: dict[str, np.ndarray] = {}
         y, u = np.moveaxis(record.y, 1, 0).copy(), np.moveaxis(record.u, 1, 0).copy()
         with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
             for k, t in enumerate(record.t):
-                state = self.update(state, float(t), y[k], u[k])
-                if not isinstance(state, State):
-                    name, kind = type(self).__name__, type(state).__name__
-                    raise TypeError(f"{name}.update returned {kind}; expected a State")
+                state = self._state_from("update", self.update(state, float(t), y[k], u[k]))
                 if k == 0:
                     columns = _empty_columns(state, record.num_samples)
                 for name, column in columns.items():
                     column[k] = getattr(state, name)
         return Estimates(**{name: np.moveaxis(c, 0, 1) for name, c in columns.items()})
+
+    def _state_from(self, method: str, state: Any) -> State:
+        """What a method returned, if it is a state."""
+        if not isinstance(state, State):
+            name, kind = type(self).__name__, type(state).__name__
+            raise TypeError(f"{name}.{method} returned {kind}; expected a State")
+        return state
 
     @property
     def output_variance(self) -> np.ndarray:

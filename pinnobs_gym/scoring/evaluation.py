@@ -88,10 +88,24 @@ def evaluate(
     game = Game.of(env_id, setup, condition)
     made = make_estimator(estimator, game, options or {})
     stored = None if results is None else Results(Path(results))
-    found = run_episodes(game, made, range(seed, seed + episodes), stored, progress)
+    found = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
     log_episodes(log, found.rows, found.first_played)
     log_summary(log, found.rows)
     return found.rows
+
+
+def seeds_of(seed: int, episodes: int) -> range:
+    """The seeds of so many episodes, the first one's given.
+
+    Raises:
+        ValueError: in one line, if there are no episodes or a seed is below zero.
+    """
+    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0)):
+        if value < least:
+            raise ValueError(f"{name}={value}; expected at least {least}")
+        if int(value) != value:
+            raise ValueError(f"{name}={value}; expected a whole number")
+    return range(int(seed), int(seed + episodes))
 
 
 @dataclass(frozen=True)
@@ -121,14 +135,7 @@ def run_episodes(
         results: what is stored, and where rows are appended.
         progress: called with the number of episodes done.
         label: the estimator's name in rows, if not its own.
-
-    Raises:
-        ValueError: in one line, if there are no episodes or a seed is below zero.
     """
-    if not len(seeds):
-        raise ValueError(f"episodes={len(seeds)}; expected at least 1")
-    if seeds[0] < 0:
-        raise ValueError(f"seed={seeds[0]}; expected at least 0")
     common = _common(estimator, game) | {"estimator": label or estimator.label}
     wanted = [{**common, "episode_seed": seed} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)

@@ -58,7 +58,8 @@ def load(cls: type[Estimator], path: Path, game: Game) -> Estimator:
         ValueError: in one line, if it cannot be read or belongs to another system.
     """
     if not issubclass(cls, LearnedEstimator):
-        raise ValueError(f"estimator {cls.__name__!r} is not one that is trained first")
+        name = getattr(cls, "name", cls.__name__)
+        raise ValueError(f"estimator {name!r} is not one that is trained first")
     estimator: Any = cls.load(path, game.source.system)
     noise_std = game.source.setup.noise_std
     return replace(estimator, noise_std=noise_std) if "noise" in cls.knows else estimator

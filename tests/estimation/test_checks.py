@@ -500,3 +500,24 @@ def test_checking_registers_nothing() -> None:
     check_system(QuickPendulum)
     check_estimator(EKF(QuickPendulum()))
     assert not {"Pendulum", "QuickPendulum"} & set(SYSTEMS.classes())
+
+
+@dataclass(frozen=True)
+class NoState(Estimator):
+    """Returns an array where a state is expected."""
+
+    def reset(self, prior: Prior) -> Any:
+        return prior.mean
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        return state
+
+
+def test_what_is_no_state_is_told_of_the_method_that_returned_it() -> None:
+    system = QuickPendulum()
+    prior = Prior.of(system, system.setups["benchmark"], 1)
+    record = Record(np.zeros(1), np.zeros((1, 1, system.ny)), np.zeros((1, 1, system.nu)), prior)
+    with pytest.raises(TypeError, match=r"NoState\.reset returned ndarray; expected a State"):
+        NoState(system).run(record)
+    with pytest.raises(TypeError, match="is not an instance of an Estimator"):
+        check_estimator(NoState)  # pyright: ignore

@@ -127,6 +127,8 @@ def test_tensorboard_has_scalars_a_figure_and_hparams(tmp_path):
         ({"condition": "rain"}, "unknown condition 'rain'; known are nominal"),
         ({"condition": "load_step"}, "needs a plant with a load torque; ReverseDuffing has none"),
         ({"episodes": 0}, "episodes=0; expected at least 1"),
+        ({"episodes": -3}, "episodes=-3; expected at least 1"),
+        ({"episodes": 1.5}, "episodes=1.5; expected a whole number"),
         ({"seed": -1}, "seed=-1; expected at least 0"),
         ({"options": {"gain": 1.0}}, "estimator 'ekf': .*unexpected keyword argument 'gain'"),
         ({"estimator": EKF(Academic())}, "model is Academic .*; the env plays ReverseDuffing"),

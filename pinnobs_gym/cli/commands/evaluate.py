@@ -15,7 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.runs import runs_of
-from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes
+from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes, seeds_of
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
 from pinnobs_gym.training.by_name import load
@@ -75,14 +75,14 @@ class Evaluate:
 
     def _score(self, game: Game, estimator: Estimator, episodes: int) -> list[Row]:
         """The rows of that many episodes, which are logged."""
-        seeds = range(self.seed, self.seed + episodes)
+        seeds = seeds_of(self.seed, episodes)
         with progress() as bar:
             task = bar.add_task("episodes", total=episodes)
 
-            def told(done: int) -> None:
+            def count(done: int) -> None:
                 bar.advance(task, done)
 
-            found = run_episodes(game, estimator, seeds, Results(self._rows), told)
+            found = run_episodes(game, estimator, seeds, Results(self._rows), count)
             bar.update(task, completed=episodes)
         with Log(log_folder(self.out, found.rows[0])) as log:
             log_episodes(log, found.rows, found.first_played)
