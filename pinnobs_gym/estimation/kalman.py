@@ -1,15 +1,17 @@
 """What filters of the Kalman family share: the prediction and the update in Joseph's form.
 
-Inside these functions the batch comes last, which is several times faster for small matrices.
+Inside these functions the batch comes last, which is several times faster for small matrices. Those
+with `Array` in their annotations take NumPy arrays and torch tensors, which keep gradients.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.matrices import divide, identity, product, sandwich
+from pinnobs_gym.simulation.matrices import divide, identity, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step_jacobian
-from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.system import Array, System
 
 
 def predict(
@@ -59,8 +61,8 @@ def observe(
 
 
 def joseph_update(
-    xhat: np.ndarray, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, R: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    xhat: Array, P: Array, innovation: Array, H: Array, R: Array
+) -> tuple[Array, Array, Array]:
     """The Kalman update of a batch in Joseph's form.
 
     Args:
@@ -78,29 +80,43 @@ def joseph_update(
     return *update_with(K, xhat, P, innovation, H, R), S
 
 
-def kalman_gain(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def kalman_gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
     """The gains K = PHᵀS⁻¹, (nx, ny, batch), and the covariances S = HPHᵀ + R of the innovations,
     (ny, ny, batch); arguments as in `joseph_update`."""
     HP = product(H, P)
-    S = product(HP, H.transpose(1, 0, 2))
+    S = product(HP, H.swapaxes(0, 1))
     S += R
-    return divide(HP.transpose(1, 0, 2), S), S
+    return divide(HP.swapaxes(0, 1), S), S
+
+
+def gain_of_deviations(
+    X: np.ndarray, Y: np.ndarray, R: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The gains K = XYᵀS⁻¹, (nx, ny, batch), and the covariances S = YYᵀ + R of the innovations,
+    (ny, ny, batch), from points about the estimate.
+
+    Args:
+        X: weighted deviations of the points, shape (nx, num_points, batch).
+        Y: those of their outputs, shape (ny, num_points, batch); zero where y is missing.
+        R: covariance of the output noise, shape (ny, ny, batch or 1).
+    """
+    S = outer(Y, Y)
+    S += R
+    return divide(outer(X, Y), S), S
 
 
 def update_with(
-    K: np.ndarray,
-    xhat: np.ndarray,
-    P: np.ndarray,
-    innovation: np.ndarray,
-    H: np.ndarray,
-    R: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    K: Array, xhat: Array, P: Array, innovation: Array, H: Array, R: Array
+) -> tuple[Array, Array]:
     """Estimates (batch, nx) and their covariances (nx, nx, batch) after an update with any gains K
     (nx, ny, batch): P⁺ = (I − KH)P(I − KH)ᵀ + KRKᵀ; other arguments as in `joseph_update`."""
-    M = identity(len(P), P.shape[-1]) - product(K, H)
+    if isinstance(P, np.ndarray):
+        M = identity(len(P), P.shape[-1]) - product(K, H)
+    else:
+        M = array_namespace(P).eye(len(P), dtype=P.dtype)[..., None] - product(K, H)
     P = sandwich(M, P)
     P += sandwich(K, R)
-    P = P + P.transpose(1, 0, 2)  # which rounding alone leaves asymmetric
+    P = P + P.swapaxes(0, 1)  # which rounding alone leaves asymmetric
     P *= 0.5
     x = xhat.T + product(K, innovation.T[:, None])[:, 0]
     return x.T, P

@@ -9,7 +9,8 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
-from pinnobs_gym.simulation.matrices import divide, factor, outer, product, sandwich
+from pinnobs_gym.estimation.kalman import gain_of_deviations
+from pinnobs_gym.simulation.matrices import factor, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -86,9 +87,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         if np.count_nonzero(missing):
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
-        S = outer(Y, Y)
-        S += memory.R
-        K = divide(outer(X, Y), S)
+        K, S = gain_of_deviations(X, Y, memory.R)
         X -= product(K, Y)
         P = outer(X, X)
         P += sandwich(K, memory.R)

@@ -8,8 +8,9 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
+from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
-from pinnobs_gym.simulation.matrices import divide, outer
+from pinnobs_gym.simulation.matrices import outer
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -90,8 +91,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
         missing = np.isnan(y)
         Y = np.where(missing.T[:, None], 0.0, Y)
-        S = outer(Y, Y) + np.diag(memory.R_std**2)[..., None]
-        K = divide(outer(X, Y), S)
+        K, S = gain_of_deviations(X, Y, np.diag(memory.R_std**2)[..., None])
         errors = np.where(missing, 0.0, y + noise - outputs)
         members = members + np.einsum("ipb,mbp->mbi", K, errors)
         xhat = members.mean(axis=0)

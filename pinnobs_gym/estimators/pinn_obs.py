@@ -17,7 +17,7 @@ from pinnobs_gym.estimation.learned.mlp import Architecture, Layers, evaluate
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.registry import TRAINERS
-from pinnobs_gym.simulation.model import substeps
+from pinnobs_gym.simulation.model import runge_kutta, substeps
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
 
@@ -153,18 +153,18 @@ class PinnObsReplay(LearnedEstimator, Estimator):
         missing = np.isnan(y0) | np.isnan(y)
         y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, (y - y0) / (end - start))
 
-        def rate(t: float, x: np.ndarray, u: np.ndarray, L: np.ndarray) -> np.ndarray:
-            outputs = self.system.h(t, x, u)
-            innovation = np.where(missing, 0.0, y0 + (t - start) * slope - outputs)
-            return self.system.f(t, x, u) + innovation @ L.T
-
         for t, step, u in substeps(self.system, start, end, x, *inputs, longest):
             L = self.trained.gain(t)
-            k1 = rate(t[0], x, u[0], L[0])
-            k2 = rate(t[1], x + step / 2 * k1, u[1], L[1])
-            k3 = rate(t[1], x + step / 2 * k2, u[1], L[1])
-            k4 = rate(t[2], x + step * k3, u[2], L[2])
-            x = x + step / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+            def rate(
+                stage: int, x: np.ndarray, t: np.ndarray = t, u: np.ndarray = u, L: np.ndarray = L
+            ) -> np.ndarray:
+                k = (0, 1, 1, 2)[stage]
+                outputs = self.system.h(t[k], x, u[k])
+                innovation = np.where(missing, 0.0, y0 + (t[k] - start) * slope - outputs)
+                return self.system.f(t[k], x, u[k]) + innovation @ L[k].T
+
+            x, _ = runge_kutta(rate, x, step)
         return x
 
     def _fastest(

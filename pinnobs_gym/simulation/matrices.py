@@ -1,20 +1,28 @@
-"""Small matrices of many episodes: the batch comes last, which is several times faster."""
+"""Small matrices of many episodes: the batch comes last, which is several times faster.
+
+Those with `Array` in their annotations take NumPy arrays and torch tensors, which keep gradients.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
 import numpy as np
+from array_api_compat import array_namespace
+
+from pinnobs_gym.simulation.system import Array
 
 JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
 """What is added to variances, relatively, until a covariance has a Cholesky factor."""
 
 
-def sandwich(M: np.ndarray, P: np.ndarray) -> np.ndarray:
+def sandwich(M: Array, P: Array) -> Array:
     """MPMᵀ for M (n, m, batch) and P (m, m, batch or 1)."""
-    if len(M) * len(P) <= 4:  # one sum over both indices, which is slower for larger matrices
+    if len(M) * len(P) <= 4 and isinstance(
+        M, np.ndarray
+    ):  # one sum over both indices, which is slower for larger matrices
         return np.einsum("ijb,jkb,lkb->ilb", M, P, M)
-    return product(product(M, P), M.transpose(1, 0, 2))
+    return product(product(M, P), M.swapaxes(0, 1))
 
 
 def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
@@ -22,11 +30,14 @@ def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return np.einsum("imb,jmb->ijb", A, B)
 
 
-def divide(A: np.ndarray, S: np.ndarray) -> np.ndarray:
+def divide(A: Array, S: Array) -> Array:
     """AS⁻¹, shape (n, m, batch), for A of that shape and S (m, m, batch), symmetric and positive
     definite; not a number where it is not."""
     if len(S) == 1:
         return A / S
+    if not isinstance(S, np.ndarray):
+        inverse = array_namespace(S).linalg.inv(S.swapaxes(0, 2))  # of the transposed, batch first
+        return product(A, inverse.swapaxes(0, 2))
     with np.errstate(invalid="ignore", divide="ignore"):
         return divide_factored(A, cholesky(S))
 
@@ -83,12 +94,14 @@ def squared_size(innovation: np.ndarray, S: np.ndarray) -> np.ndarray:
     return product(divide(e, S), e.transpose(1, 0, 2))[0, 0]
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def product(a: Array, b: Array) -> Array:
     """The matrix products (n, m, batch) of (n, k, batch) and (k, m, batch): several times faster
     than the same with the batch first where the matrices are small."""
     if a.shape[1] == 1:
         return a * b
-    return np.einsum("ijb,jkb->ikb", a, b)
+    if isinstance(a, np.ndarray):
+        return np.einsum("ijb,jkb->ikb", a, b)
+    return (a[:, :, None] * b[None]).sum(1)
 
 
 @lru_cache(maxsize=16)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -13,6 +14,37 @@ from pinnobs_gym.simulation.system import Array, System
 
 _STAGES = np.array([0, 1, 1, 2])
 """Which of a step's start, middle and end each of the four Runge-Kutta stages looks at."""
+
+
+def runge_kutta(
+    rate: Callable[[int, Array], Array], x: Array, h: Array | float
+) -> tuple[Array, tuple[Array, Array, Array, Array]]:
+    """One step of the classical Runge-Kutta method (Kutta 1901), of order 4.
+
+    Args:
+        rate: dx/dt at a stage, 0 to 3, and the point there; the stages are at the start, twice at
+            the middle and at the end of the step.
+        x: where the step begins.
+        h: the step.
+
+    Returns:
+        Where it ends, and the points of the four stages.
+    """
+    k1 = rate(0, x)
+    second = x + h / 2 * k1
+    k2 = rate(1, second)
+    third = x + h / 2 * k2
+    k3 = rate(2, third)
+    fourth = x + h * k3
+    k4 = rate(3, fourth)
+    # x + h(k1 + 2k2 + 2k3 + k4)/6, in one array
+    end = k2 + k3
+    end *= 2
+    end += k1
+    end += k4
+    end *= h / 6
+    end += x
+    return end, (x, second, third, fourth)
 
 
 def model_step(
@@ -26,12 +58,14 @@ def model_step(
     straight line, only if the system's input is a measured one.
     """
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
-        k1 = system.f(t[0], x, u[0])
-        k2 = system.f(t[1], x + step / 2 * k1, u[1])
-        k3 = system.f(t[1], x + step / 2 * k2, u[1])
-        k4 = system.f(t[2], x + step * k3, u[2])
-        x = x + step / 6 * (k1 + 2 * (k2 + k3) + k4)
+        x, _ = runge_kutta(partial(_rate, system, t, u), x, step)
     return x
+
+
+def _rate(system: System, t: Array, u: Array, stage: int, x: Array) -> Array:
+    """F at a stage of a step with times t (3, ...) and inputs u (3, ..., nu)."""
+    k = _STAGES[stage]
+    return system.f(t[k], x, u[k])
 
 
 def model_step_jacobian(
@@ -50,51 +84,38 @@ def model_step_jacobian(
     for t, step, u in substeps(system, t0, t1, x.T, u0, u1):
         by_row = t.ndim == 2
         h = step[:, 0] if by_row else step
-        points = np.empty((4, nx, batch))
-        at = points.transpose(0, 2, 1)
-        points[0] = x
-        k1 = system.f(t[0], at[0], u[0]).T
-        np.add(x, h / 2 * k1, out=points[1])
-        k2 = system.f(t[1], at[1], u[1]).T
-        np.add(x, h / 2 * k2, out=points[2])
-        k3 = system.f(t[1], at[2], u[1]).T
-        np.add(x, h * k3, out=points[3])
-        k4 = system.f(t[2], at[3], u[2]).T
-        x = x + _increment(h, k1, k2, k3, k4)
-        # The variational equation Φ' = A(t)Φ, by the same method along the same stages.
+        x, points = runge_kutta(partial(_transposed_rate, system, t, u), x, h)
+        # The variational equation Φ' = A(t)Φ, by the same method along the same points.
         times, inputs = t[_STAGES], u[_STAGES]
         A = system.f_jacobian(
-            times if by_row else times[:, None], at, inputs[:, None] if u.ndim == 2 else inputs
+            times if by_row else times[:, None],
+            np.stack(points).transpose(0, 2, 1),
+            inputs[:, None] if u.ndim == 2 else inputs,
         )
         A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
-        K2 = _slope(A[1], h / 2, A[0])
-        K3 = _slope(A[2], h / 2, K2)
-        K4 = _slope(A[3], h, K3)
-        flow = _increment(h, A[0], K2, K3, K4)
+        flow, _ = runge_kutta(partial(_variation, A), _NOTHING, h)
         flow += identity(nx, batch)
         F = flow if F is None else product(flow, F)
     assert F is not None  # there is at least one substep
     return x.T, F.transpose(2, 0, 1)
 
 
-def _increment(
-    h: float | np.ndarray, k1: np.ndarray, k2: np.ndarray, k3: np.ndarray, k4: np.ndarray
+_NOTHING = np.zeros(())
+
+
+def _transposed_rate(
+    system: System, t: np.ndarray, u: np.ndarray, stage: int, x: np.ndarray
 ) -> np.ndarray:
-    """h(k1 + 2k2 + 2k3 + k4)/6, of arrays with the batch last."""
-    total = k2 + k3
-    total *= 2
-    total += k1
-    total += k4
-    total *= h / 6
-    return total
+    """`_rate` of states (nx, batch)."""
+    return _rate(system, t, u, stage, x.T).T
 
 
-def _slope(A: np.ndarray, h: float | np.ndarray, K: np.ndarray) -> np.ndarray:
-    """A(I + hK), the rate at which a flow changes after the time h at the rate K; matrices
-    (nx, nx, batch)."""
-    rate = product(A, K)
-    rate *= h
-    rate += A
+def _variation(A: np.ndarray, stage: int, change: np.ndarray) -> np.ndarray:
+    """Φ' = AΦ, (nx, nx, batch), of the change Φ − I since the step began, A (4, nx, nx, batch)."""
+    if stage == 0:  # where Φ = I
+        return A[0]
+    rate = product(A[stage], change)
+    rate += A[stage]
     return rate
 
 

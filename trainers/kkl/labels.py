@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from pinnobs_gym.estimation.learned.kkl_dynamics import Dynamics, Start, at_rest
+from pinnobs_gym.simulation.model import runge_kutta
 from pinnobs_gym.simulation.system import Array, System, vector
 from pinnobs_gym.simulation.truth import truth
 
@@ -147,10 +148,7 @@ def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
     away = np.zeros(len(x), dtype=bool)
     with np.errstate(all="ignore"):
         for _ in range(steps):
-            k1 = system.f(t, now, u)
-            k2 = system.f(t, now + h / 2 * k1, u)
-            k3 = system.f(t, now + h / 2 * k2, u)
-            now = now + h / 6 * (k1 + 2 * (k2 + k3) + system.f(t, now + h * k3, u))
+            now, _ = runge_kutta(lambda stage, x: system.f(t, x, u), now, h)
             away |= ~(abs(now) < FAR * scale).all(axis=-1)
             now = np.where(away[:, None], x, now)
     return away

@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pinnobs_gym.estimation.kalman import kalman_gain, update_with
 from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
     corrected_gain,
     recurrent_gain,
     remembered,
 )
+from pinnobs_gym.simulation.matrices import sandwich
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.system import System
 
@@ -62,8 +64,7 @@ def predict(
     flow = torch.from_numpy(np.ascontiguousarray(F.transpose(1, 2, 0)))
     moved = (flow * (moment.xhat - at)[None]).sum(1)
     xhat = torch.from_numpy(np.ascontiguousarray(after.T)) + moved
-    P = _product(_product(flow, moment.P), flow.transpose(0, 1)) + model.Q
-    return Moment(xhat, P, moment.memory)
+    return Moment(xhat, sandwich(flow, moment.P) + model.Q, moment.memory)
 
 
 def update(
@@ -88,28 +89,12 @@ def update(
         sizes = model.scale, model.output_scale
         K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, moment.memory)
         return Moment(xhat + (K * innovation[None]).sum(1), P, memory)
-    HP = _product(H, P)
-    S = _product(HP, H.transpose(0, 1)) + R
-    K = _divide(HP.transpose(0, 1), S)
+    K, S = kalman_gain(P, H, R)
     variance = torch.diagonal(S).T
     share = 1 - torch.diagonal(R).T / variance
     args = (xhat, P, innovation, variance, K, share, moment.memory)
     K = corrected_gain(weights, model.scale, *args)
-    there = torch.ones_like(innovation, dtype=torch.bool)
-    memory = remembered(moment.memory, innovation, variance, there)
-    M = torch.eye(len(xhat), dtype=xhat.dtype)[..., None] - _product(K, H)
-    P = _product(_product(M, P), M.transpose(0, 1))
-    P = P + _product(_product(K, R), K.transpose(0, 1))
-    P = (P + P.transpose(0, 1)) / 2
-    return Moment(xhat + (K * innovation[None]).sum(1), P, memory)
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """The matrix products (n, m, batch) of (n, k, batch) and (k, m, batch)."""
-    return (a[:, :, None] * b[None]).sum(1)
-
-
-def _divide(PHt: Tensor, S: Tensor) -> Tensor:
-    if len(S) == 1:
-        return PHt / S
-    return _product(PHt, torch.linalg.inv(S.permute(2, 0, 1)).permute(1, 2, 0))
+    present = torch.ones_like(innovation, dtype=torch.bool)
+    memory = remembered(moment.memory, innovation, variance, present)
+    x_after, P = update_with(K, xhat.T, P, innovation.T, H, R)
+    return Moment(x_after.T, P, memory)
