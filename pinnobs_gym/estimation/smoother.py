@@ -6,6 +6,7 @@ In these arrays samples come first, and in matrices the batch last.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,6 +110,56 @@ def backward(filtered: Filtered) -> Path:
             x[k] += np.einsum("ijb,bj->bi", gain, x[k + 1] - before.xhat[k + 1])
             smoothed = own[k - start] + sandwich(gain, P[k + 1])
             P[k] = (smoothed + smoothed.transpose(1, 0, 2)) / 2
+    return Path(x, P)
+
+
+def iterated(
+    system: System,
+    record: Record,
+    Q: Sequence[np.ndarray],
+    R: np.ndarray,
+    about: np.ndarray | None = None,
+    *,
+    caution: float = 0.0,
+    settled: float,
+) -> Path:
+    """The iterated Kalman smoother (Bell, "The iterated Kalman smoother as a Gauss-Newton method",
+    1994): it minimises the squares of the innovations, of the departure from the prior and of the
+    model's defects from sample to sample, each over its variance.
+
+    Args:
+        system: the model.
+        record: of a batch of episodes.
+        Q: covariance of the process noise of a sample, shape (nx, nx, 1), in each pass. A row is
+            done when a pass with the last of them moves none of its states by more than
+            ``settled``.
+        R: covariance of the output noise, shape (ny, ny, batch or 1).
+        about: states (num_samples, batch, nx) about which the first pass linearises the model; the
+            filter's own estimates if None.
+        caution: see `forward`; of a first pass along the filter's own estimates.
+        settled: over the system's scale.
+
+    Returns:
+        The states of each row's last pass, and their covariances.
+    """
+    scale = np.asarray(system.scale, dtype=float)
+    n, batch, nx = record.num_samples, record.batch, system.nx
+    x, P = np.full((n, batch, nx), np.nan), np.full((n, nx, nx, batch), np.nan)
+    if about is not None:
+        x[:] = about
+    rows, first = np.arange(batch), about is None
+    for each in Q:
+        at = None if first else x[:, rows]
+        noise = R if R.shape[-1] == 1 else R[..., rows]
+        left = record if len(rows) == batch else record.rows(rows)
+        path = backward(forward(system, left, each, noise, at, caution if first else 0.0))
+        moved = np.inf if at is None else (abs(path.xhat - at) / scale).max(axis=(0, 2))
+        x[:, rows], P[..., rows] = path.xhat, path.P
+        last = np.array_equal(each, Q[-1])
+        done = ~np.isfinite(path.xhat).all(axis=(0, 2)) | (last & (moved <= settled))
+        rows, first = rows[~done], False
+        if not len(rows):
+            break
     return Path(x, P)
 
 

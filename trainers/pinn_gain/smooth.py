@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimation.smoother import backward, forward
+from pinnobs_gym.estimation.smoother import iterated
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import vector
 
 PROCESS_NOISE = (30.0, 1.0)
 """Process noise, over the EKF's, of further attempts at records that the first leaves unexplained,
@@ -71,51 +70,30 @@ def smooth_once(record: Record, ekf: EKF, points: np.ndarray | None = None) -> S
         points: where to linearise first, (batch, num_samples, nx); along the EKF's own estimates
             if None.
     """
-    scale = vector(ekf.system.scale, ekf.system.nx, "scale")
-    shape = (record.batch, record.num_samples, ekf.system.nx)
-    xhat = np.full(shape, np.nan) if points is None else points.copy()
-    rows = np.arange(record.batch)
+    Q, R = ekf.tuning()
+    count = max(1, _BLOCK // record.num_samples)  # rows that fit into memory
+    parts = []
     with np.errstate(all="ignore"):
-        for k in range(_PASSES):
-            at = None if k == 0 and points is None else xhat[rows]
-            after = _blocks(ekf, record.rows(rows), at)
-            change = np.inf if at is None else (abs(after - at) / scale).max(axis=(1, 2))
-            xhat[rows] = after
-            sound = np.isfinite(after).all(axis=(1, 2))
-            rows = rows[sound & (change > _SETTLED)]
-            if not len(rows):
-                break
+        for first in range(0, record.batch, count):
+            rows = slice(first, first + count)
+            about = None if points is None else points[rows].swapaxes(0, 1)
+            block = record.rows(rows)
+            path = iterated(ekf.system, block, [Q] * _PASSES, R, about, settled=_SETTLED)
+            parts.append(path.xhat.swapaxes(0, 1))
+        xhat = np.concatenate(parts)
         return Smoothed(xhat, _explains(ekf, record, xhat))
 
 
 def _explains(ekf: EKF, record: Record, xhat: np.ndarray) -> np.ndarray:
     """Whether outputs are where they should be, over the whole record and every window of it."""
-    there = ~np.isnan(record.y)
+    present = ~np.isnan(record.y)
     error = record.y - ekf.system.h(record.t, xhat, record.u)
-    square = np.where(there, error**2 / ekf.output_variance, 0.0)
+    square = np.where(present, error**2 / ekf.output_variance, 0.0)
     window = min(_WINDOW, record.num_samples)
     good = np.isfinite(xhat).all(axis=(1, 2))
     for length in (window, record.num_samples):
-        sums = [np.cumsum(a.sum(axis=-1), axis=1) for a in (square, there)]
+        sums = [np.cumsum(a.sum(axis=-1), axis=1) for a in (square, present)]
         total, count = (np.diff(s[:, length - 1 :: length], axis=1, prepend=0) for s in sums)
         most = count + _DEVIATIONS * np.sqrt(2 * count)
         good &= (total <= most).all(axis=1)
     return np.asarray(good)
-
-
-def _blocks(ekf: EKF, record: Record, points: np.ndarray | None) -> np.ndarray:
-    """`_pass` in blocks of rows that fit into memory."""
-    count = max(1, _BLOCK // record.num_samples)
-    parts = []
-    for first in range(0, record.batch, count):
-        rows = slice(first, first + count)
-        parts.append(_pass(ekf, record.rows(rows), None if points is None else points[rows]))
-    return np.concatenate(parts)
-
-
-def _pass(ekf: EKF, record: Record, points: np.ndarray | None) -> np.ndarray:
-    """One Gauss-Newton step: filter and smoother of the model linearised at points (batch,
-    num_samples, nx), or along the filter itself."""
-    about = None if points is None else points.swapaxes(0, 1)
-    path = backward(forward(ekf.system, record, *ekf.tuning(), about))
-    return path.xhat.swapaxes(0, 1)

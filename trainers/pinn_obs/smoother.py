@@ -1,8 +1,7 @@
 """The iterated Kalman smoother, as the guide needs it.
 
-It (Bell, "The iterated Kalman smoother as a Gauss-Newton method", 1994) minimises the squares of
-the innovations, of the departure from the prior and of the model's defects from sample to sample,
-each over its variance.
+Its process noise and settling are those that make a network follow; see
+`pinnobs_gym.estimation.smoother.iterated`.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from pinnobs_gym.estimation import smoother
-from pinnobs_gym.estimation.smoother import Filtered, Path, backward
+from pinnobs_gym.estimation.smoother import Filtered, Path
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, vector
 
@@ -33,15 +32,11 @@ def smooth(system: System, record: Record, noise: np.ndarray, caution: float) ->
         noise: standard deviations of the output noise, shape (ny,), in output units; positive.
         caution: see `pinnobs_gym.estimation.smoother.forward`; of the first pass.
     """
-    path = backward(forward(system, record, noise, caution=caution))
     narrowed = _WIDE * _NARROWING ** np.arange(2 * _PASSES)
-    for drift in (*[DRIFT] * _PASSES, *np.maximum(narrowed, DRIFT)):
-        before = path.xhat
-        path = backward(forward(system, record, noise, about=before, drift=drift))
-        settled = (abs(path.xhat - before) <= _SETTLED * np.asarray(system.scale)).all()
-        if settled and drift == DRIFT:
-            break
-    return path
+    drifts = (*[DRIFT] * (1 + _PASSES), *np.maximum(narrowed, DRIFT))
+    Q = [_process_noise(system, drift) for drift in drifts]
+    R = np.diag(noise**2)[..., None]
+    return smoother.iterated(system, record, Q, R, caution=caution, settled=_SETTLED)
 
 
 def forward(
@@ -63,6 +58,10 @@ def forward(
         drift: of the process noise per sample, over the scale.
         caution: which part of HPHᵀ is added to the noise.
     """
-    Q = np.diag((drift * vector(system.scale, system.nx, "scale")) ** 2)
-    R = np.diag(noise**2)
-    return smoother.forward(system, record, Q[..., None], R[..., None], about, caution)
+    Q, R = _process_noise(system, drift), np.diag(noise**2)[..., None]
+    return smoother.forward(system, record, Q, R, about, caution)
+
+
+def _process_noise(system: System, drift: float) -> np.ndarray:
+    """Q, (nx, nx, 1)."""
+    return np.diag((drift * vector(system.scale, system.nx, "scale")) ** 2)[..., None]
