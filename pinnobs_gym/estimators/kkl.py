@@ -12,7 +12,8 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.learned.kkl_dynamics import Dynamics, Mode, Start, at_rest
-from pinnobs_gym.estimation.learned.kkl_maps import Activation, Layers, evaluate
+from pinnobs_gym.estimation.learned.kkl_maps import Activation
+from pinnobs_gym.estimation.learned.perceptron import Layers, perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.simulation.model import model_step
@@ -80,7 +81,7 @@ class TrainedKKL(Trained):
             u = np.zeros(len(self.clock.amplitudes)) if u is None else u
             told = self.clock(np.asarray(t), u)
             x = np.concatenate([x, np.broadcast_to(told, (*x.shape[:-1], told.shape[-1]))], -1)
-        return evaluate(self.encoder, self.activation, x)
+        return perceptron(self.encoder, self.activation, x)
 
     def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:
         """Estimates (..., nx) at z (..., nz), times t since the first sample, inputs (..., nu)."""
@@ -89,7 +90,7 @@ class TrainedKKL(Trained):
             t = np.broadcast_to(np.asarray(t, dtype=float), shape)
             u = np.broadcast_to(u, (*shape, u.shape[-1]))
             z = np.concatenate([z, self.clock(t, u)], axis=-1)
-        return evaluate(self.decoder, self.activation, z)
+        return perceptron(self.decoder, self.activation, z)
 
     @property
     def notes(self) -> Mapping[str, Any]:

@@ -18,14 +18,12 @@ from pinnobs_gym.estimation.learned.gain_network import (
     remembered,
     shapes,
 )
+from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, output_scale, vector
-
-Layers = tuple[tuple[np.ndarray, np.ndarray], ...]
-"""Weights (rows, columns) and biases (rows,) of each layer."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,7 +13,8 @@ import numpy as np
 
 from pinnobs_gym.estimation.adapters import OfflineEstimator
 from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
-from pinnobs_gym.estimation.learned.mlp import Architecture, Layers, evaluate
+from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
+from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.registry import TRAINERS

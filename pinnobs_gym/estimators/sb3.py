@@ -13,6 +13,7 @@ import numpy as np
 
 from pinnobs_gym.envs.actions import Form, Memory, form_of
 from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same, plain
 from pinnobs_gym.simulation.record import Prior
@@ -93,11 +94,7 @@ class TrainedAgent(Trained):
         x = np.clip((features - mean) / np.sqrt(variance + TINY), -self.clip, self.clip)
         if self.recurrent is not None:
             x, state = _remember(self.recurrent, x, state)
-        for W, b in self.layers[:-1]:
-            z = x @ W.T + b
-            x = np.tanh(z) if self.activation == "tanh" else np.maximum(z, 0.0)
-        W, b = self.layers[-1]
-        z = x @ W.T + b
+        z = perceptron(self.layers, self.activation, x)
         return np.tanh(z) if self.squash else np.clip(z, -1.0, 1.0), state
 
 

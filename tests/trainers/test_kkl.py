@@ -21,7 +21,8 @@ from pinnobs_gym.estimation.learned.kkl_dynamics import (
     niazi,
     realised,
 )
-from pinnobs_gym.estimation.learned.kkl_maps import Mlp, Scaling, evaluate
+from pinnobs_gym.estimation.learned.kkl_maps import Mlp, Scaling
+from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.kkl import KKLSupervised
 from pinnobs_gym.registry import TRAINERS as REGISTRY
@@ -362,7 +363,7 @@ def test_numpy_computes_what_torch_does():
     a = np.random.default_rng(1).normal(2, 3, (5, 3))
     scaled = torch.tensor(net.inputs.scaled(a))
     expected = net(scaled).detach().numpy() @ net.outputs.root.T + net.outputs.mean
-    np.testing.assert_allclose(evaluate(net.layers(), "silu", a), expected, atol=1e-12)
+    np.testing.assert_allclose(perceptron(net.layers(), "silu", a), expected, atol=1e-12)
 
 
 def test_gauss_newton_solves_a_regression():

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from pinnobs_gym.estimation.learned.kkl_dynamics import at_rest
-from pinnobs_gym.estimation.learned.kkl_maps import Layers, Mlp, evaluate
+from pinnobs_gym.estimation.learned.kkl_maps import Mlp
+from pinnobs_gym.estimation.learned.perceptron import Layers, perceptron
 from pinnobs_gym.simulation.system import output_scale
 from trainers.kkl.config import KKLConfig
 from trainers.kkl.fitting import Equations, Fit, Objective, Term
@@ -138,13 +139,13 @@ class TwoStageFit:
             x = np.concatenate(
                 [data.x, np.broadcast_to(clock, (*data.x.shape[:2], clock.shape[-1]))], axis=-1
             )
-            return evaluate(map_of, self.config.activation, x)
-        T, T0 = (evaluate(map_of, self.config.activation, x) for x in (data.x, data.x0))
+            return perceptron(map_of, self.config.activation, x)
+        T, T0 = (perceptron(map_of, self.config.activation, x) for x in (data.x, data.x0))
         first = self.samples.t[0]
         y0 = self.samples.system.h(first, data.x0, np.asarray(self.samples.system.input(first)))
         z0 = y0 @ at_rest(self.samples.dynamics, self.config.start).T
         if self.config.start == "prior":
-            z0 = z0 + evaluate(map_of, self.config.activation, self.samples.prior)
+            z0 = z0 + perceptron(map_of, self.config.activation, self.samples.prior)
         return T + np.einsum("kij,bj->kbi", data.flow, z0 - T0)
 
     def _decoding(self, generator: torch.Generator) -> Sequence[Equations]:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.estimation.learned.gain_network import Variant, shapes
+from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.pinn_gain import Layers, PinnGain, TrainedGain
+from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.simulation.record import Prior
 from trainers.pinn_gain.rollout import Model
 from trainers.pinn_gain.streams import Data

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from array_api_compat import array_namespace, device
 
-from pinnobs_gym.estimation.learned.mlp import Architecture, Layers
+from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.simulation.system import Array
 
 _CHUNK = 2000

@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 
 from array_api_compat import array_namespace
 
+from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.simulation.system import Array
 
 Variant: TypeAlias = Literal["kalman", "gru"]
@@ -86,23 +87,20 @@ def corrected_gain(
     ]
     for i in range(1, nx):
         features.append(P[i, :i] / (sd[i] * sd[:i] + _TINY * scale[i] * scale[:i]))
-    a = xp.concat(features, axis=0)
-    *hidden, (W, b) = layers
-    for V, c in hidden:
-        a = xp.tanh(V @ a + c[:, None])
-    factor, shift = xp.reshape(W @ a + b[:, None], (2, *K.shape)) * share**FADE
+    outputs = perceptron(layers, "tanh", xp.concat(features, axis=0).T).T
+    factor, shift = xp.reshape(outputs, (2, *K.shape)) * share**FADE
     largest = math.log(LARGEST_FACTOR)
     return K * xp.exp(largest * xp.tanh(factor)) + LARGEST_SHIFT * xp.tanh(shift) * (
         sd[:, None] / xp.sqrt(S)
     )
 
 
-def remembered(memory: Array, innovation: Array, S: Array, there: Array) -> Array:
-    """The moving averages after a sample, (ny, batch): of e²/S where an output is there."""
+def remembered(memory: Array, innovation: Array, S: Array, present: Array) -> Array:
+    """The moving averages after a sample, (ny, batch): of e²/S where an output is present."""
     xp = array_namespace(innovation)
     nis = innovation * innovation / S
     nis = xp.where(nis > _LARGEST_NIS, _LARGEST_NIS, nis)
-    return xp.where(there, memory + _NIS_RATE * (nis - memory), memory)
+    return xp.where(present, memory + _NIS_RATE * (nis - memory), memory)
 
 
 def recurrent_gain(

@@ -2,32 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
-from array_api_compat import array_namespace
 from torch import Tensor
 
-from pinnobs_gym.simulation.system import Array
+from pinnobs_gym.estimation.learned.perceptron import ACTIVATIONS, Layers, linear, perceptron
 
 Activation: TypeAlias = Literal["tanh", "silu", "relu"]
-Layers: TypeAlias = Sequence[tuple[np.ndarray, np.ndarray]]
-"""Weights (fan_out, fan_in) and biases (fan_out,) of each layer."""
-
-
-def _silu(a: Array) -> Array:
-    return a * (0.5 + 0.5 * array_namespace(a).tanh(0.5 * a))
-
-
-_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "tanh": lambda a: array_namespace(a).tanh(a),
-    "silu": _silu,
-    "relu": lambda a: a * (a > 0),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,34 +92,31 @@ class Mlp:
 
     def __call__(self, a: Tensor) -> Tensor:
         """Scaled outputs (..., num_outputs) of scaled inputs (..., num_inputs)."""
-        act = _ACTIVATIONS[self.activation]
-        *hidden, (W, b) = zip(self.parameters[::2], self.parameters[1::2], strict=True)
-        for weight, bias in hidden:
-            a = act(torch.nn.functional.linear(a, weight, bias))
-        return torch.nn.functional.linear(a, W, b)
+        layers = list(zip(self.parameters[::2], self.parameters[1::2], strict=True))
+        return perceptron(layers, self.activation, a)
 
     def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs and their directional derivative along da: a Jacobian-vector product that keeps
         its gradient with respect to the weights."""
-        act = _ACTIVATIONS[self.activation]
+        act = ACTIVATIONS[self.activation]
         *hidden, (W, b) = zip(self.parameters[::2], self.parameters[1::2], strict=True)
         for weight, bias in hidden:
-            pre = torch.nn.functional.linear(a, weight, bias)
+            pre = linear(a, weight, bias)
             a, da = act(pre), self._slope(pre) * (da @ weight.T)
-        return torch.nn.functional.linear(a, W, b), da @ W.T
+        return linear(a, W, b), da @ W.T
 
     def jacobian(self, a: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs (batch, num_outputs) and their derivatives with respect to all weights and
         biases, (batch, num_outputs, num_parameters), in the order of ``parameters``."""
-        act = _ACTIVATIONS[self.activation]
+        act = ACTIVATIONS[self.activation]
         weights = [p.detach() for p in self.parameters]
         *hidden, (W, b) = zip(weights[::2], weights[1::2], strict=True)
         seen, slopes = [a], []
         for weight, bias in hidden:
-            pre = torch.nn.functional.linear(seen[-1], weight, bias)
+            pre = linear(seen[-1], weight, bias)
             seen.append(act(pre))
             slopes.append(self._slope(pre)[:, None])
-        out = torch.nn.functional.linear(seen[-1], W, b)
+        out = linear(seen[-1], W, b)
         count, size = out.shape
         back = torch.eye(size, dtype=a.dtype, device=a.device).expand(count, size, size)
         blocks: list[Tensor] = []
@@ -161,7 +143,7 @@ class Mlp:
         return (pre > 0).to(pre.dtype)
 
     def layers(self) -> Layers:
-        """A copy of the weights for `evaluate`, the scalings taken into the outer layers."""
+        """A copy of the weights for `perceptron`, the scalings taken into the outer layers."""
         arrays = [p.detach().double().cpu().numpy().copy() for p in self.parameters]
         W, b = arrays[0], arrays[1]
         W = np.linalg.solve(self.inputs.root.T, W.T).T
@@ -169,16 +151,3 @@ class Mlp:
         arrays[-2] = self.outputs.root @ arrays[-2]
         arrays[-1] = self.outputs.root @ arrays[-1] + self.outputs.mean
         return tuple(zip(arrays[::2], arrays[1::2], strict=True))
-
-
-def evaluate(layers: Layers, activation: Activation, a: np.ndarray) -> np.ndarray:
-    """What the network makes of inputs (..., num_inputs), in NumPy."""
-    *hidden, (weight, bias) = layers
-    for W, b in hidden:
-        a = a @ W.T
-        a += b
-        if activation == "tanh":
-            np.tanh(a, out=a)
-        else:
-            a = _ACTIVATIONS[activation](a)
-    return a @ weight.T + bias

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, TypeAlias, get_args
@@ -11,36 +10,13 @@ import numpy as np
 import torch
 from array_api_compat import array_namespace
 
+from pinnobs_gym.estimation.learned.perceptron import Layers, perceptron
 from pinnobs_gym.simulation.system import Array
 
 Activation: TypeAlias = Literal["tanh", "sine", "sigmoid", "relu"]
 Precision: TypeAlias = Literal["float32", "float64"]
 
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
-
-def _tanh(z: Array) -> Array:
-    return array_namespace(z).tanh(z)
-
-
-def _sine(z: Array) -> Array:
-    return array_namespace(z).sin(z)
-
-
-def _sigmoid(z: Array) -> Array:
-    return 0.5 + 0.5 * array_namespace(z).tanh(0.5 * z)
-
-
-def _relu(z: Array) -> Array:
-    return z * (z > 0)
-
-
-_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "tanh": _tanh,
-    "sine": _sine,
-    "sigmoid": _sigmoid,
-    "relu": _relu,
-}
 
 
 @dataclass(frozen=True)
@@ -119,10 +95,6 @@ class Architecture:
         return xp.stack(values, axis=-1), xp.stack(rates, axis=-1)
 
 
-Layers: TypeAlias = tuple[tuple[np.ndarray, np.ndarray], ...]
-"""Weights (fan_out, fan_in) and biases (fan_out,) of each layer."""
-
-
 def evaluate(
     architecture: Architecture, layers: Layers, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -132,12 +104,8 @@ def evaluate(
     The network's input is the time in s as it is, as in the paper, unless the architecture says
     otherwise.
     """
-    activation = _ACTIVATIONS[architecture.activation]
-    a, _ = architecture.features(np.asarray(t, dtype=float))
-    *hidden, (weight, bias) = layers
-    for W, b in hidden:
-        a = activation(a @ W.T + b)
-    out = a @ weight.T + bias
+    features, _ = architecture.features(np.asarray(t, dtype=float))
+    out = perceptron(layers, architecture.activation, features)
     if architecture.scale is not None:
         out *= architecture.scale
     nx, ny = architecture.nx, architecture.ny
