@@ -30,7 +30,8 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
     except SystemExit as end:
         if not end.code:  # help was asked for, and printed
             raise
-    raise ValueError(f"{_first_of(told.getvalue())}; see pinnobs {command} --help") from None
+    message = _first_of(told.getvalue()).removeprefix("Error parsing config: ")
+    raise ValueError(f"{message}; see pinnobs {command} --help") from None
 
 
 def _first_of(box: str) -> str:

@@ -109,6 +109,7 @@ def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> 
         arguments,
         default=Train(system=tyro.MISSING, config=config, preset=preset),
         config=(tyro.conf.OmitArgPrefixes,),
+        description=f"{Train.__doc__} Presets: {', '.join(cls.presets)}.",
     )
 
 
