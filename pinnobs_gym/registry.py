@@ -14,7 +14,6 @@ import pkgutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -53,12 +52,15 @@ class Registry(Generic[T]):
         self._known: dict[str, type[T]] = {}
         """The classes that are imported."""
         self._all_imported = False
+        self._sources: dict[str, Origin] | None = None
 
-    @cached_property
+    @property
     def sources(self) -> dict[str, Origin]:
         """The names that the sources of the package show, without importing any of them; a warning
         for each file that is no Python, or gives a name that another has."""
-        return _shown(self._kind, self._package, self._attributes)
+        if self._sources is None:
+            self._sources = _shown(self._kind, self._package, self._attributes)
+        return self._sources
 
     def classes(self) -> dict[str, type[T]]:
         """All classes by name, sorted; imports their modules on the first call, with a warning for
