@@ -68,6 +68,8 @@ class Form(ABC):
     """
 
     name: ClassVar[str]
+    action_space: Box
+    """The space of actions of one episode."""
 
     def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
         if not (isinstance(stack, int | np.integer) and stack >= 1):
@@ -77,17 +79,21 @@ class Form(ABC):
         bound = system.state_bound or tuple(10 * s for s in system.scale)
         self.bound = np.asarray(bound, dtype=float)
         self.duration = float(setup.times[-1])
+        self.prepare()
         self.observation_space = _features_box(self.num_features)
-        self.action_space = self._actions()
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Set ``action_space`` and what else the form needs.
+
+        Raises:
+            ValueError: in one line, if the form does not fit the system or the stack.
+        """
 
     @property
     @abstractmethod
     def num_features(self) -> int:
         """Number of features; the last is a time from 0 to 1."""
-
-    def _actions(self) -> Box:
-        """The space of actions."""
-        return Box(-1.0, 1.0, (self.system.nx,), np.float32)
 
     def begin(self, mean: np.ndarray, t: np.ndarray, u: np.ndarray) -> Memory:
         """The memory before the first samples.
@@ -100,7 +106,7 @@ class Form(ABC):
         y = np.full((len(mean), self.stack, self.system.ny), np.nan)
         return Memory(np.asarray(mean, dtype=float), t, t, u, y, y[:, 0])
 
-    def look(
+    def observe(
         self, memory: Memory, t: np.ndarray, y: np.ndarray, u: np.ndarray
     ) -> tuple[np.ndarray, Memory]:
         """The features (batch, num_features) of the samples at times t.
@@ -112,16 +118,18 @@ class Form(ABC):
             u: inputs, shape (batch, nu).
         """
         outputs = np.concatenate([y[:, None], memory.y[:, :-1]], axis=1)
-        memory = self._predicted(replace(memory, y=outputs), t, u)
+        memory = self.predict(replace(memory, y=outputs), t, u)
         memory = replace(memory, t=t, u=u)
-        return self._features(memory), memory
-
-    def _predicted(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
-        """With what the model says of the samples at times t, whose outputs are there already."""
-        return memory
+        return self.features(memory), memory
 
     @abstractmethod
-    def _features(self, memory: Memory) -> np.ndarray: ...
+    def predict(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+        """The memory with what the model says of the samples at times t, whose outputs it holds
+        already."""
+
+    @abstractmethod
+    def features(self, memory: Memory) -> np.ndarray:
+        """The features (batch, num_features) of the last samples."""
 
     @abstractmethod
     def act(self, memory: Memory, actions: np.ndarray) -> Memory:
@@ -143,20 +151,18 @@ class Form(ABC):
         return actions
 
 
-class Estimate(Form):
-    """The action is x̂ in physical units; the features are y, u and t/T, as the env gives them."""
-
-    name = "estimate"
+class EstimateForm(Form):
+    """What the forms share whose action is an estimate: features are the last outputs, newest
+    first, then u and t/T; the model is not looked at."""
 
     @property
     def num_features(self) -> int:
         return self.stack * self.system.ny + self.system.nu + 1
 
-    def _actions(self) -> Box:
-        largest = self.bound.astype(np.float32)
-        return Box(-largest, largest)
+    def predict(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+        return memory
 
-    def _features(self, memory: Memory) -> np.ndarray:
+    def outputs_and_time(self, memory: Memory) -> np.ndarray:
         """The last outputs, newest first, zero before the first; then u and t/T."""
         y = memory.y
         if self.stack > 1:
@@ -164,76 +170,80 @@ class Estimate(Form):
         time = (memory.t - memory.start) / self.duration
         return np.concatenate([y.reshape(len(y), -1), memory.u, time[:, None]], axis=1)
 
+
+class Estimate(EstimateForm):
+    """The action is x̂ in physical units; the features are y, u and t/T, as the env gives them."""
+
+    name = "estimate"
+
+    def prepare(self) -> None:
+        largest = self.bound.astype(np.float32)
+        self.action_space = Box(-largest, largest)
+
+    def features(self, memory: Memory) -> np.ndarray:
+        return self.outputs_and_time(memory)
+
     def act(self, memory: Memory, actions: np.ndarray) -> Memory:
         return replace(memory, xhat=self.checked(actions))
 
 
-class Normalized(Estimate):
-    """The action is x̂ over the largest states to expect."""
+class Normalized(EstimateForm):
+    """The action is x̂ over the largest states to expect; features are zero where an output is
+    missing, which no network takes."""
 
     name = "normalized"
 
-    def _actions(self) -> Box:
-        return Form._actions(self)
+    def prepare(self) -> None:
+        self.action_space = _unit_box(self.system.nx)
+
+    def features(self, memory: Memory) -> np.ndarray:
+        features = self.outputs_and_time(memory)
+        return np.where(np.isnan(features), 0.0, features)
 
     def act(self, memory: Memory, actions: np.ndarray) -> Memory:
         return replace(memory, xhat=self.bound * self.checked(actions))
 
-    def _features(self, memory: Memory) -> np.ndarray:
-        """Those of `Estimate`, but zero where an output is missing, which no network takes."""
-        features = super()._features(memory)
-        return np.where(np.isnan(features), 0.0, features)
 
-
-class Gain(Form):
-    """The action is a gain L on the innovation: x̂ = x̂⁻ + L(y − h(t, x̂⁻, u)), x̂⁻ from the model.
-
-    Kalman's gain of state i and output j is ρσᵢ/√Sⱼ, where σᵢ is the standard deviation of the
-    prediction's error, √Sⱼ that of the innovation, and ρ their correlation. The action is ρ, nx·ny
-    numbers, row by row; σ(k) and S(k) are fixed schedules (`typical`), the same in all episodes, so
-    that the agent need not find over which powers of ten a gain decays. What the right ρ is in
-    this episode, it must say.
+class PredictionForm(Form):
+    """What the forms share whose action corrects the model's prediction x̂⁻, by a share of the
+    typical error σ(k), a fixed schedule that is the same in all episodes (`typical`).
 
     Features: asinh of the innovation over √S, x̂⁻ over its scale, u over its largest, and
     log(1 + k)/log(1 + N), k the sample's number and N the episode's last.
     """
 
-    name = "gain"
-
-    def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
-        super().__init__(system, setup, stack)
-        if stack != 1:
-            raise ValueError(f"stack={stack} goes with estimates; {self.name!r} has a prediction")
-        self.sigma, self.root_S = typical(system, setup)
-        u = abs(np.asarray(system.input(setup.times))).max(axis=0, initial=0.0)
+    def prepare(self) -> None:
+        if self.stack != 1:
+            raise ValueError(
+                f"stack={self.stack} goes with estimates; {self.name!r} has a prediction"
+            )
+        self.sigma, self.root_S = typical(self.system, self.setup)
+        u = abs(np.asarray(self.system.input(self.setup.times))).max(axis=0, initial=0.0)
         self.u_scale = np.where(u > 0, u, 1.0)
+        self.action_space = _unit_box(self.num_actions)
+
+    @property
+    @abstractmethod
+    def num_actions(self) -> int:
+        """Numbers in an action, each from −1 to 1."""
 
     @property
     def num_features(self) -> int:
         return self.system.ny + self.system.nx + self.system.nu + 1
 
-    def _actions(self) -> Box:
-        return Box(-1.0, 1.0, (self.system.nx * self.system.ny,), np.float32)
-
-    def _predicted(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+    def predict(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
         xhat = model_step(self.system, memory.t, t, memory.xhat, memory.u, u)
         y = memory.y[:, 0]
         surprise = (y - self.system.h(t, xhat, u)) / self.root_S[self._samples(t, memory)]
         return replace(memory, xhat=xhat, surprise=np.where(np.isnan(y), 0.0, surprise))
 
-    def _features(self, memory: Memory) -> np.ndarray:
+    def features(self, memory: Memory) -> np.ndarray:
         k = np.minimum((memory.t - memory.start) / self.setup.dt, self.setup.num_steps)
         time = np.log1p(k) / np.log1p(self.setup.num_steps)
         parts = (np.arcsinh(memory.surprise), memory.xhat / self.scale, memory.u / self.u_scale)
         return np.concatenate([*parts, time[:, None]], axis=1)
 
-    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
-        correlation = self.checked(actions).reshape(-1, self.system.nx, self.system.ny)
-        with np.errstate(all="ignore"):  # of rows that are not finite
-            share = np.einsum("bij,bj->bi", correlation, memory.surprise)
-        return self._corrected(memory, share)
-
-    def _corrected(self, memory: Memory, share: np.ndarray) -> Memory:
+    def corrected(self, memory: Memory, share: np.ndarray) -> Memory:
         """The predictions corrected by a share (batch, nx) of the typical error, within bounds."""
         largest = OUTSIDE * self.bound
         xhat = memory.xhat + share * self.sigma[self._samples(memory.t, memory)]
@@ -258,19 +268,40 @@ class Gain(Form):
         return np.minimum(k, len(self.sigma) - 1)
 
 
-class Correction(Gain):
-    """The action is what is added to the model's prediction, over the typical error σ(k).
+class Gain(PredictionForm):
+    """The action is a gain L on the innovation: x̂ = x̂⁻ + L(y − h(t, x̂⁻, u)), x̂⁻ from the model.
 
-    Features are those of `Gain`.
+    Kalman's gain of state i and output j is ρσᵢ/√Sⱼ, where σᵢ is the standard deviation of the
+    prediction's error, √Sⱼ that of the innovation, and ρ their correlation. The action is ρ, nx·ny
+    numbers, row by row; σ(k) and S(k) are the schedules, so that the agent need not find over which
+    powers of ten a gain decays. What the right ρ is in this episode, it must say.
     """
+
+    name = "gain"
+
+    @property
+    def num_actions(self) -> int:
+        return self.system.nx * self.system.ny
+
+    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+        correlation = self.checked(actions).reshape(-1, self.system.nx, self.system.ny)
+        with np.errstate(all="ignore"):  # of rows that are not finite
+            share = np.einsum("bij,bj->bi", correlation, memory.surprise)
+        return self.corrected(memory, share)
+
+
+class Correction(PredictionForm):
+    """The action is what is added to the model's prediction, over `LARGEST_CORRECTION` times the
+    typical error σ(k)."""
 
     name = "correction"
 
-    def _actions(self) -> Box:
-        return Form._actions(self)
+    @property
+    def num_actions(self) -> int:
+        return self.system.nx
 
     def act(self, memory: Memory, actions: np.ndarray) -> Memory:
-        return self._corrected(memory, LARGEST_CORRECTION * self.checked(actions))
+        return self.corrected(memory, LARGEST_CORRECTION * self.checked(actions))
 
 
 LARGEST_CORRECTION = 3.0
@@ -324,6 +355,11 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"{name}: the model runs away from every draw of its prior; no gain scale")
     sigma = np.sqrt(np.median(variance[..., sound], axis=2))
     return sigma, np.sqrt(np.median(S_all[..., sound], axis=2))
+
+
+def _unit_box(size: int) -> Box:
+    """Actions of so many numbers from −1 to 1."""
+    return Box(-1.0, 1.0, (size,), np.float32)
 
 
 def _features_box(size: int) -> Box:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pinnobs_gym.envs.actions import Form, Gain, Memory, form_of
+from pinnobs_gym.envs.actions import Form, Memory, PredictionForm, form_of
 from pinnobs_gym.envs.episodes import EpisodeSource
 
 
@@ -30,7 +30,7 @@ class AgentSide:
         self.plain = action_mode == "estimate" and stack == 1 and reward == "error"
         """Whether actions and observations are the env's own."""
         self.improves = reward == "improvement"
-        if self.improves and not isinstance(self.form, Gain):
+        if self.improves and not isinstance(self.form, PredictionForm):
             raise ValueError(f"reward='improvement' needs a prediction; {action_mode!r} has none")
         self._source = source
         self._memory: Memory | None = None
@@ -52,7 +52,7 @@ class AgentSide:
             rows = np.arange(len(k))
             self._memory = self._begun(mean)
         new = self._begun(mean[rows])
-        self._features[rows], new = self.form.look(new, *self._sample(samples[rows], k[rows]))
+        self._features[rows], new = self.form.observe(new, *self._sample(samples[rows], k[rows]))
         self._memory = self._memory.with_rows(rows, new)
         return self._features.copy()
 
@@ -60,10 +60,10 @@ class AgentSide:
         """Begin the episodes of rows (n,) anew, whose first samples are still to be looked at."""
         self._memory = self._playing.with_rows(rows, self._begun(mean[rows]))
 
-    def look(self, samples: np.ndarray, k: np.ndarray) -> np.ndarray:
+    def observe(self, samples: np.ndarray, k: np.ndarray) -> np.ndarray:
         """The observations (batch, features) of the next samples; arguments as in `begin`."""
         with np.errstate(all="ignore"):  # rows whose action was not finite
-            features, self._memory = self.form.look(self._playing, *self._sample(samples, k))
+            features, self._memory = self.form.observe(self._playing, *self._sample(samples, k))
         self._features = features.astype(np.float32)
         return self._features.copy()
 
@@ -74,8 +74,8 @@ class AgentSide:
         return self._memory.xhat
 
     def improvement(self, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """The reward of the last actions, (batch,); see `Gain.improvement`."""
-        assert isinstance(self.form, Gain)
+        """The reward of the last actions, (batch,); see `PredictionForm.improvement`."""
+        assert isinstance(self.form, PredictionForm)
         return self.form.improvement(self._before, xhat, x)
 
     @property

@@ -42,7 +42,8 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         condition: how episodes depart from the setup; see `pinnobs_gym.simulation.conditions`.
         action_mode: ``estimate``, ``normalized``, ``gain`` or ``correction``.
         reward: ``error``, as above, or ``improvement`` on the model's prediction, for training with
-            actions that are gains or corrections; see `pinnobs_gym.envs.actions.Gain.improvement`.
+            actions that are gains or corrections; see
+            `pinnobs_gym.envs.actions.PredictionForm.improvement`.
         stack_outputs: how many of the last outputs an observation holds.
         render_mode: ``rgb_array`` or ``human``.
         changes: ``dt``, ``duration``, ``noise_std``, ``parameters``; see `Changes`.
@@ -131,7 +132,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         info = {"state": self._x[self._k].copy()}
         observation = self._observations[self._k].copy()
         if not self.agent.plain:
-            observation = self.agent.look(observation[None], np.array([self._k]))[0]
+            observation = self.agent.observe(observation[None], np.array([self._k]))[0]
         self._over = terminated or truncated
         if self.render_mode == "human":
             self.render()

@@ -144,7 +144,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if not self.agent.plain:
             if begun is not None:
                 self.agent.forget(self._prior.mean, begun)
-            observations = self.agent.look(observations, self._k)
+            observations = self.agent.observe(observations, self._k)
         if begun is not None:
             infos |= self._begun(begun)
         return observations, rewards, terminated, truncated, infos

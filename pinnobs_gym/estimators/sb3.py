@@ -147,7 +147,7 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
             memory, hidden = self._form.begin(state.xhat, now, u), self.trained.begin(len(y))
         else:
             memory, hidden = state.memory
-        features, memory = self._form.look(memory, now, y, u)
+        features, memory = self._form.observe(memory, now, y, u)
         actions, hidden = self.trained.act(features, hidden)
         memory = self._form.act(memory, actions)
         return State(memory.xhat, t, u, memory=(memory, hidden))

@@ -149,7 +149,7 @@ def test_kalman_gains_are_actions() -> None:
     assert expected.innovation is not None
     memory = form.begin(prior.mean, np.zeros(2), u[:, 0])
     for k in range(len(t)):
-        _, memory = form.look(memory, np.full(2, t[k]), y[:, k], u[:, k])
+        _, memory = form.observe(memory, np.full(2, t[k]), y[:, k], u[:, k])
         # the gain from two episodes' corrections, solved for: nx·ny unknowns, ny = 2 episodes
         added = (expected.xhat[:, k] - memory.xhat).T
         K = np.linalg.solve(expected.innovation[:, k], added.T).T
@@ -163,7 +163,7 @@ def test_a_missing_output_corrects_nothing() -> None:
     form = form_of("gain", *SYSTEMS.resolve("ReverseDuffing").configured())
     one = np.zeros(1)
     memory = form.begin(np.array([[1.0, 1.0]]), one, np.zeros((1, 0)))
-    features, memory = form.look(memory, one, np.array([[np.nan]]), np.zeros((1, 0)))
+    features, memory = form.observe(memory, one, np.array([[np.nan]]), np.zeros((1, 0)))
     assert np.isfinite(features).all()
     assert form.act(memory, np.ones((1, 2))).xhat.tolist() == [[1.0, 1.0]]
 

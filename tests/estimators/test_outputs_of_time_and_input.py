@@ -236,8 +236,8 @@ def test_a_form_of_actions_takes_the_known_part_off(mode):
     ]
     for k in range(5):
         t = np.full(3, plain.t[k])
-        ours, memories[0] = forms[0].look(memories[0], t, record.y[:, k], record.u[:, k])
-        theirs, memories[1] = forms[1].look(memories[1], t, plain.y[:, k], plain.u[:, k])
+        ours, memories[0] = forms[0].observe(memories[0], t, record.y[:, k], record.u[:, k])
+        theirs, memories[1] = forms[1].observe(memories[1], t, plain.y[:, k], plain.u[:, k])
         assert abs(theirs[:, :2]).max() > 0.1
         np.testing.assert_allclose(np.delete(ours, 4, axis=1), theirs, atol=1e-12)
 
