@@ -576,3 +576,33 @@ def test_a_measured_input_is_refused():
     short = Record(record.t[:5], record.y[:, :5], record.u[:, :5], record.prior)
     with pytest.raises(ValueError, match="the record has 5 samples"):
         trained_by("kkl_supervised", system, {}, record=short)
+
+
+@pytest.mark.parametrize("stop", [20, 115])  # in the second fit of the sweep, and after it
+def test_a_sweep_that_is_interrupted_goes_on_to_the_same_result(stop, tmp_path, monkeypatch):
+    game = Game.of("ReverseDuffing")
+    system, setup, record = game.source.system, game.source.setup, game.record([10**6])
+    settings = {**SMALL, "iterations": 12, "width": 6, "sweep": "cutoff", "checkpoint_every": 5}
+    arguments = {"record": record, "noise_std": setup.noise_std}
+    whole = trained_by("kkl_supervised", system, settings, **arguments)
+    original, made = TwoStageFit.step, []
+
+    def step(fit):
+        made.append(None)
+        if len(made) == stop:
+            raise KeyboardInterrupt
+        original(fit)
+
+    path = tmp_path / "checkpoint.pt"
+    with monkeypatch.context() as patch:
+        patch.setattr(TwoStageFit, "step", step)
+        part = trained_by("kkl_supervised", system, settings, checkpoint=path, **arguments)
+    assert part.ending == "interrupted"
+    assert (len(part.facts["sweep"]) < 7) == (stop == 20)
+    again = trained_by(
+        "kkl_supervised", system, settings, checkpoint=path, resume=True, **arguments
+    )
+    assert again.facts["sweep"] == whole.facts["sweep"]
+    assert again.config == whole.config
+    for layer, other in zip(whole.decoder, again.decoder, strict=True):
+        np.testing.assert_array_equal(layer[0], other[0])

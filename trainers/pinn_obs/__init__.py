@@ -143,23 +143,30 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
         return float(terms @ [self.config.w0, self.config.w_ode, self.config.w_y])
 
     def state(self) -> dict[str, Any]:
-        # The attempt stands for the state of chance: nothing is drawn after the weights.
-        assert self.best is not None
-        assert self._method is not None
+        # The attempt stands for the state of chance: nothing is drawn after the weights. After a
+        # loss that is not finite there are no best weights, and no method yet.
         return {
             "attempt": self.attempt,
             "stuck": self.stuck,
             "mark": asdict(self.mark),
-            "best": asdict(self.best),
-            "method": self.recipe.method_state(self._method),
+            "best": None if self.best is None else asdict(self.best),
+            "kept": None if self._kept is None else asdict(self._kept),
+            "method": None if self.best is None else self._method_state(),
         }
+
+    def _method_state(self) -> dict[str, Any]:
+        assert self._method is not None
+        return self.recipe.method_state(self._method)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self._begin(state["attempt"])
-        self.best, self.mark = Best(**state["best"]), Mark(**state["mark"])
-        self.stuck = state["stuck"]
-        best = self.best.theta, self.best.loss
-        self._method = self.recipe.load_method(state["method"], best)
+        self.mark, self.stuck = Mark(**state["mark"]), state["stuck"]
+        if state["kept"] is not None:
+            self._kept = Best(**state["kept"])
+        if state["best"] is not None:
+            self.best = Best(**state["best"])
+            best = self.best.theta, self.best.loss
+            self._method = self.recipe.load_method(state["method"], best)
 
     def result(self) -> TrainedNetwork:
         """The network of the least loss of all attempts.

@@ -492,6 +492,23 @@ def test_a_loss_that_is_not_finite_begins_again_three_times():
     assert "\n" not in str(caught.value)
 
 
+def test_a_loss_that_is_not_finite_may_be_kept_in_a_checkpoint(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    record, config = random_record(Failing()), replace(SMALL, seed=5, checkpoint_every=1)
+    Failing.calls.clear()
+    straight = train_pinn_obs(Failing(bad=2), config, record=record)
+    Failing.calls.clear()
+    with pytest.raises(FloatingPointError, match=r"Failing .*seed 5"):
+        train_pinn_obs(Failing(bad=10**6), config, record=record, checkpoint=path)
+    Failing.calls.clear()
+    first = replace(config, iterations=2)  # both not finite
+    with pytest.raises(FloatingPointError, match=r"Failing .*seed 5"):
+        train_pinn_obs(Failing(bad=2), first, record=record, checkpoint=path)
+    resumed = train_pinn_obs(Failing(bad=2), config, record=record, checkpoint=path, resume=True)
+    assert (resumed.seed, resumed.loss) == (straight.seed, straight.loss) == (7, straight.loss)
+    assert same_weights(resumed, straight)
+
+
 def with_y(y):
     return replace(random_record(Spring()), y=y)
 
