@@ -124,11 +124,11 @@ def _episode(cls: type[System]) -> Any:
 
 
 def estimator_page(name: str, cls: type[Estimator]) -> str:
-    """What an estimator is, what it is told, its equations and settings."""
+    """What an estimator is, what it knows, its equations and settings."""
     trainer = cls.needs_training or cls.trains_on_record
     told = [
         ("track", _line(f"{cls.track}: {_TRACKS[cls.track]}")),
-        ("is told", ", ".join(cls.knows)),
+        ("knows", ", ".join(cls.knows)),
         ("training", f"[`{trainer}`](../trainers/{trainer}.md)" if trainer else "needs none"),
         ("class", f"`{cls.__module__}.{cls.__qualname__}`"),
     ]
@@ -234,7 +234,7 @@ def _estimators(estimators: Mapping[str, type[Estimator]]) -> str:
         (f"[{name}]({name}.md)", cls.track, ", ".join(cls.knows), first_line(cls))
         for name, cls in estimators.items()
     ]
-    return _index("Estimators", ("name", "track", "is told", "what it is"), lines, estimators)
+    return _index("Estimators", ("name", "track", "knows", "what it is"), lines, estimators)
 
 
 def _trainers(trainers: Mapping[str, type[Trainer[Any, Any]]]) -> str:
@@ -254,7 +254,7 @@ def _index(
 
 def _conditions() -> str:
     lines = [
-        (f"`{name}`", c.summary, c.told, "yes" if c.reference else "no")
+        (f"`{name}`", c.summary, c.known_to_estimators, "yes" if c.reference else "no")
         for name, c in CONDITIONS.items()
     ]
     header = ("name", "what changes", "estimators are told", "Cramér–Rao reference")

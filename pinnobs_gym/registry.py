@@ -21,7 +21,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 T = TypeVar("T")
 
 
-class Origin(NamedTuple):
+class NameSource(NamedTuple):
     """Where a name comes from, as the source of a file shows it."""
 
     module: str
@@ -52,10 +52,10 @@ class Registry(Generic[T]):
         self._known: dict[str, type[T]] = {}
         """The classes that are imported."""
         self._all_imported = False
-        self._sources: dict[str, Origin] | None = None
+        self._sources: dict[str, NameSource] | None = None
 
     @property
-    def sources(self) -> dict[str, Origin]:
+    def sources(self) -> dict[str, NameSource]:
         """The names that the sources of the package show, without importing any of them; a warning
         for each file that is no Python, or gives a name that another has."""
         if self._sources is None:
@@ -203,15 +203,15 @@ class Registry(Generic[T]):
         return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
 
 
-def _shown(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, Origin]:
+def _shown(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, NameSource]:
     """What `Registry.sources` returns."""
-    found: dict[str, Origin] = {}
+    found: dict[str, NameSource] = {}
     for module in _modules(package):
         try:
             tree = ast.parse(_source(module))
         except SyntaxError as error:
-            told = f"{module}, line {error.lineno}, is no Python: {error.msg}"
-            warnings.warn(f"left out as a {kind}: {told}", stacklevel=3)
+            message = f"{module}, line {error.lineno}, is no Python: {error.msg}"
+            warnings.warn(f"left out as a {kind}: {message}", stacklevel=3)
             continue
         for node in tree.body:
             if isinstance(node, ast.ClassDef):
@@ -220,10 +220,10 @@ def _shown(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, Or
                     name = constants.get("name", node.name)
                     if name in found:
                         other = f"{found[name].module} has one of that name"
-                        told = f"{node.name!r} in {module}: {other}"
-                        warnings.warn(f"left out as a {kind}: {told}", stacklevel=3)
+                        message = f"{node.name!r} in {module}: {other}"
+                        warnings.warn(f"left out as a {kind}: {message}", stacklevel=3)
                         continue
-                    found[name] = Origin(module, constants)
+                    found[name] = NameSource(module, constants)
     return dict(sorted(found.items()))
 
 

@@ -42,7 +42,7 @@ def cells(figures: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
 
 def page(groups: dict[str, list[dict[str, Any]]]) -> str:
     """All figures as one page of Markdown."""
-    parts = ["# Measured figures", _told(groups)]
+    parts = ["# Measured figures", _intro(groups)]
     for group, figures in groups.items():
         what = (_module(group).__doc__ or "").strip()
         parts += [f"## {group}", what, markdown_table(HEADER, cells(figures))]
@@ -65,10 +65,10 @@ def readme_section(groups: dict[str, list[dict[str, Any]]]) -> str:
             tables.append(table(figures))
     summary = markdown_table(("group", "hold", "missed"), lines)
     link = "All of them are in [docs/benchmarks.md](docs/benchmarks.md)."
-    return "\n\n".join([f"{_told(groups)} {link}", summary, *tables])
+    return "\n\n".join([f"{_intro(groups)} {link}", summary, *tables])
 
 
-def _told(groups: dict[str, list[dict[str, Any]]]) -> str:
+def _intro(groups: dict[str, list[dict[str, Any]]]) -> str:
     dates = sorted({figure["date"] for figures in groups.values() for figure in figures})
     when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
     return (

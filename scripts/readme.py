@@ -67,13 +67,13 @@ def picture(path: Path, seed: int = 3) -> None:
 def summary(scored: list[rows.Row]) -> str:
     """A line per estimator across the systems, and the table of ranks if there is one."""
     date = datetime.now(UTC).date().isoformat()
-    told = (
+    intro = (
         f"Measured on {date} with Python {platform.python_version()}, one thread a job "
         f"({processor()}), by `make leaderboard`, which writes the details of each system to "
         "`runs/leaderboard/leaderboard.md`."
     )
     found = board(rows.Stored(scored, []))
-    parts = [told, ranks_table.NOTE, markdown_table(*ranks_table.cells(found.lines))]
+    parts = [intro, ranks_table.NOTE, markdown_table(*ranks_table.cells(found.lines))]
     if len(found.ranks) > 2:
         parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(found.ranks))]
     return "\n\n".join(parts)
@@ -82,13 +82,13 @@ def summary(scored: list[rows.Row]) -> str:
 def under_conditions(scored: list[rows.Row]) -> str:
     """The table of ranks under every condition."""
     episodes = len({row["episode_seed"] for row in scored})
-    told = (
+    intro = (
         "Estimators that need no training under every condition, by `pinnobs leaderboard "
         f"--condition all --episodes {episodes}`."
     )
     ratios = ranks.log_ratios(contenders(runs_of(scored)))
     table = markdown_table(*ranks_table.rank_cells(ranks.ranks(ratios)))
-    return "\n\n".join([told, ranks_table.RANK_NOTE, table])
+    return "\n\n".join([intro, ranks_table.RANK_NOTE, table])
 
 
 def replaced(text: str, name: str, content: str, heading: str) -> str:

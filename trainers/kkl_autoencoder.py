@@ -22,7 +22,7 @@ from trainers.kkl.trainer import KKLTrainer
 
 
 @dataclass(frozen=True)
-class Config(KKLConfig):
+class KKLAutoencoderConfig(KKLConfig):
     """The recipe of an unsupervised KKL observer."""
 
     horizon: float = 3.0
@@ -37,17 +37,17 @@ class Config(KKLConfig):
         check_setting(self, "horizon", "a number of at least 0", lambda v: 0 <= v < np.inf)
 
 
-def faithful() -> Config:
+def faithful() -> KKLAutoencoderConfig:
     """Peralez & Nadri's recipe: discrete time, one sample, z from 0, no noise, Adam."""
-    config = Config(mode="discrete", horizon=0.0)
+    config = KKLAutoencoderConfig(mode="discrete", horizon=0.0)
     return as_published(config, depth=5, activation="relu")
 
 
-class KKLAutoencoderTrainer(KKLTrainer[Config]):
+class KKLAutoencoderTrainer(KKLTrainer[KKLAutoencoderConfig]):
     """Fits T to its own equation over several samples, and T* to T."""
 
     name = "kkl_autoencoder"
-    presets = {"default": Config, "faithful": faithful}
+    presets = {"default": KKLAutoencoderConfig, "faithful": faithful}
     labelled = False
 
     def gap(self) -> int:

@@ -22,7 +22,7 @@ from trainers.kkl.trainer import KKLTrainer
 
 
 @dataclass(frozen=True)
-class Config(KKLConfig):
+class KKLPinnConfig(KKLConfig):
     """The recipe of a physics-informed KKL observer."""
 
     equation: float = 0.3
@@ -36,16 +36,16 @@ class Config(KKLConfig):
         check_setting(self, "equation", "a number of at least 0", lambda v: 0 <= v < np.inf)
 
 
-def faithful() -> Config:
+def faithful() -> KKLPinnConfig:
     """Niazi et al.'s recipe: poles −1, −2, ..., z from 0, no noise, Adam."""
-    return as_published(Config(), design="niazi", depth=3, activation="relu", share=1.0)
+    return as_published(KKLPinnConfig(), design="niazi", depth=3, activation="relu", share=1.0)
 
 
-class KKLPinnTrainer(KKLTrainer[Config]):
+class KKLPinnTrainer(KKLTrainer[KKLPinnConfig]):
     """Fits T to simulated pairs of x and z and to its partial differential equation."""
 
     name = "kkl_pinn"
-    presets = {"default": Config, "faithful": faithful}
+    presets = {"default": KKLPinnConfig, "faithful": faithful}
 
     def gap(self) -> int:
         return 0

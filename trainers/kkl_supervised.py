@@ -20,21 +20,21 @@ from trainers.kkl.trainer import KKLTrainer
 
 
 @dataclass(frozen=True)
-class Config(KKLConfig):
+class KKLSupervisedConfig(KKLConfig):
     """The recipe of a supervised KKL observer."""
 
 
-def faithful() -> Config:
+def faithful() -> KKLSupervisedConfig:
     """Ramos et al.'s recipe: Bessel poles, SiLU networks of five layers of 50, z from 0, no noise,
     Adam."""
-    return as_published(Config(), depth=5, activation="silu", share=0.5)
+    return as_published(KKLSupervisedConfig(), depth=5, activation="silu", share=0.5)
 
 
-class KKLSupervisedTrainer(KKLTrainer[Config]):
+class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
     """Fits T to simulated pairs of x and z."""
 
     name = "kkl_supervised"
-    presets = {"default": Config, "faithful": faithful}
+    presets = {"default": KKLSupervisedConfig, "faithful": faithful}
 
     def gap(self) -> int:
         return 0

@@ -22,8 +22,8 @@ def usage() -> str:
     lines = ["usage: pinnobs COMMAND ...", ""]
     for name in COMMANDS:
         source = resources.files(commands).joinpath(f"{name}.py").read_text(encoding="utf-8")
-        told = ast.get_docstring(ast.parse(source)) or name  # importing it takes long
-        call, _, what = told.partition("\n")[0].partition(": ")
+        docstring = ast.get_docstring(ast.parse(source)) or name  # importing it takes long
+        call, _, what = docstring.partition("\n")[0].partition(": ")
         lines.append(f"  {call.strip('`'):21} {what.rstrip('.')}")
     return "\n".join(
         [

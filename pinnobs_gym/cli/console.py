@@ -33,7 +33,7 @@ def print_table(table: standings_table.Table) -> None:
     """Print a leaderboard's table; a narrow terminal is spared the intervals."""
     wide = console.width >= WIDE
     shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
-    hidden = {"is told", "training", "NIS", "corr.", "tail / CRR"}
+    hidden = {"knows", "training", "NIS", "corr.", "tail / CRR"}
     hidden |= {"track"} if wide else {"90th pct.", "µs/step", "/ CRR", "ANEES", "covers %"}
     columns = [i for i, name in enumerate(standings_table.HEADER) if name not in hidden]
     for i in columns:
@@ -45,7 +45,7 @@ def print_table(table: standings_table.Table) -> None:
     console.print(shown)
     for standing in table.standings:
         trained = f"; trained: {standing.training}" if standing.training else ""
-        console.print(f"  {standing.estimator} is told: {standing.knows}{trained}")
+        console.print(f"  {standing.estimator} knows: {standing.knows}{trained}")
     if table.note:
         console.print(f"  {table.note}", style="yellow", markup=False)
 
@@ -94,7 +94,7 @@ class RunView:
         self._bar = progress()
         self._task = self._bar.add_task("jobs", total=total)
         self._live = Live(self, console=console, refresh_per_second=4)
-        self._told = self._begun = time.monotonic()
+        self._printed_at = self._started_at = time.monotonic()
 
     def __enter__(self) -> Self:
         if console.is_terminal:
@@ -118,9 +118,9 @@ class RunView:
             console.print(f"failed: {name}: {error}", style="red", markup=False, soft_wrap=True)
         now = time.monotonic()
         last = self.done + self.failed == self._total
-        if not console.is_terminal and (last or now - self._told >= self.EVERY):
-            self._told = now
-            console.print(self._line(now - self._begun), soft_wrap=True, highlight=False)
+        if not console.is_terminal and (last or now - self._printed_at >= self.EVERY):
+            self._printed_at = now
+            console.print(self._line(now - self._started_at), soft_wrap=True, highlight=False)
 
     def _line(self, seconds: float) -> str:
         ended = self.done + self.failed

@@ -23,14 +23,14 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
     Raises:
         ValueError: in one line, if they are not what the command takes.
     """
-    told = io.StringIO()
+    errors = io.StringIO()
     try:
-        with contextlib.redirect_stderr(told):
+        with contextlib.redirect_stderr(errors):
             return tyro.cli(kind, prog=f"pinnobs {command}", args=arguments, **options)
     except SystemExit as end:
         if not end.code:  # help was asked for, and printed
             raise
-    message = _first_of(told.getvalue()).removeprefix("Error parsing config: ")
+    message = _first_of(errors.getvalue()).removeprefix("Error parsing config: ")
     raise ValueError(f"{message}; see pinnobs {command} --help") from None
 
 

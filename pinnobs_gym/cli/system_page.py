@@ -59,7 +59,10 @@ def page(cls: type[System], env_id: str) -> str:
         "Names for `condition`, joined by `+`; `estimators told` is what is known of it.\n",
         _table(
             ("name", "what changes", "estimators told"),
-            [(n, CONDITIONS[n].summary, CONDITIONS[n].told) for n in fitting(system, setup)],
+            [
+                (name, CONDITIONS[name].summary, CONDITIONS[name].known_to_estimators)
+                for name in fitting(system, setup)
+            ],
         ),
         "\n## Version History\n",
         f"v{cls.version}: first version.",

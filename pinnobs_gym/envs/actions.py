@@ -28,7 +28,7 @@ _DRAWS = 33
 
 
 @dataclass(frozen=True)
-class Memory:
+class AgentMemory:
     """What a form remembers of a batch of episodes."""
 
     xhat: np.ndarray
@@ -45,17 +45,17 @@ class Memory:
     """Innovations over their typical standard deviation, shape (batch, ny); zero where y is
     missing."""
 
-    def rows(self, rows: np.ndarray) -> Memory:
+    def rows(self, rows: np.ndarray) -> AgentMemory:
         """That of some rows."""
-        return Memory(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return AgentMemory(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
-    def with_rows(self, rows: np.ndarray, other: Memory) -> Memory:
+    def with_rows(self, rows: np.ndarray, other: AgentMemory) -> AgentMemory:
         """The same with some rows replaced."""
         merged = {}
         for f in fields(self):
             merged[f.name] = getattr(self, f.name).copy()
             merged[f.name][rows] = getattr(other, f.name)
-        return Memory(**merged)
+        return AgentMemory(**merged)
 
 
 class Form(ABC):
@@ -95,7 +95,7 @@ class Form(ABC):
     def num_features(self) -> int:
         """Number of features; the last is a time from 0 to 1."""
 
-    def begin(self, mean: np.ndarray, t: np.ndarray, u: np.ndarray) -> Memory:
+    def begin(self, mean: np.ndarray, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         """The memory before the first samples.
 
         Args:
@@ -104,11 +104,11 @@ class Form(ABC):
             u: inputs at these, shape (batch, nu).
         """
         y = np.full((len(mean), self.stack, self.system.ny), np.nan)
-        return Memory(np.asarray(mean, dtype=float), t, t, u, y, y[:, 0])
+        return AgentMemory(np.asarray(mean, dtype=float), t, t, u, y, y[:, 0])
 
     def observe(
-        self, memory: Memory, t: np.ndarray, y: np.ndarray, u: np.ndarray
-    ) -> tuple[np.ndarray, Memory]:
+        self, memory: AgentMemory, t: np.ndarray, y: np.ndarray, u: np.ndarray
+    ) -> tuple[np.ndarray, AgentMemory]:
         """The features (batch, num_features) of the samples at times t.
 
         Args:
@@ -123,16 +123,16 @@ class Form(ABC):
         return self.features(memory), memory
 
     @abstractmethod
-    def predict(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+    def predict(self, memory: AgentMemory, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         """The memory with what the model says of the samples at times t, whose outputs it holds
         already."""
 
     @abstractmethod
-    def features(self, memory: Memory) -> np.ndarray:
+    def features(self, memory: AgentMemory) -> np.ndarray:
         """The features (batch, num_features) of the last samples."""
 
     @abstractmethod
-    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+    def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         """The memory with the estimates that actions (batch, ...) mean."""
 
     def checked(self, actions: np.ndarray) -> np.ndarray:
@@ -159,10 +159,10 @@ class EstimateForm(Form):
     def num_features(self) -> int:
         return self.stack * self.system.ny + self.system.nu + 1
 
-    def predict(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+    def predict(self, memory: AgentMemory, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         return memory
 
-    def outputs_and_time(self, memory: Memory) -> np.ndarray:
+    def outputs_and_time(self, memory: AgentMemory) -> np.ndarray:
         """The last outputs, newest first, zero before the first; then u and t/T."""
         y = memory.y
         if self.stack > 1:
@@ -180,10 +180,10 @@ class Estimate(EstimateForm):
         largest = self.bound.astype(np.float32)
         self.action_space = Box(-largest, largest)
 
-    def features(self, memory: Memory) -> np.ndarray:
+    def features(self, memory: AgentMemory) -> np.ndarray:
         return self.outputs_and_time(memory)
 
-    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+    def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         return replace(memory, xhat=self.checked(actions))
 
 
@@ -196,11 +196,11 @@ class Normalized(EstimateForm):
     def prepare(self) -> None:
         self.action_space = _unit_box(self.system.nx)
 
-    def features(self, memory: Memory) -> np.ndarray:
+    def features(self, memory: AgentMemory) -> np.ndarray:
         features = self.outputs_and_time(memory)
         return np.where(np.isnan(features), 0.0, features)
 
-    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+    def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         return replace(memory, xhat=self.bound * self.checked(actions))
 
 
@@ -231,25 +231,25 @@ class PredictionForm(Form):
     def num_features(self) -> int:
         return self.system.ny + self.system.nx + self.system.nu + 1
 
-    def predict(self, memory: Memory, t: np.ndarray, u: np.ndarray) -> Memory:
+    def predict(self, memory: AgentMemory, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         xhat = model_step(self.system, memory.t, t, memory.xhat, memory.u, u)
         y = memory.y[:, 0]
         surprise = (y - self.system.h(t, xhat, u)) / self.root_S[self._samples(t, memory)]
         return replace(memory, xhat=xhat, surprise=np.where(np.isnan(y), 0.0, surprise))
 
-    def features(self, memory: Memory) -> np.ndarray:
+    def features(self, memory: AgentMemory) -> np.ndarray:
         k = np.minimum((memory.t - memory.start) / self.setup.dt, self.setup.num_steps)
         time = np.log1p(k) / np.log1p(self.setup.num_steps)
         parts = (np.arcsinh(memory.surprise), memory.xhat / self.scale, memory.u / self.u_scale)
         return np.concatenate([*parts, time[:, None]], axis=1)
 
-    def corrected(self, memory: Memory, share: np.ndarray) -> Memory:
+    def corrected(self, memory: AgentMemory, share: np.ndarray) -> AgentMemory:
         """The predictions corrected by a share (batch, nx) of the typical error, within bounds."""
         largest = OUTSIDE * self.bound
         xhat = memory.xhat + share * self.sigma[self._samples(memory.t, memory)]
         return replace(memory, xhat=np.clip(xhat, -largest, largest))
 
-    def improvement(self, memory: Memory, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def improvement(self, memory: AgentMemory, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
         """By how much the correction lessened the squared error, over the typical one, (batch,).
 
         Which gain is best at a sample is the same as for −mean(((x̂ − x)/scale)²), since what is
@@ -262,7 +262,7 @@ class PredictionForm(Form):
             less /= self.sigma[self._samples(memory.t, memory)] ** 2
             return np.clip(less.mean(axis=1) / (1 + nis), -LARGEST_REWARD, LARGEST_REWARD)
 
-    def _samples(self, t: np.ndarray, memory: Memory) -> np.ndarray:
+    def _samples(self, t: np.ndarray, memory: AgentMemory) -> np.ndarray:
         """The place of samples in the schedules."""
         k = np.rint((t - memory.start) / self.setup.dt).astype(int)
         return np.minimum(k, len(self.sigma) - 1)
@@ -283,7 +283,7 @@ class Gain(PredictionForm):
     def num_actions(self) -> int:
         return self.system.nx * self.system.ny
 
-    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+    def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         correlation = self.checked(actions).reshape(-1, self.system.nx, self.system.ny)
         with np.errstate(all="ignore"):  # of rows that are not finite
             share = np.einsum("bij,bj->bi", correlation, memory.surprise)
@@ -300,7 +300,7 @@ class Correction(PredictionForm):
     def num_actions(self) -> int:
         return self.system.nx
 
-    def act(self, memory: Memory, actions: np.ndarray) -> Memory:
+    def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         return self.corrected(memory, LARGEST_CORRECTION * self.checked(actions))
 
 

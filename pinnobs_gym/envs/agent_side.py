@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pinnobs_gym.envs.actions import Form, Memory, PredictionForm, form_of
+from pinnobs_gym.envs.actions import AgentMemory, Form, PredictionForm, form_of
 from pinnobs_gym.envs.episodes import EpisodeSource
 
 
@@ -33,7 +33,7 @@ class AgentSide:
         if self.improves and not isinstance(self.form, PredictionForm):
             raise ValueError(f"reward='improvement' needs a prediction; {action_mode!r} has none")
         self._source = source
-        self._memory: Memory | None = None
+        self._memory: AgentMemory | None = None
 
     def begin(
         self, mean: np.ndarray, samples: np.ndarray, k: np.ndarray, rows: np.ndarray | None = None
@@ -50,15 +50,15 @@ class AgentSide:
         if self._memory is None:
             self._features = np.empty((len(k), self.form.num_features), np.float32)
             rows = np.arange(len(k))
-            self._memory = self._begun(mean)
-        new = self._begun(mean[rows])
+            self._memory = self._initial(mean)
+        new = self._initial(mean[rows])
         self._features[rows], new = self.form.observe(new, *self._sample(samples[rows], k[rows]))
         self._memory = self._memory.with_rows(rows, new)
         return self._features.copy()
 
     def forget(self, mean: np.ndarray, rows: np.ndarray) -> None:
         """Begin the episodes of rows (n,) anew, whose first samples are still to be looked at."""
-        self._memory = self._playing.with_rows(rows, self._begun(mean[rows]))
+        self._memory = self._playing.with_rows(rows, self._initial(mean[rows]))
 
     def observe(self, samples: np.ndarray, k: np.ndarray) -> np.ndarray:
         """The observations (batch, features) of the next samples; arguments as in `begin`."""
@@ -79,12 +79,12 @@ class AgentSide:
         return self.form.improvement(self._before, xhat, x)
 
     @property
-    def _playing(self) -> Memory:
+    def _playing(self) -> AgentMemory:
         if self._memory is None:
             raise RuntimeError("no episode has begun; call reset before step")
         return self._memory
 
-    def _begun(self, mean: np.ndarray) -> Memory:
+    def _initial(self, mean: np.ndarray) -> AgentMemory:
         inputs = np.broadcast_to(self._source.inputs[0], (len(mean), self._source.system.nu))
         return self.form.begin(mean, np.zeros(len(mean)), inputs)
 

@@ -18,7 +18,7 @@ from pinnobs_gym.envs.arguments import (
     reward_weights,
     seeds_of,
 )
-from pinnobs_gym.envs.episodes import Ahead, Changes, EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import Changes, EpisodeBuffer, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
@@ -78,7 +78,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         self._k = 0
         self._over = True
         self._stream: Stream | None = None
-        self._ahead = Ahead(self.source, 1)
+        self._buffer = EpisodeBuffer(self.source, 1)
         self._picture: EpisodePicture | None = None
 
     def reset(
@@ -90,8 +90,8 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         x0 = given_x0(self.source, options, 1)
         if seed is not None or self._stream is None:
             self._stream = Stream(seeds_of(self.np_random))
-            self._ahead.forget([0])
-        episode = self._ahead.take([0], [self._stream], x0)
+            self._buffer.forget([0])
+        episode = self._buffer.take([0], [self._stream], x0)
         self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]
         self._k = 0
         self._over = False

@@ -178,7 +178,7 @@ class EpisodeSource:
         return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
 
 
-class Ahead:
+class EpisodeBuffer:
     """The next episodes of an env's rows, simulated before they are played.
 
     Many episodes take little longer than one: where rows begin anew one by one, a block is

@@ -20,7 +20,7 @@ from pinnobs_gym.envs.arguments import (
     given_x0,
     reward_weights,
 )
-from pinnobs_gym.envs.episodes import Ahead, Changes, Episodes, EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import Changes, EpisodeBuffer, Episodes, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
@@ -73,7 +73,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._any_over = False
         self._together = True
         self._streams: list[Stream] = []
-        self._ahead = Ahead(self.source, num_envs)
+        self._buffer = EpisodeBuffer(self.source, num_envs)
         self._episodes: Episodes | None = None
         self._noise: np.ndarray | None = None
         self._prior = Prior.of(self.source.system, self.source.setup, num_envs)
@@ -97,10 +97,10 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         x0 = given_x0(self.source, options, self.num_envs)
         self._seed(seed, rows)
         self._begin(rows, prior.mean[rows], None if x0 is None else x0[rows])
-        observations, infos = self._look()
+        observations, infos = self._observe()
         if not self.agent.plain:
             observations = self.agent.begin(self._prior.mean, observations, self._k, rows)
-        return observations, infos | self._begun(rows)
+        return observations, infos | self._prior_infos(rows)
 
     def step(
         self, actions: np.ndarray
@@ -140,13 +140,13 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         truncated = np.asarray(self._k == self._num_steps)
         self._over = terminated | truncated
         self._any_over = bool(self._over.any())
-        observations, infos = self._look()
+        observations, infos = self._observe()
         if not self.agent.plain:
             if begun is not None:
                 self.agent.forget(self._prior.mean, begun)
             observations = self.agent.observe(observations, self._k)
         if begun is not None:
-            infos |= self._begun(begun)
+            infos |= self._prior_infos(begun)
         return observations, rewards, terminated, truncated, infos
 
     def record(self) -> Record:
@@ -188,11 +188,11 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if not self._streams:
             self._streams = [Stream(np.random.SeedSequence(s)) for s in seeds]
         elif seed is not None:
-            self._ahead.forget(rows.tolist())
+            self._buffer.forget(rows.tolist())
             for row in rows:
                 self._streams[row] = Stream(np.random.SeedSequence(seeds[row]))
 
-    def _begun(self, rows: np.ndarray) -> dict[str, Any]:
+    def _prior_infos(self, rows: np.ndarray) -> dict[str, Any]:
         """The infos of rows whose episode has just begun: their prior."""
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[rows] = True
@@ -203,13 +203,13 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         """Begin the next episode of these rows, from prior means (len(rows), nx)."""
         self._prior.mean[rows] = xhat0
         chosen = rows.tolist()
-        if len(rows) == self.num_envs and not self._ahead.any(chosen):
+        if len(rows) == self.num_envs and not self._buffer.any(chosen):
             # Arrays of this size are slow to allocate: those of episodes that are over serve again.
             draws = self.source.draw(self._streams, self._noise)
             self._noise = draws.noise
             self._episodes = self.source.play(draws, x0, self._episodes)
         else:
-            new = self._ahead.take(chosen, self._streams, x0)
+            new = self._buffer.take(chosen, self._streams, x0)
             for name in ("x", "y", "observations"):
                 getattr(self._playing, name)[:, rows] = getattr(new, name)
         self._k[rows] = 0
@@ -224,7 +224,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
                 x, observations = self._playing.x[:, row], self._playing.observations[:, row]
                 self._pictures[row].begin(self.source.times, x, observations)
 
-    def _look(self) -> tuple[np.ndarray, dict[str, Any]]:
+    def _observe(self) -> tuple[np.ndarray, dict[str, Any]]:
         """The observations and infos of each row's present sample."""
         episodes, k = self._playing, self._k
         if self._together:

@@ -18,7 +18,7 @@ from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
 from pinnobs_gym.simulation.checks import initial_states
 from pinnobs_gym.simulation.conformance import (
     Found,
-    into,
+    add_check,
     require,
     require_close,
     require_shape,
@@ -106,7 +106,7 @@ def _online(estimator: Estimator) -> bool:
     return estimator.track == "online"
 
 
-@into(ESTIMATOR_CHECKS, "immutable")
+@add_check(ESTIMATOR_CHECKS, "immutable")
 def _estimator_immutable(estimator: Estimator) -> None:
     """The estimator is immutable."""
     cls = type(estimator)
@@ -118,7 +118,7 @@ def _estimator_immutable(estimator: Estimator) -> None:
     require(estimator.track in ("online", "offline"), f"track={estimator.track!r} is unknown")
 
 
-@into(ESTIMATOR_CHECKS, "shapes")
+@add_check(ESTIMATOR_CHECKS, "shapes")
 def _estimator_shapes(estimator: Estimator) -> None:
     """Estimates, covariances and innovations have their shapes and are finite."""
     record = _record(estimator)
@@ -152,7 +152,7 @@ def _check_values(
         require(least > -1e-9, f"P {when} has eigenvalue {least:.1e}; expected none below zero")
 
 
-@into(ESTIMATOR_CHECKS, "rows_independent")
+@add_check(ESTIMATOR_CHECKS, "rows_independent")
 def _estimator_rows_independent(estimator: Estimator) -> None:
     """A row of a batch gives the same as that row alone."""
     record = _record(estimator)
@@ -171,7 +171,7 @@ def _rows(estimates: Estimates, rows: slice) -> Estimates:
     return Estimates(**taken)
 
 
-@into(ESTIMATOR_CHECKS, "purity")
+@add_check(ESTIMATOR_CHECKS, "purity")
 def _estimator_purity(estimator: Estimator) -> None:
     """The same record gives the same estimates, and neither it nor earlier states are modified."""
     record = _record(estimator)
@@ -209,7 +209,7 @@ def _copy(record: Record) -> Record:
     return Record(record.t.copy(), record.y.copy(), record.u.copy(), prior)
 
 
-@into(ESTIMATOR_CHECKS, "causality")
+@add_check(ESTIMATOR_CHECKS, "causality")
 def _estimator_causality(estimator: Estimator) -> None:
     """Changing later outputs changes no earlier estimate."""
     if not _online(estimator):
@@ -225,7 +225,7 @@ def _estimator_causality(estimator: Estimator) -> None:
             raise Found(f"the estimate at sample {first} changes with outputs from sample {k} on")
 
 
-@into(ESTIMATOR_CHECKS, "missing_samples")
+@add_check(ESTIMATOR_CHECKS, "missing_samples")
 def _estimator_missing_samples(estimator: Estimator) -> None:
     """A NaN in y is a missing sample, and none sticks; all may be missing."""
     if not _online(estimator):
@@ -254,7 +254,7 @@ def _estimator_missing_samples(estimator: Estimator) -> None:
             )
 
 
-@into(ESTIMATOR_CHECKS, "irregular_times")
+@add_check(ESTIMATOR_CHECKS, "irregular_times")
 def _estimator_irregular_times(estimator: Estimator) -> None:
     """Samples may come at irregular times."""
     if not _online(estimator):
@@ -265,7 +265,7 @@ def _estimator_irregular_times(estimator: Estimator) -> None:
     require(np.isfinite(xhat).all(), "xhat is not finite on a record of irregular times")
 
 
-@into(ESTIMATOR_CHECKS, "run_equals_updates")
+@add_check(ESTIMATOR_CHECKS, "run_equals_updates")
 def _estimator_run_equals_updates(estimator: Estimator) -> None:
     """`run` gives what looping `update` does."""
     if not _online(estimator):
@@ -284,7 +284,7 @@ def _estimator_run_equals_updates(estimator: Estimator) -> None:
         )
 
 
-@into(ESTIMATOR_CHECKS, "diverging_row")
+@add_check(ESTIMATOR_CHECKS, "diverging_row")
 def _estimator_diverging_row(estimator: Estimator) -> None:
     """A row that diverges is marked by what it holds; it neither raises nor touches the others."""
     if not _online(estimator):
@@ -303,7 +303,7 @@ def _estimator_diverging_row(estimator: Estimator) -> None:
                 require_close(a, b, ROUNDING, abs(b).max(axis=(0, 1)), what)
 
 
-@into(ESTIMATOR_CHECKS, "save_load")
+@add_check(ESTIMATOR_CHECKS, "save_load")
 def _estimator_save_load(estimator: Estimator) -> None:
     """What can be saved is the same when loaded."""
     cls: Any = type(estimator)

@@ -145,10 +145,10 @@ class Estimator(ABC):
         `output_scale`.
         """
         benchmark = self.system.setups["benchmark"].noise_std
-        told = benchmark if self.noise_std is None else self.noise_std
-        std = vector(told, self.system.ny, "noise_std")
+        known_noise = benchmark if self.noise_std is None else self.noise_std
+        std = vector(known_noise, self.system.ny, "noise_std")
         if not (np.isfinite(std).all() and (std >= 0).all()):
-            raise ValueError(f"noise_std={told}; expected numbers of at least 0")
+            raise ValueError(f"noise_std={known_noise}; expected numbers of at least 0")
         return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
 
     @property

@@ -16,7 +16,7 @@ from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class Memory:
+class SigmaPointMemory:
     """What the filter keeps besides the state's own fields; the batch comes last."""
 
     Q: np.ndarray
@@ -59,11 +59,11 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         batch = len(prior.mean)
-        memory = Memory(*self.tuning(batch), self.points(), np.zeros(batch))
+        memory = SigmaPointMemory(*self.tuning(batch), self.points(), np.zeros(batch))
         return State(prior.mean, P=prior.cov, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: Memory = state.memory
+        memory: SigmaPointMemory = state.memory
         xhat, P = state.xhat, covariances(state)
         unit, mean_weights, cov_weights = memory.points
         weights = np.sqrt(cov_weights)[:, None]

@@ -15,7 +15,7 @@ from pinnobs_gym.simulation.system import vector
 
 
 @dataclass(frozen=True)
-class Memory:
+class EKFMemory:
     """What the filter keeps besides the state's own fields; the batch comes last."""
 
     Q: np.ndarray
@@ -84,11 +84,11 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         wide = P0 + np.diag(vector(self.system.scale, self.system.nx, "scale") ** 2)
         bounds = self._gate_bounds()
         beyond = np.zeros(len(P0), dtype=int)
-        memory = Memory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
+        memory = EKFMemory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
         return State(prior.mean, P=P0, memory=memory)
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: Memory = state.memory
+        memory: EKFMemory = state.memory
         xhat, P = predicted(self.system, state, t, u, memory.Q)
         R = memory.R
         innovation, H = observe(self.system, t, xhat, y, u)
@@ -110,8 +110,8 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         return 2 * gammaincinv(degrees / 2, self.gate)
 
     def _gated(
-        self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, memory: Memory
-    ) -> tuple[np.ndarray, Memory]:
+        self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, memory: EKFMemory
+    ) -> tuple[np.ndarray, EKFMemory]:
         """P, widened where the filter starts again."""
         present = H.any(axis=1).sum(axis=0)  # outputs that are not missing
         nis = squared_size(innovation, sandwich(H, P) + memory.R)

@@ -16,7 +16,7 @@ from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class Memory:
+class EnsembleMemory:
     """The ensemble, and what made it."""
 
     members: np.ndarray
@@ -74,10 +74,10 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + np.einsum("ijb,mj->mbi", L, self._draws(0, self.system.nx))
         stds = self.process_noise * np.asarray(self.system.scale), np.sqrt(self.output_variance)
-        return State(prior.mean, P=prior.cov, memory=Memory(members, *stds))
+        return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members, *stds))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: Memory = state.memory
+        memory: EnsembleMemory = state.memory
         members, nx = memory.members, self.system.nx
         draws = self._draws(memory.sample + 1, nx + self.system.ny)[:, None]
         if state.t is not None:

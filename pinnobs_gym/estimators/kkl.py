@@ -38,9 +38,9 @@ class Clock:
 
     def __call__(self, t: Array, u: Array, xp: Any = np) -> Array:
         """The numbers (..., size) at times t (...) since the first sample, inputs (..., nu)."""
-        told = [xp.exp(-rate * t) for rate in self.rates]
-        told += [u[..., i] / size for i, size in enumerate(self.amplitudes)]
-        return xp.stack(told, -1)
+        inputs = [xp.exp(-rate * t) for rate in self.rates]
+        inputs += [u[..., i] / size for i, size in enumerate(self.amplitudes)]
+        return xp.stack(inputs, -1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,8 +79,8 @@ class TrainedKKL(Trained):
         first sample (s) and inputs u."""
         if self.encoder[0][0].shape[1] > x.shape[-1]:
             u = np.zeros(len(self.clock.amplitudes)) if u is None else u
-            told = self.clock(np.asarray(t), u)
-            x = np.concatenate([x, np.broadcast_to(told, (*x.shape[:-1], told.shape[-1]))], -1)
+            inputs = self.clock(np.asarray(t), u)
+            x = np.concatenate([x, np.broadcast_to(inputs, (*x.shape[:-1], inputs.shape[-1]))], -1)
         return perceptron(self.encoder, self.activation, x)
 
     def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:

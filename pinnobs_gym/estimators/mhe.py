@@ -15,7 +15,7 @@ from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class Memory:
+class WindowMemory:
     """The window, and what is known of its start; in matrices the batch comes last."""
 
     Q: np.ndarray
@@ -78,10 +78,10 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         P0, mean = prior.cov.transpose(1, 2, 0), prior.mean
-        return State(mean, P=prior.cov, memory=Memory(*self.tuning(), mean, P0, mean))
+        return State(mean, P=prior.cov, memory=WindowMemory(*self.tuning(), mean, P0, mean))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: Memory = state.memory
+        memory: WindowMemory = state.memory
         if len(memory.t) == self.window:
             memory = self._moved(memory, t, u)
         memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
@@ -101,14 +101,14 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)
 
-    def _fit(self, memory: Memory, start: np.ndarray) -> Fit:
+    def _fit(self, memory: WindowMemory, start: np.ndarray) -> Fit:
         """The model's trajectory through the window from a state at its start."""
         nx, batch = self.system.nx, len(start)
         X = identity(nx, batch)
         R = np.diagonal(memory.R[..., 0])
         return linearised(self.system, memory.t, memory.y, memory.u, start, X, R)
 
-    def _moved(self, memory: Memory, t: float, u: np.ndarray) -> Memory:
+    def _moved(self, memory: WindowMemory, t: float, u: np.ndarray) -> WindowMemory:
         """The window without its first sample, which x̄ and P̄ take in."""
         start = memory.start
         innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])

@@ -24,7 +24,7 @@ _HALVINGS = 20
 
 
 @dataclass(frozen=True)
-class Memory:
+class ParticleMemory:
     """The particles."""
 
     particles: np.ndarray
@@ -87,10 +87,10 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         )
         particles = prior.mean + np.einsum("ijb,mj->mbi", L, draws)
         log_weights = np.full(particles.shape[:2], -np.log(self.particles))
-        return State(prior.mean, P=prior.cov, memory=Memory(particles, log_weights))
+        return State(prior.mean, P=prior.cov, memory=ParticleMemory(particles, log_weights))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: Memory = state.memory
+        memory: ParticleMemory = state.memory
         x, log_weights = memory.particles, memory.log_weights
         if state.t is not None:
             x = model_step(self.system, state.t, t, x, state.u, u)
@@ -104,7 +104,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         rows = np.flatnonzero((weights**2).sum(axis=0) > 2 / self.particles)
         if len(rows):
             x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
-        memory = Memory(x, log_weights, memory.sample + 1)
+        memory = ParticleMemory(x, log_weights, memory.sample + 1)
         innovation = np.where(missing, 0.0, y - yhat)
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.envs.actions import Form, Memory, form_of
+from pinnobs_gym.envs.actions import AgentMemory, Form, form_of
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
@@ -142,7 +142,7 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         now = np.full(len(y), t)
-        memory: Memory
+        memory: AgentMemory
         if state.t is None:
             memory, hidden = self._form.begin(state.xhat, now, u), self.trained.begin(len(y))
         else:

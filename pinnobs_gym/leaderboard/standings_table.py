@@ -86,7 +86,7 @@ HEADER = (
     "NIS",
     "corr.",
     "µs/step",
-    "is told",
+    "knows",
     "training",
 )
 """The columns of a table."""

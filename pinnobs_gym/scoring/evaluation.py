@@ -40,8 +40,8 @@ class Results:
         file, if it is read."""
         if self.known is None:
             return {rows_module.key(row): row for row in rows_module.read(self.path)}
-        there = (row for row in wanted if rows_module.key(row)[4:] in self.known)
-        return {rows_module.key(row): row for row in there}
+        stored = (row for row in wanted if rows_module.key(row)[4:] in self.known)
+        return {rows_module.key(row): row for row in stored}
 
 
 def evaluate(

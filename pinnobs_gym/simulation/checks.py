@@ -10,7 +10,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.conformance import (
     Found,
-    into,
+    add_check,
     require,
     require_close,
     require_shape,
@@ -85,7 +85,7 @@ def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> tuple[np.ndar
     return x, np.asarray(system.h(t[:, None], x, u[:, None]))
 
 
-@into(SYSTEM_CHECKS, "attributes")
+@add_check(SYSTEM_CHECKS, "attributes")
 def _system_attributes(cls: type[System]) -> None:
     """The class attributes are complete and make sense."""
     cls.validate()
@@ -113,7 +113,7 @@ def _system_attributes(cls: type[System]) -> None:
         require((std > 0).all(), f"P0_std={setup.P0_std} of setup {name!r}; expected positive")
 
 
-@into(SYSTEM_CHECKS, "shapes")
+@add_check(SYSTEM_CHECKS, "shapes")
 def _system_shapes(cls: type[System]) -> None:
     """All functions act on the last axis and take any leading ones."""
     system = cls()
@@ -156,7 +156,7 @@ def _check_output_shapes(system: System, t: Any, x: np.ndarray, u: np.ndarray, w
     require_shape(system.h_jacobian(t, x, u), (*y, system.nx), f"h_jacobian {where}")
 
 
-@into(SYSTEM_CHECKS, "rows_independent")
+@add_check(SYSTEM_CHECKS, "rows_independent")
 def _system_rows_independent(cls: type[System]) -> None:
     """A row of a batch gives the same as that row alone."""
     system = cls()
@@ -180,7 +180,7 @@ def _functions(system: System) -> dict[str, Callable[[Any, Any, Any], Any]]:
     }
 
 
-@into(SYSTEM_CHECKS, "purity")
+@add_check(SYSTEM_CHECKS, "purity")
 def _system_purity(cls: type[System]) -> None:
     """The same call gives the same result, and arguments are not modified."""
     system = cls()
@@ -194,7 +194,7 @@ def _system_purity(cls: type[System]) -> None:
         require(np.array_equal(first, again), f"{name} gives another result when called again")
 
 
-@into(SYSTEM_CHECKS, "array_api")
+@add_check(SYSTEM_CHECKS, "array_api")
 def _system_array_api(cls: type[System]) -> None:
     """f, h and input give the same in NumPy and in torch, and torch can differentiate them."""
     import torch
@@ -225,7 +225,7 @@ def _system_array_api(cls: type[System]) -> None:
                 require_close(values, expected, EXACT, size, f"{name} in torch and in NumPy")
 
 
-@into(SYSTEM_CHECKS, "f_jacobian")
+@add_check(SYSTEM_CHECKS, "f_jacobian")
 def _system_f_jacobian(cls: type[System]) -> None:
     """f_jacobian is ∂f/∂x, by central differences."""
     system = cls()
@@ -234,7 +234,7 @@ def _system_f_jacobian(cls: type[System]) -> None:
     _check_jacobian(system, lambda x: system.f(t, x, u), found, x, "f_jacobian")
 
 
-@into(SYSTEM_CHECKS, "h_jacobian")
+@add_check(SYSTEM_CHECKS, "h_jacobian")
 def _system_h_jacobian(cls: type[System]) -> None:
     """h_jacobian is ∂h/∂x, by central differences."""
     system = cls()
@@ -270,7 +270,7 @@ def _check_jacobian(
     )
 
 
-@into(SYSTEM_CHECKS, "initial_states")
+@add_check(SYSTEM_CHECKS, "initial_states")
 def _system_initial_states(cls: type[System]) -> None:
     """Every setup has admissible initial states, from which the plant stays finite."""
     for name, system, setup in _setups(cls):
@@ -281,7 +281,7 @@ def _system_initial_states(cls: type[System]) -> None:
         require(np.isfinite(y).all(), f"outputs of setup {name!r} leave the finite ones")
 
 
-@into(SYSTEM_CHECKS, "invariants")
+@add_check(SYSTEM_CHECKS, "invariants")
 def _system_invariants(cls: type[System]) -> None:
     """What `System.invariants` names stays the same along the truth."""
     for name, system, setup in _setups(cls):
@@ -295,7 +295,7 @@ def _system_invariants(cls: type[System]) -> None:
             require_close(along, expected, TRUTH_TOLERANCE, size, what)
 
 
-@into(SYSTEM_CHECKS, "indistinguishable")
+@add_check(SYSTEM_CHECKS, "indistinguishable")
 def _system_indistinguishable(cls: type[System]) -> None:
     """What `System.indistinguishable` names gives the same output for ever."""
     for name, system, setup in _setups(cls):

@@ -27,7 +27,7 @@ def run_all(checks: Mapping[str, Callable[[T], None]], subject: T) -> None:
         raise CheckFailed("\n".join(failures))
 
 
-def into(
+def add_check(
     table: dict[str, Callable[[T], None]], name: str
 ) -> Callable[[Callable[[T], None]], Callable[[T], None]]:
     """Put a check into a table; whatever it raises becomes one line with its name."""

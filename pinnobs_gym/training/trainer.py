@@ -73,7 +73,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         """Iterations made so far."""
         self.ending: Ending = "running"
         self._record, self._game = record, game
-        self._earlier, self._begun = 0.0, time.process_time()
+        self._earlier, self._started_at = 0.0, time.process_time()
         self.start()
 
     @classmethod
@@ -114,7 +114,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
     @property
     def seconds(self) -> float:
         """CPU seconds so far, those before a resumption included."""
-        return self._earlier + time.process_time() - self._begun
+        return self._earlier + time.process_time() - self._started_at
 
     def continue_from(self, iteration: int, seconds: float) -> None:
         """Count on from an interrupted training's iterations and CPU seconds."""

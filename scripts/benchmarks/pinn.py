@@ -19,7 +19,7 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.loop import train
-from trainers.pinn_obs import Config, PinnObsTrainer, paper, transfer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer, paper, transfer
 
 SEEDS = range(5)
 PAPER_ITERATIONS = 101_431
@@ -67,7 +67,7 @@ class Case:
         noise = std * np.random.default_rng(seed).standard_normal(self.record.y.shape)
         return replace(self, record=replace(self.record, y=self.record.y + noise))
 
-    def trained(self, config: Config, noise_std: float = 0.0) -> TrainedNetwork:
+    def trained(self, config: PinnObsConfig, noise_std: float = 0.0) -> TrainedNetwork:
         """What comes of a training on this record."""
         return train(PinnObsTrainer(self.system, config, record=self.record, noise_std=noise_std))
 
@@ -153,7 +153,7 @@ def seconds_to_paper(case: Case, depth: int, seed: int, limit: float) -> float:
     """CPU seconds of the fast recipe until loss and RMSE are the paper's, looked at every ten
     iterations; infinite if that takes over the limit."""
     spent, start = 0.0, time.process_time()
-    config = Config(depth=depth, seed=seed)
+    config = PinnObsConfig(depth=depth, seed=seed)
     run = PinnObsTrainer(case.system, config, record=case.record, noise_std=0.0)
     while not run.finished():
         for _ in range(10):
@@ -174,7 +174,7 @@ def replays(case: Case, budget: float) -> Iterator[Figure]:
         values = []
         for seed in SEEDS:
             one = case.noisy(std, seed) if std else case
-            config = Config(seed=seed, budget=budget)
+            config = PinnObsConfig(seed=seed, budget=budget)
             values.append(one.replayed(one.trained(config, std)))
         what = f"ReverseDuffing, replay on the own record, noise {std:g}, RMSE"
         yield at_most(f"{what}, median of {len(SEEDS)} seeds", float(np.median(values)), "", asked)
@@ -199,7 +199,7 @@ def paper_setup(name: str) -> Iterator[Figure]:
     case = Case.of(name)
     results = []
     for seed in SEEDS:
-        trained = case.trained(Config(seed=seed))
+        trained = case.trained(PinnObsConfig(seed=seed))
         results.append((case.direct(trained), case.replayed(trained), trained.seconds))
     direct, replay, seconds = np.median(results, axis=0)
     line = EKF_RMSE[name]

@@ -16,7 +16,7 @@ from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import train_by_name
-from trainers.pinn_gain import Config
+from trainers.pinn_gain import PinnGainConfig
 
 SEEDS = 3
 """Training seeds, of which the median counts."""
@@ -55,7 +55,7 @@ def of_system(name: str, repeats: int) -> Iterator[Figure]:
 
 def trained_on(name: str, seed: int) -> Any:
     """A gain trained by the default recipe."""
-    config = Config(seed=seed)
+    config = PinnGainConfig(seed=seed)
     return train_by_name("pinn_gain", config, Game.of(name))
 
 

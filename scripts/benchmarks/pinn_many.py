@@ -11,7 +11,7 @@ from benchmarks import Figure, at_least, cpu_seconds, median_ratio
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.training.loop import train
-from trainers.pinn_obs import Config, PinnObsTrainer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 from trainers.pinn_obs.objective import Objective
 
 MANY = 64
@@ -33,7 +33,7 @@ def at_once(source: EpisodeSource, record: Record, repeats: int) -> Figure:
     """Records per CPU-second of `train_rows` over those of `train`, in the first iterations of the
     fast preset, which all cost the same."""
     system, noise = source.system, source.setup.noise_std
-    config = Config(iterations=ITERATIONS)
+    config = PinnObsConfig(iterations=ITERATIONS)
 
     def single() -> None:
         for i in range(SINGLE):
@@ -59,7 +59,7 @@ def stacked_evaluations(source: EpisodeSource, record: Record, repeats: int) -> 
     records, both on the CPU: why `train_rows` takes one record after another there."""
     noise = source.setup.noise_std
     rows = [record.rows(slice(i, i + 1)) for i in range(MANY)]
-    config = Config(guide=0.0)  # which takes no part in the time of an evaluation
+    config = PinnObsConfig(guide=0.0)  # which takes no part in the time of an evaluation
     runs = [PinnObsTrainer(source.system, config, record=r, noise_std=noise) for r in rows]
     objectives = [run.recipe.objective for run in runs]
     thetas = [run.theta for run in runs]

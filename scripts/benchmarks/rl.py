@@ -22,7 +22,7 @@ from pinnobs_gym.leaderboard.standings_table import markdown_table
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import train_by_name
-from trainers.rl import Config
+from trainers.rl import RLConfig
 
 SEEDS = 3
 """Training seeds."""
@@ -95,7 +95,7 @@ def _of(values: dict[str, float], start: str, end: str = "") -> float:
 
 def trained_on(name: str, seed: int) -> Any:
     """An agent trained by the default recipe."""
-    return train_by_name("rl", Config(seed=seed), Game.of(name))
+    return train_by_name("rl", RLConfig(seed=seed), Game.of(name))
 
 
 def scores(name: str, trained: TrainedAgent) -> list[Row]:

@@ -169,8 +169,8 @@ def two_over_one(repeats: int) -> Figure:
 
     seconds(2)
     ratios = [seconds(1) / seconds(2) for _ in range(repeats)]
-    told = "EKF suite: throughput of two processes over one"
-    return at_least(told, float(np.median(ratios)), "", 1.8)
+    label = "EKF suite: throughput of two processes over one"
+    return at_least(label, float(np.median(ratios)), "", 1.8)
 
 
 def many_rows() -> Iterator[Figure]:

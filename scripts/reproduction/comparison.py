@@ -191,11 +191,11 @@ def lines(comparison: Comparison, rows: Mapping[str, Row]) -> list[tuple[str, ..
             printed = ["" if value is None else f"{value:.3g}" for value in PRINTED[method]]
             table.append((method, "the paper", "not stated", "not stated", *printed, ""))
         own = [rows.get(comparison.key(method, i)) for i in range(comparison.records)]
-        there = [row for row in own if row is not None]
-        seconds = f"{np.median([row['seconds'] for row in there]):.0f}" if there else ""
-        for window in WINDOWS if there else ():
+        present = [row for row in own if row is not None]
+        seconds = f"{np.median([row['seconds'] for row in present]):.0f}" if present else ""
+        for window in WINDOWS if present else ():
             for statistic, of in (("mean", np.mean), ("median", np.median)):
-                values = [of(_values(there, window, metric)) for metric in METRICS]
+                values = [of(_values(present, window, metric)) for metric in METRICS]
                 shown = [f"{value:.3g}" for value in values]
                 table.append((method, "ours", window, statistic, *shown, seconds))
     return table

@@ -26,7 +26,7 @@ from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import train
 from reproduction.figures import estimates_figure, loss_figure, readable_gain_figure
 from reproduction.tables import Case
-from trainers.pinn_obs import Config, PinnObsTrainer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 
 SETUP = "paper"
 SEED = 0
@@ -43,7 +43,7 @@ class Job:
     case: Case
     preset: str
     """Name of the recipe that the config is made of."""
-    config: Config
+    config: PinnObsConfig
     out: Path
     """Folder under which all goes."""
 
@@ -87,8 +87,8 @@ class Job:
         return bool(smaller)
 
 
-def _digest(case: Case, config: Config) -> str:
-    kind = f"{Config.__module__}.{Config.__qualname__}"
+def _digest(case: Case, config: PinnObsConfig) -> str:
+    kind = f"{PinnObsConfig.__module__}.{PinnObsConfig.__qualname__}"
     decides = {"system": case.system, "played": (SETUP, SEED), kind: config}
     text = json.dumps(canonical(decides), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

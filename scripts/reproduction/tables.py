@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from trainers.pinn_obs import Config, PinnObsTrainer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Case:
     system: str = "ReverseDuffing"
 
 
-def recipe(preset: str, case: Case, seed: int, budget: float | None) -> Config:
+def recipe(preset: str, case: Case, seed: int, budget: float | None) -> PinnObsConfig:
     """The settings of a case in a preset.
 
     Raises:

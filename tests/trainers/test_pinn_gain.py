@@ -24,11 +24,11 @@ from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from pinnobs_gym.training.loop import train as run
 from pinnobs_gym.training.trainer import TRAINING_SEED
-from trainers.pinn_gain import Config, PinnGainTrainer
-from trainers.pinn_gain.rollout import Model, Moment, predict, update
+from trainers.pinn_gain import PinnGainConfig, PinnGainTrainer
+from trainers.pinn_gain.rollout import FilterState, Model, predict, update
 from trainers.pinn_gain.smooth import smooth
 
-SMALL = Config(
+SMALL = PinnGainConfig(
     episodes=10, held_out=3, width=6, iterations=6, streams=6, chunk=10, check_every=2, log_every=2
 )
 
@@ -105,7 +105,7 @@ def test_online_and_training_compute_the_same(name, variant):
     count = memory_size(variant, system.ny, 8)
     memory = torch.full((count, 4), 1.0 if variant == "kalman" else 0.0, dtype=torch.float64)
     prior = record.prior
-    moment = Moment(
+    moment = FilterState(
         torch.tensor(prior.mean.T), torch.tensor(prior.cov.transpose(1, 2, 0).copy()), memory
     )
     for k in range(record.num_samples):
@@ -160,7 +160,7 @@ def test_the_gradient_is_that_of_the_linearised_rollout():
     layers = [tuple(map(torch.tensor, layer)) for layer in gain_of(system).trained.layers]
 
     def loss(weights):
-        moment = Moment(
+        moment = FilterState(
             torch.zeros(2, count, dtype=torch.float64),
             torch.eye(2, dtype=torch.float64)[..., None].expand(2, 2, count),
             torch.ones(2, count, dtype=torch.float64),

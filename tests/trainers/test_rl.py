@@ -28,7 +28,7 @@ from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from pinnobs_gym.training.by_name import train_by_name, trainer_of
 from pinnobs_gym.training.log import Log
-from trainers.rl import Config, RLTrainer
+from trainers.rl import RLConfig, RLTrainer
 from trainers.rl.agent import options
 
 DUFFING = Game.of("ReverseDuffing")
@@ -42,19 +42,19 @@ KINDS = [
 ]
 
 
-def small(algorithm: str = "ppo", mode: str = "gain", **changes: Any) -> Config:
+def small(algorithm: str = "ppo", mode: str = "gain", **changes: Any) -> RLConfig:
     buffer = {"buffer": 1000} if algorithm in ("sac", "td3") else {}
     preset = f"{algorithm}_normalized" if mode == "normalized" else algorithm
     given = {**SMALL, **buffer, "action_mode": mode, **changes}
     return RLTrainer.configured({"preset": preset, **given})
 
 
-def begun(system: str, config: Config) -> Any:
+def begun(system: str, config: RLConfig) -> Any:
     """A training that has not made a step."""
     return trainer_of("rl", config, Game.of(system))
 
 
-def train_rl(config: Config, game: Game, **options: Any) -> Any:
+def train_rl(config: RLConfig, game: Game, **options: Any) -> Any:
     """The agent that comes of a training."""
     return train_by_name("rl", config, game, **options)
 
@@ -133,7 +133,7 @@ def test_the_estimator_is_the_agent_in_its_env() -> None:
 
 def test_the_best_gain_of_a_schedule_is_learned() -> None:
     """In 8,192 steps the agent comes from the model alone (NRMSE about one) to a small tail."""
-    config = Config(steps=8192, rows=32, batch=256, check_every=4096, held_out=8)
+    config = RLConfig(steps=8192, rows=32, batch=256, check_every=4096, held_out=8)
     learned = train_rl(config, DUFFING)
     rows = evaluate(
         Sb3(ReverseDuffing(), learned.setup["noise_std"], trained=learned),
@@ -287,7 +287,7 @@ def test_bad_checkpoints(tmp_path: Path) -> None:
 )
 def test_bad_settings(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        Config(**arguments)
+        RLConfig(**arguments)
 
 
 # Scripts and hyperparameter files

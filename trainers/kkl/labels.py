@@ -199,7 +199,7 @@ def initial_states(
 
 
 @dataclass(frozen=True, eq=False)
-class Episodes:
+class SampledEpisodes:
     """Simulated episodes at some of their samples."""
 
     t: np.ndarray
@@ -231,7 +231,7 @@ def simulated(
     kept: np.ndarray,
     start: Start = "zero",
     xhat0: np.ndarray | None = None,
-) -> Episodes:
+) -> SampledEpisodes:
     """Simulate episodes from x0 (batch, nx) on the sample times t (num_samples,) in s; of the
     samples ``kept`` (kept,) are returned. z begins as ``start`` says, x̂₀ (1, nx) being the prior's.
 
@@ -269,7 +269,7 @@ def simulated(
         if T is not None and T0 is not None:
             T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
     flow = dynamics.flows(t)[kept]
-    return Episodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, drawn - len(x0), drawn)
+    return SampledEpisodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, drawn - len(x0), drawn)
 
 
 _AT_ONCE = 256

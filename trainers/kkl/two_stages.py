@@ -28,7 +28,7 @@ _SHARE = 0.02
 
 
 @dataclass(eq=False)
-class Best:
+class BestWeights:
     """The weights of the least validation error."""
 
     error: float
@@ -50,16 +50,16 @@ class TwoStageFit:
     def __init__(
         self, samples: Samples, config: KKLConfig, encoding: Callable[[Samples], Objective]
     ) -> None:
-        self._begun, self._earlier = time.process_time(), 0.0
+        self._started_at, self._earlier = time.process_time(), 0.0
         self.samples, self.config, self._encoding = samples, config, encoding
         self.latest = np.nan
-        self.best: dict[str, Best] = {}
+        self.best: dict[str, BestWeights] = {}
         self._begin("T")
 
     @property
     def seconds(self) -> float:
         """CPU seconds so far."""
-        return self._earlier + time.process_time() - self._begun
+        return self._earlier + time.process_time() - self._started_at
 
     @property
     def iterations(self) -> int:
@@ -209,7 +209,9 @@ class TwoStageFit:
             self.latest = self._held_error()
         best = self.best.get(self.stage)
         if best is None or self.latest < best.error:
-            self.best[self.stage] = Best(self.latest, self.fit.iteration, self.fit.net.layers())
+            self.best[self.stage] = BestWeights(
+                self.latest, self.fit.iteration, self.fit.net.layers()
+            )
 
     def _held_error(self) -> float:
         net = self.fit.net
@@ -240,7 +242,7 @@ class TwoStageFit:
             "seconds": self.seconds,
             "stage_start": self._stage_start,
             "best": {
-                stage: {f.name: getattr(best, f.name) for f in fields(Best)}
+                stage: {f.name: getattr(best, f.name) for f in fields(BestWeights)}
                 for stage, best in self.best.items()
             },
             "usual": self._mse.cpu().numpy() if self.stage == "T*" else None,
@@ -249,7 +251,7 @@ class TwoStageFit:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from what `state` gave."""
-        self.best = {stage: Best(**found) for stage, found in state["best"].items()}
+        self.best = {stage: BestWeights(**found) for stage, found in state["best"].items()}
         kept = dict(self.best)
         if state["stage"] != "T":
             self._begin("T*")

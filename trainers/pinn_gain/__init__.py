@@ -26,7 +26,7 @@ from pinnobs_gym.estimators.pinn_gain import TrainedGain
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, output_scale, vector
 from pinnobs_gym.training.trainer import Trainer
-from trainers.pinn_gain.config import Config
+from trainers.pinn_gain.config import PinnGainConfig
 from trainers.pinn_gain.held_out import HeldOut
 from trainers.pinn_gain.rollout import Model
 from trainers.pinn_gain.smooth import smooth
@@ -51,7 +51,7 @@ _RESOLUTION = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Best:
+class BestGain:
     """The weights of the least held-out loss so far."""
 
     loss: float
@@ -63,7 +63,7 @@ class Best:
     layers: Layers
 
 
-class PinnGainTrainer(Trainer[Config, TrainedGain]):
+class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
     """Trains a gain on the records of a batch of ``config.episodes`` episodes.
 
     It begins as the EKF, and the weights of the least error on the records held out are kept, the
@@ -72,7 +72,7 @@ class PinnGainTrainer(Trainer[Config, TrainedGain]):
     """
 
     name = "pinn_gain"
-    presets = {"default": Config}
+    presets = {"default": PinnGainConfig}
 
     def start(self) -> None:
         config, system, record = self.config, self.system, self.record
@@ -95,7 +95,7 @@ class PinnGainTrainer(Trainer[Config, TrainedGain]):
         self.data = Data.of(system, record, smoothed, learned)
         facts = self.facts(loss=1.0, seed=config.seed)
         self.held_out = HeldOut(self.model, Data.of(system, record, smoothed, held), facts)
-        self.best: Best | None = None
+        self.best: BestGain | None = None
         self.stuck = False
         self.loss, self.gradient, self.latest = math.nan, math.nan, math.nan
         self._begin(attempt=0)
@@ -177,7 +177,7 @@ class PinnGainTrainer(Trainer[Config, TrainedGain]):
         layers = layers_of(self.average)
         loss = self.held_out.loss(layers)
         if self.best is None or loss < self.best.loss:
-            self.best = Best(loss, self.iteration, self.seed, layers)
+            self.best = BestGain(loss, self.iteration, self.seed, layers)
         self.latest = loss
 
     def _restart(self) -> None:
@@ -233,7 +233,7 @@ class PinnGainTrainer(Trainer[Config, TrainedGain]):
         assert self.best is not None
         return {
             "counts": {name: getattr(self, name) for name in _COUNTS},
-            "best": {f.name: getattr(self.best, f.name) for f in fields(Best)},
+            "best": {f.name: getattr(self.best, f.name) for f in fields(BestGain)},
             "streams": self.streams.state(),
             "parameters": [p.detach().numpy() for p in self.parameters],
             "average": [p.numpy() for p in self.average],
@@ -242,7 +242,7 @@ class PinnGainTrainer(Trainer[Config, TrainedGain]):
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self._begin(state["counts"]["attempt"])
-        self.best = Best(**state["best"])
+        self.best = BestGain(**state["best"])
         for name in _COUNTS:
             setattr(self, name, state["counts"][name])
         with torch.no_grad():
@@ -263,7 +263,7 @@ def layers_of(parameters: list[Tensor]) -> Layers:
     return tuple(zip(arrays[::2], arrays[1::2], strict=True))
 
 
-def _check(system: System, record: Record, config: Config) -> None:
+def _check(system: System, record: Record, config: PinnGainConfig) -> None:
     """Check that a record can be trained on."""
     name = type(system).__name__
     sizes = (("y", record.y, system.ny), ("u", record.u, system.nu))

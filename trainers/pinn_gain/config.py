@@ -11,7 +11,7 @@ from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_se
 
 
 @dataclass(frozen=True)
-class Config(TrainingConfig):
+class PinnGainConfig(TrainingConfig):
     """The recipe of a gain shared by all episodes."""
 
     may_change = ("iterations",)

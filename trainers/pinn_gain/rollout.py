@@ -38,7 +38,7 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Moment:
+class FilterState:
     """The estimates of all streams after a sample, the batch last."""
 
     xhat: Tensor
@@ -50,8 +50,11 @@ class Moment:
 
 
 def predict(
-    model: Model, moment: Moment, t: tuple[np.ndarray, np.ndarray], u: tuple[np.ndarray, np.ndarray]
-) -> Moment:
+    model: Model,
+    moment: FilterState,
+    t: tuple[np.ndarray, np.ndarray],
+    u: tuple[np.ndarray, np.ndarray],
+) -> FilterState:
     """The prediction over one sample, from times t[0] to t[1], (batch,) in s, at inputs u[0] and
     u[1], (batch, nu).
 
@@ -64,17 +67,17 @@ def predict(
     flow = torch.from_numpy(np.ascontiguousarray(F.transpose(1, 2, 0)))
     moved = (flow * (moment.xhat - at)[None]).sum(1)
     xhat = torch.from_numpy(np.ascontiguousarray(after.T)) + moved
-    return Moment(xhat, sandwich(flow, moment.P) + model.Q, moment.memory)
+    return FilterState(xhat, sandwich(flow, moment.P) + model.Q, moment.memory)
 
 
 def update(
     model: Model,
     weights: Weights,
-    moment: Moment,
+    moment: FilterState,
     now: tuple[np.ndarray, np.ndarray],
     y: Tensor,
     R: Tensor,
-) -> Moment:
+) -> FilterState:
     """The estimates after outputs y (ny, batch), with noise of covariance R (ny, ny, batch), at
     times ``now[0]`` (batch,) in s and inputs ``now[1]`` (batch, nu); no output is missing."""
     xhat, P = moment.xhat, moment.P
@@ -88,7 +91,7 @@ def update(
         std = torch.diagonal(R).T.sqrt()
         sizes = model.scale, model.output_scale
         K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, moment.memory)
-        return Moment(xhat + (K * innovation[None]).sum(1), P, memory)
+        return FilterState(xhat + (K * innovation[None]).sum(1), P, memory)
     K, S = kalman_gain(P, H, R)
     variance = torch.diagonal(S).T
     share = 1 - torch.diagonal(R).T / variance
@@ -97,4 +100,4 @@ def update(
     present = torch.ones_like(innovation, dtype=torch.bool)
     memory = remembered(moment.memory, innovation, variance, present)
     x_after, P = update_with(K, xhat.T, P, innovation.T, H, R)
-    return Moment(x_after.T, P, memory)
+    return FilterState(x_after.T, P, memory)

@@ -11,7 +11,7 @@ import torch
 
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
-from trainers.pinn_gain.rollout import Model, Moment, Weights, predict, update
+from trainers.pinn_gain.rollout import FilterState, Model, Weights, predict, update
 from trainers.pinn_gain.smooth import Smoothed
 
 NOMINAL = 0.5
@@ -100,10 +100,10 @@ class Streams:
             self.record[i], self.position[i] = record, position
             self.P[..., i], self.memory[:, i], self.new[i] = data.cov[record], self._first, True
 
-    def roll(self, weights: Weights) -> tuple[list[Moment], torch.Tensor]:
+    def roll(self, weights: Weights) -> tuple[list[FilterState], torch.Tensor]:
         """All streams over one chunk: the estimates after each sample, and the scaled errors
         (chunk, nx, batch)."""
-        moment = Moment(*(torch.from_numpy(a) for a in (self.xhat, self.P, self.memory)))
+        moment = FilterState(*(torch.from_numpy(a) for a in (self.xhat, self.P, self.memory)))
         noise = self.rng.standard_normal((self.chunk, len(self.std), len(self.record)))
         noise *= self.std[:, None] * self.factor
         R = torch.from_numpy(np.diag(self.std**2)[..., None] * self.factor**2)
@@ -119,7 +119,7 @@ class Streams:
             errors.append((moment.xhat - x) / self.model.scale)
         return moments, torch.stack(errors)
 
-    def _advance(self, moment: Moment, now: np.ndarray, first: bool) -> Moment:
+    def _advance(self, moment: FilterState, now: np.ndarray, first: bool) -> FilterState:
         """The prediction to samples now (batch,); a new stream is at its own already."""
         before = np.maximum(now - 1, 0)  # what comes of a new stream's step is dropped
         after = before + 1
@@ -130,9 +130,9 @@ class Streams:
             return predicted
         new = torch.from_numpy(self.new.copy())
         xhat = torch.where(new, moment.xhat, predicted.xhat)
-        return Moment(xhat, torch.where(new, moment.P, predicted.P), moment.memory)
+        return FilterState(xhat, torch.where(new, moment.P, predicted.P), moment.memory)
 
-    def continue_from(self, last: Moment) -> None:
+    def continue_from(self, last: FilterState) -> None:
         """Go on from the estimates at the end of a chunk; some streams, those that are at an end
         and those that are lost begin anew."""
         self.xhat, self.P = last.xhat.detach().numpy().copy(), last.P.detach().numpy().copy()

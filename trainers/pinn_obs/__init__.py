@@ -21,9 +21,9 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import deferred_interrupt, train
 from pinnobs_gym.training.trainer import Trainer
-from trainers.pinn_obs.config import Config, fast, paper, transfer
+from trainers.pinn_obs.config import PinnObsConfig, fast, paper, transfer
 from trainers.pinn_obs.fast_recipe import FastRecipe
-from trainers.pinn_obs.minimum import Best, Mark, Method
+from trainers.pinn_obs.minimum import BestIterate, Mark, Minimiser
 from trainers.pinn_obs.paper_recipe import PaperRecipe
 from trainers.pinn_obs.passes import unflattened
 from trainers.pinn_obs.pictures import figures
@@ -40,7 +40,7 @@ _RESTARTS = 3
 _TERMS = ("initial", "equation", "output")
 
 
-class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
+class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
     """Trains PINN-Obs on the record of one episode.
 
     The weights of the least training loss are kept. If the loss leaves the finite numbers, training
@@ -55,18 +55,18 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
         _check(self.system, self.record, self.config)
         recipe = _RECIPES[self.config.optimiser]
         self.recipe = recipe(self.system, self.config, self.record, self.noise_std)
-        self._kept: Best | None = None  # of attempts that ended in a loss that is not finite
+        self._kept: BestIterate | None = None  # of attempts that ended in a loss that is not finite
         self._begin(attempt=0)
 
     def _begin(self, attempt: int) -> None:
         """Draw the weights of an attempt."""
         self.attempt = attempt
-        self.best: Best | None = None
+        self.best: BestIterate | None = None
         self.mark = Mark(math.inf, self.iteration)
         self.stuck = False
         seed = self.config.seed + attempt
         self._first = self.recipe.draw(torch.Generator().manual_seed(seed))
-        self._method: Method | None = None
+        self._method: Minimiser | None = None
 
     @property
     def theta(self) -> np.ndarray:
@@ -92,7 +92,7 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
         elif self.best is None or loss < self.best.loss:
             if loss < (1 - self.config.improvement) * self.mark.loss:
                 self.mark = Mark(loss, self.iteration)
-            self.best = Best(loss, self.iteration, self.config.seed + self.attempt, theta)
+            self.best = BestIterate(loss, self.iteration, self.config.seed + self.attempt, theta)
 
     def _restart(self) -> None:
         """Begin again from the next seed; what was best so far is kept. After the third time there
@@ -162,9 +162,9 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
         self._begin(state["attempt"])
         self.mark, self.stuck = Mark(**state["mark"]), state["stuck"]
         if state["kept"] is not None:
-            self._kept = Best(**state["kept"])
+            self._kept = BestIterate(**state["kept"])
         if state["best"] is not None:
-            self.best = Best(**state["best"])
+            self.best = BestIterate(**state["best"])
             best = self.best.theta, self.best.loss
             self._method = self.recipe.load_method(state["method"], best)
 
@@ -198,7 +198,7 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
     def train_rows(
         cls,
         system: System,
-        config: Config,
+        config: PinnObsConfig,
         *,
         record: Record,
         noise_std: Sequence[float] | float | None = None,
@@ -207,10 +207,10 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
         """Train on each row of a record, of one episode each, with one seed.
 
         With a GPU and no folder the fast recipe trains on all rows at once, each until its own
-        patience, iterations or budget end it (of the CPU seconds of all); see `Config.device`.
-        Otherwise it is one row after another, exactly as by `train`: on a CPU that is the fastest.
-        After Ctrl-C rows keep the best weights that they have, be it those of their first
-        iteration.
+        patience, iterations or budget end it (of the CPU seconds of all); see
+        `PinnObsConfig.device`. Otherwise it is one row after another, exactly as by `train`: on a
+        CPU that is the fastest. After Ctrl-C rows keep the best weights that they have, be it those
+        of their first iteration.
 
         Args:
             system: the model.
@@ -245,14 +245,14 @@ class PinnObsTrainer(Trainer[Config, TrainedNetwork]):
         return found
 
 
-def _device(config: Config) -> str:
+def _device(config: PinnObsConfig) -> str:
     present = torch.cuda.is_available()
     if config.device == "cuda" and not present:
         raise ValueError("device='cuda'; torch finds no GPU here")
     return "cuda" if present and config.device != "cpu" else "cpu"
 
 
-def _check(system: System, record: Record, config: Config) -> None:
+def _check(system: System, record: Record, config: PinnObsConfig) -> None:
     """Check that a record can be trained on."""
     name = type(system).__name__
     if (np.diff(record.t.astype(config.dtype)) <= 0).any():

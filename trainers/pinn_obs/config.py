@@ -14,7 +14,7 @@ Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
-class Config(TrainingConfig):
+class PinnObsConfig(TrainingConfig):
     """The recipe of PINN-Obs: the fast one, unless its settings are changed; see `paper`."""
 
     may_change = ("iterations", "device")
@@ -91,19 +91,19 @@ class Config(TrainingConfig):
                 check_setting(self, name, "0 with adam", lambda v: v == 0)
 
 
-def fast() -> Config:
+def fast() -> PinnObsConfig:
     """A small network in scaled quantities, guided by a smoother; self-scaled Broyden."""
-    return Config()
+    return PinnObsConfig()
 
 
-def transfer() -> Config:
+def transfer() -> PinnObsConfig:
     """The fast recipe with a gain that is meant for other records, too, and so the aim."""
-    return Config(transfer=True, gain_penalty=0.3)
+    return PinnObsConfig(transfer=True, gain_penalty=0.3)
 
 
-def paper() -> Config:
+def paper() -> PinnObsConfig:
     """The paper's recipe ("Ablation studies"): Adam on part of the samples."""
-    return Config(
+    return PinnObsConfig(
         depth=9,
         optimiser="adam",
         iterations=200_000,

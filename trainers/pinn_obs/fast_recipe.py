@@ -15,9 +15,9 @@ from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
 from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
-from trainers.pinn_obs.config import Config
+from trainers.pinn_obs.config import PinnObsConfig
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
-from trainers.pinn_obs.minimum import FIRST_STEP, Method
+from trainers.pinn_obs.minimum import FIRST_STEP, Minimiser
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.passes import draw_layers, flattened, unflattened
 from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
@@ -51,12 +51,12 @@ class FastRecipe(Recipe):
     lines, as in the replay. Outputs of noise σ weigh less by (0.01/σ)², σ over their scale, if that
     is less than one, so that the equations decide and the fit does not chase it.
 
-    With `Config.guide` the estimates and gains are drawn towards those of `guide_of`, without it
-    the gains towards zero.
+    With `PinnObsConfig.guide` the estimates and gains are drawn towards those of
+    `guide_of`, without it the gains towards zero.
     """
 
     def __init__(
-        self, system: System, config: Config, record: Record, noise_std: np.ndarray
+        self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
     ) -> None:
         self.config, self.system, self.record, self.noise_std = config, system, record, noise_std
         t = record.t
@@ -104,9 +104,9 @@ class FastRecipe(Recipe):
         needed = math.ceil(max(frequencies, default=0.0) * length / (2 * math.pi) * _PER_PERIOD)
         if samples < min(needed, self.record.num_samples):
             points = math.ceil(needed * self.config.points / most)
-            told = f"points={self.config.points} do not resolve the outputs over {length:g} s"
+            problem = f"points={self.config.points} do not resolve the outputs over {length:g} s"
             swings = f"they swing {needed / _PER_PERIOD:.0f} times"
-            message = f"{told}: {swings}; take points={points} or a shorter record"
+            message = f"{problem}: {swings}; take points={points} or a shorter record"
             warnings.warn(message, stacklevel=2)
 
     def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
@@ -147,7 +147,7 @@ class FastRecipe(Recipe):
         away = evaluate(self.architecture, layers, t)[0] - self.guide.smoothed
         return Covariance(t, self.guide.P + away[:, :, None] * away[:, None, :])
 
-    def method_state(self, method: Method) -> dict[str, Any]:
+    def method_state(self, method: Minimiser) -> dict[str, Any]:
         assert isinstance(method, QuasiNewton)
         parts: dict[str, Any] = {"gradient": method.gradient, "direction": method.direction}
         if method.H is not None:

@@ -77,28 +77,28 @@ def guide_of(
         transfer: go with the filter whatever the first innovation tells, so that the gain is
             Riccati's alone.
     """
-    told = np.maximum(noise, QUIET * y_scale)
+    known_noise = np.maximum(noise, QUIET * y_scale)
     with np.errstate(all="ignore"):
-        path = smooth(system, samples, told, _CAUTION)
-        along = forward(system, samples, told, about=path.xhat, caution=_CAUTION)
+        path = smooth(system, samples, known_noise, _CAUTION)
+        along = forward(system, samples, known_noise, about=path.xhat, caution=_CAUTION)
     if not all(np.isfinite(part).all() for part in (path.xhat, path.P, along.K)):
         return None
     smoothed, P = path.xhat[:, 0], path.P[..., 0]
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
-    first = abs(points.y[0] - system.h(t[0], points.xhat0, points.u[0])) * points.there[0]
+    first = abs(points.y[0] - system.h(t[0], points.xhat0, points.u[0])) * points.present[0]
     if transfer or not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
         L = on_lines(t, samples.t, observer_gain(samples.t, along))
         return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
     if noise.any():
         prior = Prior(samples.prior.mean, P[0] + _LEFT_OVER**2 * samples.prior.cov)
         begun = replace(samples, prior=prior)
-        along = forward(system, begun, told, about=path.xhat, caution=_CAUTION)
+        along = forward(system, begun, known_noise, about=path.xhat, caution=_CAUTION)
     L = on_lines(t, samples.t, observer_gain(samples.t, along))
     left = np.exp((t[0] - t) / tau)[:, None]
     goal = on_lines(t, samples.t, smoothed)
     xhat = left * points.xhat0 + (1 - left) * goal
     rate = (1 - left) * np.gradient(goal, t, axis=0) + left / tau * (goal - points.xhat0)
-    innovation = (points.y - system.h(t, xhat, points.u)) * points.there / y_scale
+    innovation = (points.y - system.h(t, xhat, points.u)) * points.present / y_scale
     residual = rate - system.f(t, xhat, points.u)
     residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
     floor = max(_CLEAR, float((noise / y_scale).max()))

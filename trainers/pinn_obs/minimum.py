@@ -15,7 +15,7 @@ of the quasi-Newton step; from there nearly every first trial will do, from 1.0 
 
 
 @dataclass(frozen=True, eq=False)
-class Best:
+class BestIterate:
     """The weights of the least loss so far."""
 
     loss: float
@@ -36,7 +36,7 @@ class Mark:
     iteration: int
 
 
-class Method(Protocol):
+class Minimiser(Protocol):
     """A minimisation in progress."""
 
     x: np.ndarray

@@ -24,7 +24,7 @@ class Points:
     """Inputs there, shape (num_points, nu)."""
     y: np.ndarray
     """Outputs there, shape (num_points, ny); zero where they are missing."""
-    there: np.ndarray
+    present: np.ndarray
     """1.0 where an output is there, 0.0 where it is missing, shape (num_points, ny)."""
     equation: np.ndarray
     """Quadrature weights of the equation's residuals, shape (num_points,); their sum is 1."""
@@ -159,7 +159,7 @@ class Objective:
         """Innovations (..., num_points, ny), zero where missing, and residuals
         (..., num_points, nx)."""
         points = self.points
-        innovation = (points.y - self.system.h(points.t, xhat, points.u)) * points.there
+        innovation = (points.y - self.system.h(points.t, xhat, points.u)) * points.present
         correction = (L * innovation[..., None, :]).sum(-1)
         return innovation, rate - self.system.f(points.t, xhat, points.u) - correction
 
@@ -174,7 +174,7 @@ class Objective:
         loss = (by_initial * initial).sum(-1) + (by_rate * residual).sum((-2, -1))
         loss += (by_innovation * innovation).sum((-2, -1))
         by_innovation -= _through(by_rate, L)
-        by_innovation *= points.there
+        by_innovation *= points.present
         by_L = by_rate[..., None] * -innovation[..., None, :]
         at = points.t, xhat, points.u
         A, H = system.f_jacobian(*at), system.h_jacobian(*at)

@@ -12,8 +12,8 @@ from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.adam import Adam
-from trainers.pinn_obs.config import Config
-from trainers.pinn_obs.minimum import Method
+from trainers.pinn_obs.config import PinnObsConfig
+from trainers.pinn_obs.minimum import Minimiser
 from trainers.pinn_obs.objective import Objective, Weights
 from trainers.pinn_obs.passes import draw_layers, flattened
 from trainers.pinn_obs.points import samples_of
@@ -24,7 +24,7 @@ class PaperRecipe(Recipe):
     """Adam on all training samples at once, the terms' weights those of the config."""
 
     def __init__(
-        self, system: System, config: Config, record: Record, noise_std: np.ndarray
+        self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
     ) -> None:
         self.config, self.system, self.record = config, system, record
         sizes = (system.nx, system.ny, config.depth, config.width)
@@ -58,7 +58,7 @@ class PaperRecipe(Recipe):
     def covariance(self, theta: np.ndarray) -> None:
         return None
 
-    def method_state(self, method: Method) -> dict[str, Any]:
+    def method_state(self, method: Minimiser) -> dict[str, Any]:
         assert isinstance(method, Adam)
         names = ("x", "f", "gradient", "mean", "square", "steps")
         return {name: getattr(method, name) for name in names}

@@ -34,16 +34,16 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
     layer = t[0] + (t[1] - t[0]) * np.geomspace(*_LAYER)
     times = np.unique(np.concatenate([t[chosen], layer]))
     y = on_lines(times, t, record.y[0])
-    there = ~np.isnan(y)
+    present = ~np.isnan(y)
     halves = np.diff(times) / (t[-1] - t[0]) / 2
     weights = np.append(halves, 0.0) + np.append(0.0, halves)
-    output = weights[:, None] * there
+    output = weights[:, None] * present
     u = on_lines(times, t, record.u[0]) if system.measured_input else system.input(times)
     points = Points(
         times,
         np.asarray(u),
-        np.where(there, y, 0.0),
-        there.astype(float),
+        np.where(present, y, 0.0),
+        present.astype(float),
         weights,
         output / np.maximum(output.sum(0), 1e-9),
         record.prior.mean[0],
@@ -62,13 +62,13 @@ def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:
     t, y = record.t[indices], record.y[0, indices]
     u = record.u[0, indices] if system.measured_input else np.asarray(system.input(t))
     among = np.isin(indices, chosen)
-    there = ~np.isnan(y)
-    output = (there & among[:, None]).astype(float)
+    present = ~np.isnan(y)
+    output = (present & among[:, None]).astype(float)
     return Points(
         t,
         u,
-        np.where(there, y, 0.0),
-        there.astype(float),
+        np.where(present, y, 0.0),
+        present.astype(float),
         among / len(chosen),
         output * (system.ny / max(output.sum(), 1.0)),
         record.prior.mean[0],
@@ -106,9 +106,9 @@ def fast_frequencies(record: Record) -> tuple[float, ...]:
     even = np.linspace(t[0], t[-1], len(t))
     power = np.zeros(len(t) // 2 + 1)
     for y in record.y[0].T:
-        there = ~np.isnan(y)
-        if there.any() and np.ptp(y[there]) > 0:
-            wave = np.interp(even, t[there], (y[there] - y[there].mean()) / y[there].std())
+        present = ~np.isnan(y)
+        if present.any() and np.ptp(y[present]) > 0:
+            wave = np.interp(even, t[present], (y[present] - y[present].mean()) / y[present].std())
             power += abs(np.fft.rfft(wave * np.hanning(len(t)))) ** 2
     peak = int(np.argmax(power))
     if not _PERIODS < peak < len(power) - 1:

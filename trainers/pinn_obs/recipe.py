@@ -13,8 +13,8 @@ from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimators.pinn_obs import Covariance
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
-from trainers.pinn_obs.config import Config
-from trainers.pinn_obs.minimum import Method
+from trainers.pinn_obs.config import PinnObsConfig
+from trainers.pinn_obs.minimum import Minimiser
 from trainers.pinn_obs.objective import Objective
 
 
@@ -35,7 +35,7 @@ class Recipe(ABC):
 
     @abstractmethod
     def __init__(
-        self, system: System, config: Config, record: Record, noise_std: np.ndarray
+        self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
     ) -> None: ...
 
     @abstractmethod
@@ -43,7 +43,7 @@ class Recipe(ABC):
         """Random weights (n,)."""
 
     @abstractmethod
-    def begin(self, theta: np.ndarray) -> Method:
+    def begin(self, theta: np.ndarray) -> Minimiser:
         """The minimisation from weights theta (n,)."""
 
     @abstractmethod
@@ -56,10 +56,10 @@ class Recipe(ABC):
         known."""
 
     @abstractmethod
-    def method_state(self, method: Method) -> dict[str, Any]:
+    def method_state(self, method: Minimiser) -> dict[str, Any]:
         """All that `load_method` needs to go on exactly: arrays and plain values."""
 
     @abstractmethod
-    def load_method(self, state: Mapping[str, Any], best: tuple[np.ndarray, float]) -> Method:
+    def load_method(self, state: Mapping[str, Any], best: tuple[np.ndarray, float]) -> Minimiser:
         """The minimisation that goes on from what `method_state` gave; ``best`` are the best
         weights (n,) and their loss."""

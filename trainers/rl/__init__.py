@@ -25,7 +25,7 @@ from pinnobs_gym.scoring.metrics import score
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.training.trainer import Trainer
 from trainers.rl.agent import first_seed, learning_rate, make_agent, make_env, policy_layers
-from trainers.rl.config import PRESETS, Config
+from trainers.rl.config import PRESETS, RLConfig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +37,7 @@ RESUMED = 10**9
 _STATISTICS = ("mean", "var", "count")
 
 
-class RLTrainer(Trainer[Config, TrainedAgent]):
+class RLTrainer(Trainer[RLConfig, TrainedAgent]):
     """Trains an agent on episodes that it plays itself.
 
     The agent of the least error on episodes held out is kept. The measure is the geometric mean of

@@ -18,7 +18,7 @@ from torch import nn
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.sb3_env import Sb3VecEnv
 from pinnobs_gym.estimators.sb3 import Layer
-from trainers.rl.config import Config
+from trainers.rl.config import RLConfig
 
 SEEDS_APART = 1000
 """From the first seed of an agent's episodes to that of the agent trained with the next seed."""
@@ -26,7 +26,7 @@ LAST_RATE = 0.02
 """The learning rate in the end, over that at first."""
 
 
-def make_agent(config: Config, env: VecNormalize) -> BaseAlgorithm:
+def make_agent(config: RLConfig, env: VecNormalize) -> BaseAlgorithm:
     """SB3's agent that knows nothing, and plays an env.
 
     Raises:
@@ -38,7 +38,7 @@ def make_agent(config: Config, env: VecNormalize) -> BaseAlgorithm:
     return _algorithm(config)(policy, env, seed=config.seed, device="cpu", **chosen)
 
 
-def make_env(config: Config, game: Game, episode: int) -> VecNormalize:
+def make_env(config: RLConfig, game: Game, episode: int) -> VecNormalize:
     """The rows that are played, of seeds from ``episode`` on, with normalised features."""
     learns_gain = config.action_mode != "normalized"
     rows = game.vector_env(
@@ -52,17 +52,17 @@ def make_env(config: Config, game: Game, episode: int) -> VecNormalize:
     return VecNormalize(VecMonitor(env), norm_reward=not learns_gain, gamma=config.gamma)
 
 
-def first_seed(config: Config, episode: int) -> int:
+def first_seed(config: RLConfig, episode: int) -> int:
     """Seed of the first episode that an agent plays."""
     return episode + SEEDS_APART * config.seed
 
 
-def learning_rate(config: Config, done: float) -> float:
+def learning_rate(config: RLConfig, done: float) -> float:
     """Step of Adam when a part from 0 to 1 of the training is done."""
     return config.learning_rate * (1 - done * (1 - LAST_RATE))
 
 
-def _algorithm(config: Config) -> Any:
+def _algorithm(config: RLConfig) -> Any:
     """SB3's class."""
     if config.algorithm != "recurrent_ppo":
         return getattr(stable_baselines3, config.algorithm.upper())
@@ -74,7 +74,7 @@ def _algorithm(config: Config) -> Any:
         ) from None
 
 
-def options(config: Config, actions: int) -> dict[str, Any]:
+def options(config: RLConfig, actions: int) -> dict[str, Any]:
     """A config in SB3's words, for actions of so many numbers."""
     c: Any = config
     policy: dict[str, Any] = {"net_arch": [c.width, c.width], "activation_fn": nn.Tanh}

@@ -15,7 +15,7 @@ _ON_POLICY = ("ppo", "recurrent_ppo")
 
 
 @dataclass(frozen=True)
-class Config(TrainingConfig):
+class RLConfig(TrainingConfig):
     """How an agent is trained: by PPO that chooses gains, unless its settings are changed. Those of
     PPO with gains were tuned, on episodes that are not scored; the other presets begin there."""
 
@@ -87,14 +87,14 @@ class Config(TrainingConfig):
             )
 
 
-def ppo() -> Config:
+def ppo() -> RLConfig:
     """Proximal policy optimisation (Schulman et al. 2017) with gains as actions."""
-    return Config()
+    return RLConfig()
 
 
-def sac() -> Config:
+def sac() -> RLConfig:
     """Soft actor-critic (Haarnoja et al. 2018) with gains as actions."""
-    return Config(
+    return RLConfig(
         algorithm="sac",
         rows=32,
         rollout=4,
@@ -105,33 +105,33 @@ def sac() -> Config:
     )
 
 
-def td3() -> Config:
+def td3() -> RLConfig:
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018) with gains as
     actions."""
     return replace(sac(), algorithm="td3")
 
 
-def recurrent_ppo() -> Config:
+def recurrent_ppo() -> RLConfig:
     """PPO with a long short-term memory, with gains as actions; needs the extra ``rl``."""
-    return Config(algorithm="recurrent_ppo")
+    return RLConfig(algorithm="recurrent_ppo")
 
 
-def ppo_normalized() -> Config:
+def ppo_normalized() -> RLConfig:
     """PPO that gives estimates themselves, and sees the last outputs."""
     return replace(ppo(), action_mode="normalized", stack=8, width=64)
 
 
-def sac_normalized() -> Config:
+def sac_normalized() -> RLConfig:
     """Soft actor-critic that gives estimates themselves, and sees the last outputs."""
     return replace(sac(), action_mode="normalized", stack=8, width=64)
 
 
-def td3_normalized() -> Config:
+def td3_normalized() -> RLConfig:
     """TD3 that gives estimates themselves, and sees the last outputs."""
     return replace(td3(), action_mode="normalized", stack=8, width=64)
 
 
-def recurrent_ppo_normalized() -> Config:
+def recurrent_ppo_normalized() -> RLConfig:
     """PPO with a long short-term memory that gives estimates themselves."""
     return replace(recurrent_ppo(), action_mode="normalized", width=64)
 

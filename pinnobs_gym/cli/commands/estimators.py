@@ -27,7 +27,7 @@ class Estimators:
         if self.name is not None:
             console.print(inspect.getdoc(ESTIMATORS.resolve(self.name)), markup=False)
             return 0
-        table = Table("name", "track", "is told", "what it is")
+        table = Table("name", "track", "knows", "what it is")
         for name, cls in ESTIMATORS.classes().items():
             first = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
             table.add_row(name, cls.track, ", ".join(cls.knows), first)

@@ -99,8 +99,8 @@ class Leaderboard:
             if self.scheduler is None:
                 raise ValueError("backend 'dask' without a scheduler; expected --scheduler ADDRESS")
             if self.jobs is not None:
-                told = "the scheduler's workers say how many run at a time"
-                raise ValueError(f"jobs={self.jobs} with backend 'dask': {told}")
+                message = "the scheduler's workers say how many run at a time"
+                raise ValueError(f"jobs={self.jobs} with backend 'dask': {message}")
             return Workers(scheduler=self.scheduler)
         if self.scheduler is not None:
             raise ValueError(f"scheduler={self.scheduler!r} goes with --backend dask")

@@ -128,6 +128,6 @@ def _report_training(
             f"last 25 % {row['nrmse_tail']:.4g}",
             highlight=False,
         )
-    if estimator.track == "online" and (told := acceptance.warning(loss, found[0].scores)):
-        console.print(f"warning: {told}", style="yellow")
+    if estimator.track == "online" and (message := acceptance.warning(loss, found[0].scores)):
+        console.print(f"warning: {message}", style="yellow")
     return found[0].played

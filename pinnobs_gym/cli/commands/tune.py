@@ -55,13 +55,13 @@ class Tune:
         with progress() as bar:
             task = bar.add_task("trials", total=self.trials, completed=min(done, self.trials))
 
-            def told(tried: Tried | None) -> None:
+            def report(tried: Tried | None) -> None:
                 best = search.best()
                 shown = "" if best is None else f"trials, best {best.error:.4g}"
                 bar.update(task, advance=1, description=shown)
 
             try:
-                search.run(self.trials, told)
+                search.run(self.trials, report)
             except KeyboardInterrupt:
                 stopped = True
         self._report(default, search.best())

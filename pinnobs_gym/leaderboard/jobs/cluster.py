@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkersLost
-from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome, attempt
+from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -83,7 +83,7 @@ class DaskPool(Pool):
         workers: Any = client.nthreads()
         self.size = len(workers)  # a worker's threads take turns
 
-    def submit(self, number: int, job: Job, origin: Origin) -> Future:
+    def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future:
         try:
             future = self._client.submit(attempt, number, job, origin, pure=False)
         except Exception as error:

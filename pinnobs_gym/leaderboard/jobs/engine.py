@@ -24,7 +24,7 @@ from uuid import uuid4
 
 from pinnobs_gym.files import holding, is_held
 from pinnobs_gym.leaderboard.jobs.pool import Pool, ThisProcess, WorkerLost
-from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome
+from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob
 from pinnobs_gym.scoring.rows import CannotWrite
 
 LISTEN = 0.5
@@ -64,16 +64,16 @@ class Engine:
 
     def __init__(self, workers: Workers) -> None:
         self._workers = workers
-        self._under_way: dict[int, Job] = {}
+        self._under_way: dict[int, PicklableJob] = {}
         self.processes = workers.processes
         """How many jobs are run at a time."""
 
     @property
-    def running(self) -> list[Job]:
+    def running(self) -> list[PicklableJob]:
         """The jobs that run now: of those handed out, those that have waited longest."""
         return list(self._under_way.values())[: self.processes]
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[PicklableJob]) -> Iterator[Ended]:
         """Run jobs in this order, and yield each as it ends.
 
         Raises:
@@ -90,9 +90,9 @@ class Engine:
             finally:
                 self._under_way.clear()
 
-    def _run(self, jobs: dict[int, Job], pool: Pool, origin: Origin) -> Iterator[Ended]:
+    def _run(self, jobs: dict[int, PicklableJob], pool: Pool, origin: Origin) -> Iterator[Ended]:
         """Run all jobs, and those whose process died once more, each alone."""
-        suspects: dict[int, Job] = {}
+        suspects: dict[int, PicklableJob] = {}
         for number, future in self._futures(jobs.items(), pool, origin):
             try:
                 outcome = pool.outcome(future)
@@ -109,7 +109,7 @@ class Engine:
             yield _ended(suspects[number], outcome)
 
     def _futures(
-        self, jobs: Iterable[tuple[int, Job]], pool: Pool, origin: Origin
+        self, jobs: Iterable[tuple[int, PicklableJob]], pool: Pool, origin: Origin
     ) -> Iterator[tuple[int, Any]]:
         """Hand out jobs, as many as the pool queues, and yield the number and the future of each
         as it is done. They are under way until then."""
@@ -141,7 +141,7 @@ def _next(done: SimpleQueue[tuple[int, Any]]) -> tuple[int, Any]:
             continue
 
 
-def _ended(job: Job, outcome: Outcome) -> Ended:
+def _ended(job: PicklableJob, outcome: Outcome) -> Ended:
     """What became of a job.
 
     Raises:

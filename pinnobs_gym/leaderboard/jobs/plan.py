@@ -43,8 +43,8 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
     called = [entry.label or ESTIMATORS.name_of(cls) for entry, cls in chosen]
     for name in called:
         if called.count(name) > 1:
-            told = f"{name!r} stands for two; give each a label of its own"
-            raise suite.wrong("estimators", told)
+            message = f"{name!r} stands for two; give each a label of its own"
+            raise suite.wrong("estimators", message)
     quick, long = [], []
     for system in suite.systems or tuple(SYSTEMS.classes()):
         for table, (entry, cls) in product(_tables(suite, system), chosen):
@@ -58,7 +58,7 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
 
 
 @dataclass(frozen=True)
-class Table:
+class PlannedGame:
     """A game, and who plays it."""
 
     game: Game
@@ -98,9 +98,9 @@ def _learning(
 def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[Job], list[Job]]:
     """The jobs to run, each told what of it is stored already, and those that are left out since
     they failed before; with ``retry_failed`` they are run again."""
-    there: dict[tuple[GameName, str], list[tuple[str, int | None, int]]] = defaultdict(list)
+    known_rows: dict[tuple[GameName, str], list[tuple[str, int | None, int]]] = defaultdict(list)
     for row in stored.rows:
-        there[game_of(row), row["estimator"]].append(
+        known_rows[game_of(row), row["estimator"]].append(
             (row["config_hash"], row["training_seed"], row["episode_seed"])
         )
     failed = {row["job"] for row in stored.failures}
@@ -114,7 +114,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
         cls = ESTIMATORS.resolve(job.estimator)
         if job.label is not None or cls.label is Estimator.label:
             name = job.label or ESTIMATORS.name_of(cls)
-            found = there[job.game.name, name]
+            found = known_rows[job.game.name, name]
             seeds = range(job.seed, job.seed + job.episodes)
             known = frozenset(entry for entry in found if entry[2] in seeds)
         to_run.append(replace(job, known=known, failed=again))
@@ -131,7 +131,7 @@ def _class(suite: Suite, entry: Entry) -> type[Estimator]:
     return cls
 
 
-def _tables(suite: Suite, system: str) -> list[Table]:
+def _tables(suite: Suite, system: str) -> list[PlannedGame]:
     """What of a system is played."""
     try:
         cls = SYSTEMS.resolve(system)
@@ -142,20 +142,20 @@ def _tables(suite: Suite, system: str) -> list[Table]:
     except ValueError as error:
         raise suite.wrong("setup", error) from error
     if "all" in suite.conditions and len(suite.conditions) > 1:
-        told = f"conditions {' '.join(suite.conditions)}: 'all' stands alone"
-        raise suite.wrong("conditions", told)
+        message = f"conditions {' '.join(suite.conditions)}: 'all' stands alone"
+        raise suite.wrong("conditions", message)
     ranked = list(dict.fromkeys(["nominal", cls.ranked_condition]))
     if suite.conditions == ("all",):
         names = dict.fromkeys([*ranked, *fitting(model, setup)])
     else:
         names, ranked = suite.conditions or ranked, list(suite.conditions or ranked)
-    tables: dict[GameName, Table] = {}
+    tables: dict[GameName, PlannedGame] = {}
     for name in names:
         try:
             game = Game.of(cls, suite.setup, name)
         except ValueError as error:
             raise suite.wrong("conditions", f"{name!r} on {system}: {error}") from error
-        tables[game.name] = Table(game, name not in ranked)
+        tables[game.name] = PlannedGame(game, name not in ranked)
     return list(tables.values())
 
 

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome, attempt
+from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt
 
 
 class WorkerLost(Exception):
@@ -30,7 +30,7 @@ class Pool(ABC):
     """Whether its processes are children of this one."""
 
     @abstractmethod
-    def submit(self, number: int, job: Job, origin: Origin) -> Any:
+    def submit(self, number: int, job: PicklableJob, origin: Origin) -> Any:
         """Queue an `attempt` at a job; returns its future, with an ``add_done_callback``.
 
         Raises:
@@ -65,7 +65,7 @@ class ThisProcess(Pool):
     queued = 1
     children = False
 
-    def submit(self, number: int, job: Job, origin: Origin) -> Future[Outcome]:
+    def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future[Outcome]:
         future: Future[Outcome] = Future()
         future.set_result(attempt(number, job, origin))
         return future

@@ -16,7 +16,7 @@ from types import TracebackType
 from loky import BrokenProcessPool, ProcessPoolExecutor, get_reusable_executor
 
 from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkerLost
-from pinnobs_gym.leaderboard.jobs.worker import Job, Origin, Outcome, attempt, interrupts
+from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt, interrupts
 
 IDLE = 300
 """Seconds after which workers end that have nothing to do; the next run uses them until then."""
@@ -49,7 +49,7 @@ class ProcessPool(Pool):
         self.queued = 2 * size  # so that no worker waits for its next job
         self._executor = self._usable()
 
-    def submit(self, number: int, job: Job, origin: Origin) -> Future[Outcome]:
+    def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future[Outcome]:
         with interrupts(signal.SIG_IGN, unless=signal.SIG_IGN):  # which new workers inherit
             while True:
                 self._executor = self._usable()

@@ -24,7 +24,7 @@ SEEN_AFTER = 5.0
 """Seconds that a file takes at most to be seen on other machines of a shared folder."""
 
 
-class Job(Protocol):
+class PicklableJob(Protocol):
     """What the engine runs: anything that can be pickled and does all of its work by itself."""
 
     @property
@@ -82,7 +82,7 @@ _ONE_AT_A_TIME = threading.Lock()
 """Jobs of one process run after each other: numerical libraries share state between threads."""
 
 
-def attempt(number: int, job: Job, origin: Origin) -> Outcome:
+def attempt(number: int, job: PicklableJob, origin: Origin) -> Outcome:
     """Run a job in a worker, unless that was done and the worker died before it could say so."""
     with _ONE_AT_A_TIME:
         try:
@@ -96,7 +96,7 @@ def attempt(number: int, job: Job, origin: Origin) -> Outcome:
     return outcome
 
 
-def _run(job: Job) -> str | None:
+def _run(job: PicklableJob) -> str | None:
     """Run a job; what went wrong, in one line, is written down."""
     try:
         with interrupts(_stop, only=signal.default_int_handler):

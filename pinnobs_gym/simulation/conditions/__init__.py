@@ -29,9 +29,10 @@ class Combined(Condition):
     parts: tuple[Condition, ...]
 
     @property
-    def told(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def known_to_estimators(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What is told of the parts."""
-        return ", ".join(dict.fromkeys(part.told for part in self.parts if part.told != "nothing"))
+        known = dict.fromkeys(part.known_to_estimators for part in self.parts)
+        return ", ".join(what for what in known if what != "nothing")
 
     @property
     def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -39,7 +39,7 @@ class Condition:
     many episodes there are, so that an episode does not depend on those simulated with it.
     """
 
-    told: ClassVar[str] = "nothing"
+    known_to_estimators: ClassVar[str] = "nothing"
     """What estimators are told of it."""
     reference: ClassVar[bool] = True
     """Whether the Cramér-Rao reference of the model, the prior and the noise that estimators are

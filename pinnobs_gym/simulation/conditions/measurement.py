@@ -16,7 +16,7 @@ class Noise(Condition):
     """Output noise of another strength, times that of `noise_scale`."""
 
     factor: float
-    told = "its strength"
+    known_to_estimators = "its strength"
 
     @property
     def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -37,7 +37,7 @@ class SampleTime(Condition):
     """Another time between samples, in episodes as long as before."""
 
     factor: float
-    told = "the sample times"
+    known_to_estimators = "the sample times"
 
     @property
     def summary(self) -> str:
@@ -97,7 +97,7 @@ class Dropouts(Condition):
     """Samples missing at random, each with the same probability."""
 
     probability: float
-    told = "which are missing"
+    known_to_estimators = "which are missing"
 
     @property
     def summary(self) -> str:
@@ -116,7 +116,7 @@ class Gap(Condition):
 
     seconds: float = 1.0
     largest_part: float = 0.2
-    told = "which are missing"
+    known_to_estimators = "which are missing"
 
     @property
     def summary(self) -> str:

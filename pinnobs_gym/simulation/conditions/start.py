@@ -17,7 +17,7 @@ class FarGuess(Condition):
     deviation of the prior away from the middle of the initial set. P₀ stays."""
 
     reference = False
-    told = "x̂₀"
+    known_to_estimators = "x̂₀"
 
     @property
     def summary(self) -> str:

@@ -22,12 +22,12 @@ from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsRepla
 from pinnobs_gym.scoring import acceptance
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.systems import SYSTEMS
-from trainers.pinn_obs import Config, PinnObsTrainer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.passes import flattened
 from trainers.pinn_obs.points import fast_frequencies, points_of
 
-SMALL = Config(depth=2, width=8, iterations=60, log_every=10)
+SMALL = PinnObsConfig(depth=2, width=8, iterations=60, log_every=10)
 
 
 def by_autograd(network, system, points, weights, lead):
@@ -116,7 +116,9 @@ def test_a_fast_oscillation_is_found():
 def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
     game = Game.of("ReverseDuffing", "paper")
     system, record = game.source.system, game.record([0])
-    estimator = PinnObs(system, config=Config(seed=seed), noise_std=game.source.setup.noise_std)
+    estimator = PinnObs(
+        system, config=PinnObsConfig(seed=seed), noise_std=game.source.setup.noise_std
+    )
     (trained,) = estimator.fit(record)
     played = play(game, PinnObsDirect(system, trained=trained), [0])
     error = played.estimates.xhat - played.truth
@@ -129,7 +131,7 @@ def test_noise_is_not_fitted():
     game = Game.of("Academic")
     system, setup, record = game.source.system, game.source.setup, game.record([3])
     trained = train_pinn_obs(
-        system, Config(iterations=500), record=record, noise_std=setup.noise_std
+        system, PinnObsConfig(iterations=500), record=record, noise_std=setup.noise_std
     )
     output = system.h(record.t, trained.xhat(record.t), record.u[0]) - record.y[0]
     later = record.t > 5
@@ -201,7 +203,7 @@ def test_a_loss_that_is_not_finite_begins_again():
 def test_presets_are_whole_recipes_of_which_settings_are_changed():
     paper = PinnObsTrainer.configured({"preset": "paper", "width": 7})
     assert (paper.width, paper.depth, paper.optimiser, paper.guide) == (7, 9, "adam", 0.0)
-    assert PinnObsTrainer.configured({}) == Config()
+    assert PinnObsTrainer.configured({}) == PinnObsConfig()
     assert PinnObsTrainer.configured({"preset": "transfer"}).transfer
     for change, message in (
         ({"preset": "best"}, "preset='best'; expected one of fast, transfer, paper"),

@@ -19,7 +19,7 @@ from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from trainers.pinn_obs import Config, fast, transfer
+from trainers.pinn_obs import PinnObsConfig, fast, transfer
 from trainers.pinn_obs.guide import observer_gain
 from trainers.pinn_obs.smoother import DRIFT, forward, smooth
 
@@ -158,7 +158,7 @@ def test_from_any_seed_direct_estimates_and_replay_find_the_states(name):
     system, setup = source.system, source.setup
     tail, scale = slice(3 * len(x) // 4, None), np.asarray(system.scale)
     for seed in (0, 1):
-        config = Config(iterations=500, seed=seed)
+        config = PinnObsConfig(iterations=500, seed=seed)
         trained = train_pinn_obs(system, config, record=record, noise_std=setup.noise_std)
         replayed = PinnObsReplay(system, trained=trained).run(record).xhat[0]
         for xhat in (trained.xhat(record.t), replayed):
@@ -176,7 +176,7 @@ def test_a_record_too_long_for_the_points_is_told():
     y = np.cos(4.0 * t)[None, :, None]  # 127 periods: 1019 samples are needed
     prior = Prior.of(system, system.setups["benchmark"], 1)
     record = Record(t, y, np.zeros((1, len(t), 0)), prior)
-    config = Config(iterations=1, points=300)
+    config = PinnObsConfig(iterations=1, points=300)
     with pytest.warns(UserWarning, match=r"points=300 .* 200 s: they swing 127 times; .*=10\d\d"):
         train_pinn_obs(system, config, record=record)
 

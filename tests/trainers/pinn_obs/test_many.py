@@ -12,7 +12,7 @@ from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.loop import Interrupt
-from trainers.pinn_obs import Config, PinnObsTrainer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 from trainers.pinn_obs.objective import Objective
 from trainers.pinn_obs.stacked import Minimisations, advance
 
@@ -20,7 +20,7 @@ from trainers.pinn_obs.stacked import Minimisations, advance
 pytestmark = pytest.mark.filterwarnings("ignore:points=40 do not resolve")
 
 train_rows = PinnObsTrainer.train_rows
-SMALL = Config(depth=2, width=8, iterations=25, points=40)
+SMALL = PinnObsConfig(depth=2, width=8, iterations=25, points=40)
 
 
 def records(name="ReverseDuffing", batch=3):
@@ -144,5 +144,5 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch):
     with pytest.raises(ValueError, match="device='cuda'; torch finds no GPU here"):
         train_rows(system, replace(SMALL, device="cuda"), record=record, noise_std=noise)
     with pytest.raises(ValueError, match="device='tpu'; expected auto, cpu or cuda"):
-        Config(device="tpu")
+        PinnObsConfig(device="tpu")
     assert train_rows(system, SMALL, record=record, noise_std=noise)[0].iterations == 25

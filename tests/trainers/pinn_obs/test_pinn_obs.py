@@ -28,7 +28,7 @@ from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
-from trainers.pinn_obs import Config, paper
+from trainers.pinn_obs import PinnObsConfig, paper
 from trainers.pinn_obs.adam import Adam
 from trainers.pinn_obs.objective import Objective, Weights
 from trainers.pinn_obs.passes import Passes, draw_layers, flattened, inputs_of, unflattened
@@ -552,7 +552,7 @@ def test_a_record_that_cannot_be_trained_on_is_refused(record, message):
 def test_a_config_out_of_range_names_the_value(change):
     ((name, value),) = change.items()
     with pytest.raises(ValueError, match=f"{name}={value!r}; expected "):
-        Config(**change)
+        PinnObsConfig(**change)
 
 
 # TrainedNetwork on every record it is given
