@@ -67,20 +67,20 @@ def covariances(state: State) -> np.ndarray:
 
 
 def predicted(
-    system: System, state: State, t: float, u: np.ndarray, Q: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The prediction x̂(k|k−1), (batch, nx), at time t (s) and its covariance P⁻, (nx, nx, batch).
-
-    Before the first sample both are the prior's.
+    system: System, state: State, P: np.ndarray, Q: np.ndarray, t: float, u: np.ndarray
+) -> State:
+    """The prediction x̂(k|k−1) at time t (s), and its covariance ΦPΦᵀ + Q, of a state after a
+    sample; see `RecursiveEstimator.predict`.
 
     Args:
         system: the model.
         state: after the sample before.
-        t: time of this sample in s.
-        u: inputs at this sample, shape (batch, nu).
+        P: the covariances that are predicted, shape (nx, nx, batch).
         Q: covariance of the process noise of a sample, shape (nx, nx, batch or 1).
+        t: time of the next sample in s.
+        u: inputs at the next sample, shape (batch, nu).
     """
-    xhat, P = state.xhat, covariances(state)
-    if state.t is not None:
-        xhat, P, _ = predict(system, (state.t, t), xhat, P, Q, (state.u, u))
-    return xhat, P
+    assert state.t is not None  # before the first sample nothing is predicted
+    xhat, P, _ = predict(system, (state.t, t), state.xhat, P, Q, (state.u, u))
+    covariance = P.transpose(2, 0, 1)
+    return State(xhat, state.t, state.u, covariance, state.innovation, None, state.memory)

@@ -10,6 +10,7 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import factor, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
@@ -30,7 +31,7 @@ class SigmaPointMemory:
 
 
 @dataclass(frozen=True)
-class SigmaPointFilter(GaussianEstimator):
+class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     """A Kalman filter whose moments come from points sent through the model.
 
     The points are drawn anew after the prediction, so that they know of Q. With the weighted
@@ -62,21 +63,28 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         memory = SigmaPointMemory(*self.tuning(batch), self.points(), np.zeros(batch))
         return State(prior.mean, P=prior.cov, memory=memory)
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.t is not None
         memory: SigmaPointMemory = state.memory
-        xhat, P = state.xhat, covariances(state)
+        unit, mean_weights, cov_weights = memory.points
+        L, memory = _factor(covariances(state), memory)
+        points = unit @ L  # (nx, num_points, batch)
+        points += state.xhat.T[:, None]
+        # Each point through the model, then the moments of where they end.
+        points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
+        points = np.ascontiguousarray(points.transpose(2, 0, 1))
+        mean = mean_weights @ points  # (nx, batch)
+        X = (points - mean[:, None]) * np.sqrt(cov_weights)[:, None]
+        P = (outer(X, X) + memory.Q).transpose(2, 0, 1)
+        return State(mean.T, state.t, state.u, P, state.innovation, None, memory)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: SigmaPointMemory = state.memory
         unit, mean_weights, cov_weights = memory.points
         weights = np.sqrt(cov_weights)[:, None]
-        L, jitter = factor(P, memory.jitter)
-        if state.t is not None:
-            points = unit @ L  # (nx, num_points, batch)
-            points += xhat.T[:, None]
-            points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
-            points = np.ascontiguousarray(points.transpose(2, 0, 1))
-            mean = mean_weights @ points  # (nx, batch)
-            X = (points - mean[:, None]) * weights
-            xhat, P = mean.T, outer(X, X) + memory.Q
-            L, jitter = factor(P, jitter)
+        xhat = state.xhat
+        L, memory = _factor(covariances(state), memory)
+        # New points about the prediction, which know of Q, through h.
         X = unit @ L  # (nx, num_points, batch)
         points = X + xhat.T[:, None]
         outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
@@ -92,7 +100,11 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         P = outer(X, X)
         P += sandwich(K, memory.R)
         xhat = (xhat.T + product(K, innovation.T[:, None])[:, 0]).T
-        if jitter is not memory.jitter:
-            memory = replace(memory, jitter=jitter)
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)
+
+
+def _factor(P: np.ndarray, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:
+    """The Cholesky factors of P (nx, nx, batch), and the memory with what had to be added to it."""
+    L, jitter = factor(P, memory.jitter)
+    return L, memory if jitter is memory.jitter else replace(memory, jitter=jitter)

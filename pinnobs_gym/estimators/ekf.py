@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
 from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import sandwich, squared_size
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
@@ -31,7 +32,7 @@ class EKFMemory:
 
 
 @dataclass(frozen=True)
-class EKF(GaussianEstimator):
+class EKF(RecursiveEstimator, GaussianEstimator):
     """The continuous-discrete extended Kalman filter (Jazwinski 1970, section 8.3).
 
     Between samples the state and the variational flow Φ' = A(x̂)Φ by the classical Runge-Kutta
@@ -87,16 +88,18 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         memory = EKFMemory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
         return State(prior.mean, P=P0, memory=memory)
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        return predicted(self.system, state, covariances(state), state.memory.Q, t, u)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: EKFMemory = state.memory
-        xhat, P = predicted(self.system, state, t, u, memory.Q)
-        R = memory.R
-        innovation, H = observe(self.system, t, xhat, y, u)
+        P, R = covariances(state), memory.R
+        innovation, H = observe(self.system, t, state.xhat, y, u)
         if self.gate is not None:
             P, memory = self._gated(P, innovation, H, memory)
         if self.huber is not None:
             R = self._reweighted(P, innovation, H, R)
-        xhat, P, S = joseph_update(xhat, P, innovation, H, R)
+        xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
         covariance, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, covariance, innovation, S, memory)
 

@@ -10,6 +10,7 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import outer
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
@@ -25,12 +26,15 @@ class EnsembleMemory:
     """Standard deviations of the process noise, shape (nx,)."""
     R_std: np.ndarray
     """Standard deviations of the output noise, shape (ny,)."""
+    noise: np.ndarray
+    """Standard normal numbers for the noise of states and outputs at this sample, shape
+    (num_members, 1, nx + ny)."""
     sample: int = 0
     """How many samples there were."""
 
 
 @dataclass(frozen=True)
-class EnKF(GaussianEstimator):
+class EnKF(RecursiveEstimator, GaussianEstimator):
     """The ensemble Kalman filter with perturbed outputs (Evensen 1994; Burgers, van Leeuwen &
     Evensen 1998), its ensemble inflated about its mean at every sample (Anderson & Anderson 1999).
 
@@ -74,18 +78,25 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + np.einsum("ijb,mj->mbi", L, self._draws(0, self.system.nx))
         stds = self.process_noise * np.asarray(self.system.scale), np.sqrt(self.output_variance)
-        return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members, *stds))
+        memory = EnsembleMemory(members, *stds, self._noise(0))
+        return State(prior.mean, P=prior.cov, memory=memory)
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.t is not None
         memory: EnsembleMemory = state.memory
-        members, nx = memory.members, self.system.nx
-        draws = self._draws(memory.sample + 1, nx + self.system.ny)[:, None]
-        if state.t is not None:
-            members = model_step(self.system, state.t, t, members, state.u, u)
-            mean = members.mean(axis=0)
-            members = mean + self.inflation * (members - mean) + memory.Q_std * draws[..., :nx]
+        members = model_step(self.system, state.t, t, memory.members, state.u, u)
+        mean = members.mean(axis=0)
+        noise = self._noise(memory.sample)
+        moved = memory.Q_std * noise[..., : self.system.nx]
+        members = mean + self.inflation * (members - mean) + moved
+        return replace(state, memory=replace(memory, members=members, noise=noise))
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        memory: EnsembleMemory = state.memory
+        members = memory.members
         mean, outputs = members.mean(axis=0), np.asarray(self.system.h(t, members, u))
-        yhat, noise = outputs.mean(axis=0), memory.R_std * draws[..., nx:]
+        yhat = outputs.mean(axis=0)
+        noise = memory.R_std * memory.noise[..., self.system.nx :]
         weight = 1 / np.sqrt(self.members - 1)
         X = weight * (members - mean).transpose(2, 0, 1)
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
@@ -99,6 +110,11 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
         memory = replace(memory, members=members, sample=memory.sample + 1)
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
+
+    def _noise(self, sample: int) -> np.ndarray:
+        """Standard normal numbers (members, 1, nx + ny) for the noise of state and outputs after
+        so many samples."""
+        return self._draws(sample + 1, self.system.nx + self.system.ny)[:, None]
 
     def _draws(self, sample: int, size: int) -> np.ndarray:
         """Standard normal numbers (members, size) of a sample, of mean zero and unit variance."""

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
-from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
+from pinnobs_gym.estimation.kalman import joseph_update, observe
 from pinnobs_gym.estimation.observer_gains import default_rate
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class HighGain(GaussianEstimator):
+class HighGain(RecursiveEstimator, GaussianEstimator):
     """The high-gain observer with exponential forgetting (Bornard, Couenne & Celle 1989; Deza et
     al. 1992): x̂' = f(t, x̂, u) + S⁻¹HᵀR⁻¹(y − h(t, x̂, u)), Ṡ = −θS − AᵀS − SA + HᵀR⁻¹H.
 
@@ -54,15 +55,18 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
         largest = self._size(prior.cov.transpose(1, 2, 0)) + self.system.nx
         return State(prior.mean, P=prior.cov, memory=(*self.tuning(len(prior.mean)), largest))
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, P, (Q, R, largest) = state.xhat, covariances(state), state.memory
-        if state.t is not None:
-            theta = default_rate(self.system) if self.theta is None else self.theta
-            grown = P * np.exp(theta * (t - state.t))
-            P = np.where(self._size(grown) < largest, grown, P)
-            xhat, P, _ = predict(self.system, (state.t, t), xhat, P, Q, (state.u, u))
-        innovation, H = observe(self.system, t, xhat, y, u)
-        xhat, P, S = joseph_update(xhat, P, innovation, H, R)
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        P, (Q, _, largest) = covariances(state), state.memory
+        assert state.t is not None
+        theta = default_rate(self.system) if self.theta is None else self.theta
+        grown = P * np.exp(theta * (t - state.t))
+        P = np.where(self._size(grown) < largest, grown, P)
+        return predicted(self.system, state, P, Q, t, u)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        P, (_, R, _) = covariances(state), state.memory
+        innovation, H = observe(self.system, t, state.xhat, y, u)
+        xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
         P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, state.memory)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.observer_gains import (
     default_rate,
     injection,
@@ -15,12 +15,13 @@ from pinnobs_gym.estimation.observer_gains import (
     placed_gain,
     settling_gain,
 )
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class Luenberger(Estimator):
+class Luenberger(RecursiveEstimator):
     """The Luenberger observer x̂' = f(t, x̂, u) + L(y − h(t, x̂, u)) with a constant gain
     (Luenberger 1964).
 
@@ -85,10 +86,14 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
     def reset(self, prior: Prior) -> State:
         return State(prior.mean.astype(float), memory=self.designed())
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, L, dt = state.xhat, state.memory, 0.0
-        if state.t is not None:
-            xhat, dt = model_step(self.system, state.t, t, xhat, state.u, u), t - state.t
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.t is not None
+        xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
+        return State(xhat, state.t, state.u, memory=state.memory)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        xhat, L = state.xhat, state.memory
+        dt = 0.0 if state.t is None else t - state.t
         missing = np.isnan(y)
         innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
         H = np.asarray(self.system.h_jacobian(t, xhat, u))

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.estimation.estimator import State
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class OpenLoop(Estimator):
+class OpenLoop(RecursiveEstimator):
     """The model integrated from x̂₀ without looking at the output."""
 
     name = "open_loop"
@@ -24,8 +25,9 @@ class OpenLoop(Estimator):
     def reset(self, prior: Prior) -> State:
         return State(np.asarray(prior.mean, dtype=float))
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat = state.xhat
-        if state.t is not None:
-            xhat = model_step(self.system, state.t, t, xhat, state.u, u)
-        return State(xhat, t=t, u=u)
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.t is not None
+        return State(model_step(self.system, state.t, t, state.xhat, state.u, u))
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        return State(state.xhat, t=t, u=u)

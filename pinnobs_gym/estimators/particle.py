@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import factor
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
@@ -36,7 +37,7 @@ class ParticleMemory:
 
 
 @dataclass(frozen=True)
-class ParticleFilter(Estimator):
+class ParticleFilter(RecursiveEstimator):
     """A particle filter for plants without process noise (Liu & West 2001).
 
     Particles move with the model and are weighted by the likelihood of the outputs. Where their
@@ -89,11 +90,15 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         log_weights = np.full(particles.shape[:2], -np.log(self.particles))
         return State(prior.mean, P=prior.cov, memory=ParticleMemory(particles, log_weights))
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.t is not None
+        memory: ParticleMemory = state.memory
+        x = model_step(self.system, state.t, t, memory.particles, state.u, u)
+        return replace(state, memory=replace(memory, particles=x))
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: ParticleMemory = state.memory
         x, log_weights = memory.particles, memory.log_weights
-        if state.t is not None:
-            x = model_step(self.system, state.t, t, x, state.u, u)
         missing = np.isnan(y)
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
         yhat, S = _moments(np.exp(log_weights), outputs)

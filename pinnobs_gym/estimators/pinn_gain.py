@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
 from pinnobs_gym.estimation.kalman import kalman_gain, observe, update_with
 from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
@@ -21,6 +21,7 @@ from pinnobs_gym.estimation.learned.gain_network import (
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, output_scale, vector
@@ -47,7 +48,7 @@ class TrainedGain(Trained):
 
 
 @dataclass(frozen=True)
-class PinnGain(LearnedEstimator, GaussianEstimator):
+class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
     """A Kalman filter whose gain a small network corrects, one network for all episodes; it is
     trained beforehand on outputs and the model's equations and never sees a true state.
 
@@ -93,12 +94,20 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         R = np.eye(self.system.ny)[..., None] * variance
         return State(prior.mean, P=prior.cov, memory=((scale, Q, R), np.ones((size, batch))))
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        if self.trained.variant == "gru":
+            assert state.t is not None
+            xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
+            return replace(state, xhat=xhat)
+        (_, Q, _), _ = state.memory
+        return predicted(self.system, state, covariances(state), Q, t, u)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         if self.trained.variant == "gru":
             return self._recurrent(state, t, y, u)
         fixed, memory = state.memory
-        scale, Q, R = fixed
-        xhat, P = predicted(self.system, state, t, u, Q)
+        scale, _, R = fixed
+        xhat, P = state.xhat, covariances(state)
         innovation, H = observe(self.system, t, xhat, y, u)
         K, S = kalman_gain(P, H, R)
         e, variance = np.ascontiguousarray(innovation.T), np.einsum("iib->ib", S)
@@ -112,11 +121,10 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         return State(xhat, t, u, P, innovation, S, (fixed, memory))
 
     def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """`correct` by the recurrent network's gain, without a covariance."""
         fixed, memory = state.memory
         scale, size, std = fixed
         xhat = state.xhat
-        if state.t is not None:
-            xhat = model_step(self.system, state.t, t, xhat, state.u, u)
         innovation = np.where(np.isnan(y), 0.0, y - self.system.h(t, xhat, u))
         x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
         known_noise = np.broadcast_to(std, e.shape)

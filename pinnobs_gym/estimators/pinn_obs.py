@@ -165,7 +165,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
                 innovation = np.where(missing, 0.0, y0 + (t[k] - start) * slope - outputs)
                 return self.system.f(t[k], x, u[k]) + innovation @ L[k].T
 
-            x, _ = runge_kutta(rate, x, step)
+            x = runge_kutta(rate, x, step)
         return x
 
     def _fastest(

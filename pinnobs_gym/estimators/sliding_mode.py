@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.observer_gains import default_rate, injection, settling_gain
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class SlidingMode(Estimator):
+class SlidingMode(RecursiveEstimator):
     """The sliding-mode observer with a boundary layer (Slotine, Hedrick & Misawa 1987):
     x̂' = f(t, x̂, u) + L(e + ρ·sat(e/ε)), e = y − h(t, x̂, u).
 
@@ -59,10 +60,14 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         layer = self.layer * np.sqrt(self.output_variance)
         return State(prior.mean.astype(float), memory=(L, layer))
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, (L, layer), dt = state.xhat, state.memory, 0.0
-        if state.t is not None:
-            xhat, dt = model_step(self.system, state.t, t, xhat, state.u, u), t - state.t
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.t is not None
+        xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
+        return State(xhat, state.t, state.u, memory=state.memory)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        xhat, (L, layer) = state.xhat, state.memory
+        dt = 0.0 if state.t is None else t - state.t
         missing = np.isnan(y)
         innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
         secant = 1 + self.switching / np.maximum(abs(innovation) / layer, 1.0)

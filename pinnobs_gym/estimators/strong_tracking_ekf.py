@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, predicted
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
 from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import sandwich
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class StrongTrackingEKF(GaussianEstimator):
+class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
     """The extended Kalman filter whose process noise grows with the innovation (Boutayeb & Aubry
     1999), so that it stays awake however long the record.
 
@@ -60,15 +61,17 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
         memory = (*self.tuning(len(prior.mean)), self.output_variance, growth)
         return State(prior.mean, P=prior.cov, memory=memory)
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        Q, R, variance, growth = state.memory
-        if state.t is not None:
-            assert state.innovation is not None
-            Q = Q + growth * (state.innovation**2 / variance).mean(axis=-1)
-        xhat, P = predicted(self.system, state, t, u, Q)
-        innovation, H = observe(self.system, t, xhat, y, u)
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        Q, _, variance, growth = state.memory
+        assert state.innovation is not None
+        Q = Q + growth * (state.innovation**2 / variance).mean(axis=-1)
+        return predicted(self.system, state, covariances(state), Q, t, u)
+
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        P, (_, R, _, _) = covariances(state), state.memory
+        innovation, H = observe(self.system, t, state.xhat, y, u)
         if self.output_factor:
             R = R + self.output_factor * sandwich(H, P)
-        xhat, P, S = joseph_update(xhat, P, innovation, H, R)
+        xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
         P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, state.memory)

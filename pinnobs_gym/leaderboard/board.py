@@ -15,10 +15,10 @@ from pinnobs_gym.scoring.rows import Stored
 
 @dataclass(frozen=True)
 class Board:
-    """What the leaderboard's command prints and writes."""
+    """The tables that the leaderboard command prints and writes."""
 
     tables: tuple[Table, ...]
-    """One per game, what failed in their notes."""
+    """One table per game, with failed jobs in its note."""
     lines: tuple[Line, ...]
     """The overview across systems."""
     ranks: Mapping[str, Mapping[str, int]]
@@ -26,7 +26,7 @@ class Board:
 
 
 def board(stored: Stored) -> Board:
-    """All tables of stored scores."""
+    """Compute all tables from stored scores."""
     runs = runs_of(stored.rows)
     found = contenders(runs)
     return Board(
@@ -37,6 +37,6 @@ def board(stored: Stored) -> Board:
 
 
 def markdown(board: Board) -> str:
-    """The overview, the ranks and every game's table, in Markdown."""
+    """Return the overview, the ranks and the table of every game in Markdown."""
     across = ranks_table.markdown(board.lines, board.ranks)
     return across + "\n" + standings_table.markdown(board.tables)

@@ -1,4 +1,4 @@
-"""Estimators across games, as the overview tells them apart, and compared with the `PEER`."""
+"""Estimators as compared in the overview: across games, and with the `PEER`."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from pinnobs_gym.leaderboard.standings import Standing, standing
 from pinnobs_gym.scoring.rows import Row
 
 PEER = "ekf"
-"""The estimator that all are compared with."""
+"""The estimator with which all others are compared."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """An estimator, all its training seeds together, with one budget of training; one that is not
-    trained with one choice of settings."""
+    """An estimator with all its training seeds and one training budget; if it is not trained, with
+    one choice of settings."""
 
     name: str
     games: Mapping[GameName, Sequence[Run]]
-    """Its runs of each game, in the order of their `label`; several where training seeds differ."""
+    """Runs of each game, in the order of their `label`; several runs where training seeds
+    differ."""
     ratios: Mapping[GameName, np.ndarray]
-    """log(NRMSE/NRMSE of the `PEER`) of each game of which both played some episode, shape
-    (training seeds, episodes), of the episodes that the peer and all training seeds played."""
+    """log(NRMSE/NRMSE of the `PEER`) of each game with common episodes, shape (training seeds,
+    episodes), over the episodes played by the peer and all training seeds."""
 
     @property
     def track(self) -> str:
@@ -38,18 +39,21 @@ class Contender:
 
     @property
     def runs(self) -> list[Run]:
-        """Its runs of all games."""
+        """Runs of all games."""
         return [run for runs in self.games.values() for run in runs]
 
     def standing(self, game: GameName) -> Standing:
-        """How it did on one of its games, all training seeds together."""
+        """Return the summary of one of its games over all training seeds."""
         runs = self.games[game]
         return runs[0].standing if len(runs) == 1 else standing(rows_of(runs))
 
 
 def contenders(runs: Iterable[Run]) -> list[Contender]:
-    """The contenders that runs are of, those with the most rows first. Budgets of training are in
-    the name, and settings where they tell two of a name apart, but for those with the most rows."""
+    """Group runs into contenders, those with the most rows first.
+
+    Names include the training budget. If several contenders have the same name, all but the one
+    with the most rows also include their settings.
+    """
     groups: dict[tuple[str, str], dict[GameName, list[Run]]]
     groups = defaultdict(lambda: defaultdict(list))
     for run in runs:
@@ -63,8 +67,8 @@ def contenders(runs: Iterable[Run]) -> list[Contender]:
 
 
 def among(contenders: Iterable[Contender], wanted: Callable[[Run], bool]) -> list[Contender]:
-    """The contenders with those games alone whose runs are wanted, those with the most rows first;
-    who played none of them is left out."""
+    """Return the contenders restricted to games whose runs are wanted, those with the most rows
+    first. Contenders without such a game are left out."""
     found = []
     for contender in contenders:
         games = {game: runs for game, runs in contender.games.items() if wanted(runs[0])}
@@ -75,21 +79,23 @@ def among(contenders: Iterable[Contender], wanted: Callable[[Run], bool]) -> lis
 
 
 def label(game: GameName) -> str:
-    """The heading of a game's column: the system, and condition and setup if not the usual ones."""
+    """Return the heading of a game's column: the system, with the condition and setup unless these
+    are nominal and benchmark."""
     condition = "" if game.condition == "nominal" else f" ({game.condition})"
     setup = "" if game.setup == "benchmark" else f", {game.setup}"
     return game.system + condition + setup
 
 
 def _identity(row: Row) -> tuple[str, str]:
-    """The name of a row's estimator with the budget, and its settings if it is not trained."""
+    """Return the name of a row's estimator with the budget, and its settings if it is not
+    trained."""
     budget = row["training"].get("config", {}).get("budget")
     name = row["estimator"] if budget is None else f"{row['estimator']}, {budget:g} s"
     return name, "" if row["training"] else json.dumps(row["options"], sort_keys=True)
 
 
 def _order(games: Mapping[GameName, Sequence[Run]]) -> tuple[int, int]:
-    """What contenders are sorted by: the most rows first, then the first row."""
+    """Return the sort key of contenders: the most rows first, then the earliest row."""
     runs = [run for group in games.values() for run in group]
     return -sum(len(run.rows) for run in runs), min(run.position for run in runs)
 
@@ -97,7 +103,7 @@ def _order(games: Mapping[GameName, Sequence[Run]]) -> tuple[int, int]:
 def _ratios(
     games: Mapping[GameName, Sequence[Run]], peer: Mapping[GameName, Sequence[Run]]
 ) -> dict[GameName, np.ndarray]:
-    """`Contender.ratios` of a contender's games."""
+    """Compute `Contender.ratios` of a contender's games."""
     found = {}
     for game in games:
         theirs = {row["episode_seed"]: _score(row) for row in rows_of(peer.get(game, ()))}

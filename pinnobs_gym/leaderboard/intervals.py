@@ -1,4 +1,4 @@
-"""Numbers with their confidence intervals."""
+"""Statistics with confidence intervals."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from statistics import NormalDist
 import numpy as np
 
 CONFIDENCE = 0.95
-"""Of every interval."""
+"""Confidence level of every interval."""
 REPLICATES = 2000
-"""Of a bootstrap."""
+"""Number of bootstrap replicates."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +26,20 @@ class Interval:
 
     @property
     def percent(self) -> Interval:
-        """The same in percent, rounded."""
+        """The interval in percent, rounded."""
         return Interval(*(float(round(100 * part)) for part in (self.value, self.low, self.high)))
 
     @property
     def exp(self) -> Interval:
-        """That of the number of which this is the logarithm."""
+        """The interval of the exponential."""
         with np.errstate(over="ignore"):
             return Interval(*(float(np.exp(part)) for part in (self.value, self.low, self.high)))
 
 
 def median(values: np.ndarray) -> Interval:
-    """The median with its distribution-free interval from order statistics, which takes infinite
-    values as well (Conover, "Practical Nonparametric Statistics", section 3.2); the whole range
-    where there are too few values for it."""
+    """Return the median with its distribution-free interval from order statistics (Conover,
+    "Practical Nonparametric Statistics", section 3.2). Infinite values are allowed. With too few
+    values the interval is their whole range."""
     ordered = np.sort(values)
     low = _lowest_rank(len(ordered))
     return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[-1 - low]))
@@ -47,7 +47,7 @@ def median(values: np.ndarray) -> Interval:
 
 @lru_cache(maxsize=1024)
 def _lowest_rank(count: int) -> int:
-    """The index, from either end of so many ordered values, of the bounds of their median."""
+    """Return the index, from either end of the ordered values, of the bounds of their median."""
     from scipy.special import bdtr  # scipy.stats takes long to import
 
     cumulative = bdtr(np.arange(count + 1), count, 0.5)
@@ -56,8 +56,8 @@ def _lowest_rank(count: int) -> int:
 
 @lru_cache(maxsize=65536)
 def rate(hits: int, count: int) -> Interval:
-    """A proportion with Wilson's interval (Wilson, "Probable inference, the law of succession, and
-    statistical inference", 1927)."""
+    """Return a proportion with Wilson's interval (Wilson, "Probable inference, the law of
+    succession, and statistical inference", 1927)."""
     part, z2 = hits / count, NormalDist().inv_cdf((1 + CONFIDENCE) / 2) ** 2
     middle = (hits + z2 / 2) / (count + z2)
     half = sqrt(z2) / (count + z2) * sqrt(hits * (1 - part) + z2 / 4)
@@ -66,16 +66,20 @@ def rate(hits: int, count: int) -> Interval:
 
 
 def log_ratio(score: np.ndarray, peer: np.ndarray) -> np.ndarray:
-    """log(score/peer) of the same episodes; zero where both are infinite, which is a tie."""
+    """Return log(score/peer) for the same episodes; zero for a tie, including two infinite
+    scores."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.log(score) - np.log(peer)
     return np.where(score == peer, 0.0, ratio)
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """The mean over the last axis of what is left without the lowest and the highest quarter
-    (Agarwal et al. 2021). Infinite values are trimmed with the others; it is infinite where more of
-    them are on a side than are trimmed there, and not a number where that is so on both."""
+    """Return the mean over the last axis without the lowest and the highest quarter (Agarwal et al.
+    2021).
+
+    Infinite values are trimmed like the others. The mean is infinite if more values are infinite on
+    one side than are trimmed there, and NaN if this holds on both sides.
+    """
     from scipy.stats import trim_mean
 
     with np.errstate(invalid="ignore"):
@@ -83,31 +87,34 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
 
 
 def improvement(values: np.ndarray) -> np.ndarray:
-    """The part of logarithms of ratios, over the last axis, that is below zero, a tie counting
-    half: the probability that a score is better than the peer's of the same episode."""
+    """Return the fraction of log ratios below zero over the last axis, a tie counting half: the
+    probability that a score is better than the peer's on the same episode."""
     return np.mean((values < 0) + 0.5 * (values == 0), axis=-1)
 
 
 def bootstrapped(
     strata: Sequence[np.ndarray], statistic: Callable[[np.ndarray], np.ndarray], seed: int = 0
 ) -> Interval:
-    """A statistic of all values of some strata, with its interval from a stratified bootstrap.
+    """Return a statistic of all values of several strata with its interval from a stratified
+    bootstrap.
 
-    In every stratum training seeds and episodes are drawn with replacement at levels of their own:
-    a replicate is of the drawn seeds on the drawn episodes (Efron & Tibshirani 1993, section 13.3,
-    for percentiles; Agarwal et al. 2021 for strata).
+    In every stratum, training seeds and episodes are resampled with replacement independently of
+    each other: a replicate holds the drawn seeds on the drawn episodes (Efron & Tibshirani 1993,
+    section 13.3, for percentiles; Agarwal et al. 2021 for strata).
 
     Args:
         strata: one array (training seeds, episodes) per system.
-        statistic: of values (..., n) over the last axis.
+        statistic: a function of values (..., n) over the last axis.
         seed: of the draws.
     """
     rng = np.random.default_rng(seed)
     drawn = []
     for values in strata:
+        # Resample rows and columns of each stratum.
         seeds, episodes = (rng.integers(0, size, (REPLICATES, size)) for size in values.shape)
         drawn.append(values[seeds[:, :, None], episodes[:, None]].reshape(REPLICATES, -1))
-    found = np.sort(statistic(np.concatenate(drawn, axis=1)))
+    # Percentile interval of the replicates' statistics.
+    replicates = np.sort(statistic(np.concatenate(drawn, axis=1)))
     tail = int((1 - CONFIDENCE) / 2 * REPLICATES)
     value = statistic(np.concatenate([values.ravel() for values in strata]))
-    return Interval(float(value), float(found[tail]), float(found[-1 - tail]))
+    return Interval(float(value), float(replicates[tail]), float(replicates[-1 - tail]))

@@ -1,4 +1,4 @@
-"""Estimators across systems and conditions, from stored scores. Nothing here runs an estimator."""
+"""Comparison of estimators across systems and conditions, from stored scores only."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ class Line:
     track: str
     ratio: Interval | None
     """exp of the interquartile mean, over all systems and episodes, of log(NRMSE/NRMSE of the
-    `PEER`), that of the same episode; None without common episodes."""
+    `PEER`) on the same episode; None without common episodes."""
     better: Interval | None
-    """Probability of a smaller NRMSE than the peer's of the same episode."""
+    """Probability of a smaller NRMSE than the peer's on the same episode."""
     games: Mapping[GameName, Standing]
-    """How it did on each game that it played."""
+    """Summary of each game that it played."""
     us_per_step: float
     """Median over games."""
 
     @property
     def known_ratio(self) -> float:
-        """The ratio; infinite where there is none or it is undefined."""
+        """The ratio; infinite if it is missing or undefined."""
         return np.inf if self.ratio is None or np.isnan(self.ratio.value) else self.ratio.value
 
 
 def lines(contenders: Iterable[Contender]) -> list[Line]:
-    """Every contender on the systems under the conditions that these are ranked under: online
-    before offline, then those that played more, then those with the smaller ratio."""
+    """Return a line per contender over the systems' ranked conditions: online before offline, then
+    those with the most games, then those with the smallest ratio."""
     found = [_line(contender) for contender in among(contenders, lambda run: run.ranked)]
     return sorted(found, key=lambda x: (x.track != "online", -len(x.games), x.known_ratio))
 
 
 def _line(contender: Contender) -> Line:
-    """The line of a contender's games."""
+    """Return the line of a contender."""
     strata = list(contender.ratios.values())
     standings = {game: contender.standing(game) for game in contender.games}
     return Line(
@@ -63,9 +63,12 @@ def _line(contender: Contender) -> Line:
 
 
 def log_ratios(contenders: Sequence[Contender]) -> dict[str, dict[str, float]]:
-    """Each online contender's interquartile mean of log(NRMSE/NRMSE of the `PEER`) over all systems
-    and episodes under every condition; of those alone that played every system that the peer did.
-    By condition, in the order in which these are listed, and name."""
+    """Return the interquartile mean of log(NRMSE/NRMSE of the `PEER`) over all systems and
+    episodes, by condition and name.
+
+    Only online contenders that have a ratio for each of the peer's games under the condition are
+    included. Conditions are in the order of `CONDITIONS`.
+    """
     online = [contender for contender in contenders if contender.track == "online"]
     found = {}
     for condition in sorted({run.game.condition for each in online for run in each.runs}, key=_at):
@@ -78,21 +81,21 @@ def log_ratios(contenders: Sequence[Contender]) -> dict[str, dict[str, float]]:
 
 
 def _at(condition: str) -> tuple[int, str]:
-    """Where a condition stands: those that are listed first."""
+    """Return the sort key of a condition: its place in `CONDITIONS`, with others last."""
     listed = list(CONDITIONS)
     return listed.index(condition) if condition in listed else len(listed), condition
 
 
 def _mean_ratio(contender: Contender) -> float:
-    """The interquartile mean of a contender's ratios; infinite where it is undefined."""
+    """Return the interquartile mean of a contender's ratios; infinite if it is undefined."""
     values = np.concatenate([ratio.ravel() for ratio in contender.ratios.values()])
     value = float(interquartile_mean(values))
     return np.inf if np.isnan(value) else value
 
 
 def ranks(ratios: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, int]]:
-    """Each estimator's rank under every condition, the smallest of `log_ratios` first; equal ones
-    share a rank. By condition and name."""
+    """Return each estimator's rank under every condition, by condition and name. The smallest of
+    `log_ratios` has rank 1, and ties share a rank."""
     return {
         condition: {
             name: 1 + sum(other < value for other in values.values())

@@ -21,11 +21,11 @@ NOTE = (
     "trimmed only as part of the highest quarter. `better` is the part of the episodes with a "
     "smaller NRMSE than the EKF's. Offline estimators see the whole record first."
 )
-"""How to read the overview."""
+"""Explanation of the overview."""
 
 
 def cells(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
-    """The overview's header and rows as text."""
+    """Return the overview's header and rows as text."""
     games = sorted({game for line in found for game in line.games}, key=label)
     header = ["estimator", "track", "/ ekf", "better", *map(label, games), "µs/step"]
     rows = []
@@ -40,8 +40,8 @@ def cells(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
 
 
 def rank_cells(found: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[list[str]]]:
-    """The header and rows, as text, of a table of ranks: a column per estimator, those with the
-    better worst rank first, a row per condition, and last the worst."""
+    """Return the header and rows of the table of ranks as text: a column per estimator, sorted by
+    worst rank, a row per condition, and a last row with the worst rank."""
     worst: dict[str, int] = {}
     total: dict[str, int] = defaultdict(int)
     for placed in found.values():
@@ -61,12 +61,12 @@ RANK_NOTE = (
     "alone that played every system that the EKF did. Estimators stand in the order of their worst "
     "rank."
 )
-"""How to read the table of ranks."""
+"""Explanation of the table of ranks."""
 
 
 def markdown(found: Sequence[Line], placed: Mapping[str, Mapping[str, int]]) -> str:
-    """The overview of `lines` and, if several conditions were played by estimators that can be
-    ranked, the table of `ranks`, in Markdown."""
+    """Return the overview of `lines` in Markdown, followed by the table of `ranks` if it has
+    several conditions."""
     parts = ["# Leaderboard\n", NOTE, "", markdown_table(*cells(found)), ""]
     if len(placed) > 1:
         parts += ["# Conditions\n", RANK_NOTE, "", markdown_table(*rank_cells(placed)), ""]

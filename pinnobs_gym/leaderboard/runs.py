@@ -1,4 +1,4 @@
-"""Stored scores by game and configuration: each table's line is of one run."""
+"""Stored scores grouped by game and configuration; each line of a game's table is one run."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from pinnobs_gym.scoring.rows import Row, game_of
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The episodes that one estimator played of one game with one configuration."""
+    """The episodes of one game that one estimator played with one configuration."""
 
     game: GameName
     rows: list[Row]
-    """At least one."""
+    """The scored rows, at least one."""
     position: int
-    """Of the first of them among all stored rows."""
+    """Index of its first row among all stored rows."""
 
     @property
     def estimator(self) -> str:
@@ -29,7 +29,7 @@ class Run:
 
     @property
     def config_hash(self) -> str:
-        """The hash of its settings, model and training."""
+        """Hash of the estimator's settings, model and training."""
         return self.rows[0]["config_hash"]
 
     @property
@@ -39,17 +39,17 @@ class Run:
 
     @property
     def ranked(self) -> bool:
-        """Whether the system is ranked under the condition that is played."""
+        """Whether the system is ranked under the condition of this run."""
         return self.rows[0]["ranked"]
 
     @cached_property
     def standing(self) -> Standing:
-        """The summary of its rows, computed at the first use."""
+        """The summary of its rows, computed on first use."""
         return standing(self.rows)
 
 
 def runs_of(rows: Iterable[Row]) -> list[Run]:
-    """Scored episodes as runs, in the order of their first rows."""
+    """Group scored episodes into runs, in the order of their first rows."""
     found: dict[tuple[GameName, str, str], Run] = {}
     for position, row in enumerate(rows):
         key = (game_of(row), row["estimator"], row["config_hash"])
@@ -60,5 +60,5 @@ def runs_of(rows: Iterable[Row]) -> list[Run]:
 
 
 def rows_of(runs: Iterable[Run]) -> list[Row]:
-    """The rows of all these runs."""
+    """Return the rows of all these runs."""
     return list(chain.from_iterable(run.rows for run in runs))

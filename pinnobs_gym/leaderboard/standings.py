@@ -1,4 +1,4 @@
-"""Tables of stored scores. Nothing here runs an estimator."""
+"""Summaries of stored scores, computed without running an estimator."""
 
 from __future__ import annotations
 
@@ -16,29 +16,32 @@ from pinnobs_gym.scoring.rows import Row
 
 @dataclass(frozen=True)
 class Standing:
-    """How one estimator did on the episodes of one game."""
+    """The summary of one estimator's episodes of one game."""
 
     estimator: str
     track: str
     episodes: int
     diverged: Interval
-    """Rate, with Wilson's interval."""
+    """Rate of diverged episodes, with Wilson's interval."""
     settling: Interval
-    """Median in s."""
+    """Median settling time in s."""
     nrmse: Interval
-    """Median over the whole episode."""
+    """Median NRMSE over the whole episode."""
     tail: Interval
-    """Median over the last quarter."""
+    """Median NRMSE over the last quarter."""
     tail_modulo: float | None
-    """Median of the same modulo indistinguishable states; None where that changes nothing."""
+    """Median NRMSE over the last quarter modulo indistinguishable states; None if it is the
+    same."""
     tail_90: float
-    """90th percentile over the last quarter."""
+    """90th percentile of the NRMSE over the last quarter."""
     reference_ratio: float | None
-    """Median NRMSE over the Cramér-Rao reference of the same episode; None where there is none."""
+    """Median of the NRMSE over the Cramér-Rao reference of the same episode; None without a
+    reference."""
     reference_ratio_tail: float | None
-    """The same of the last quarter."""
+    """The same over the last quarter."""
     anees: Interval | None
-    """Mean over episodes, with the band that it should be in; None without covariances."""
+    """Mean over episodes, with the band expected of consistent estimates; None without
+    covariances."""
     coverage: float | None
     """Mean over episodes."""
     nis: float | None
@@ -48,13 +51,13 @@ class Standing:
     us_per_step: float
     knows: str
     budget: float | None
-    """CPU seconds that training was given, if it was limited so."""
+    """CPU seconds allotted to training; None without such a limit."""
     training: str
-    """How it was trained, in a few words."""
+    """Short description of the training."""
 
 
 def standing(rows: Sequence[Row]) -> Standing:
-    """The summary of one estimator's rows; episodes that diverged score infinity."""
+    """Summarise one estimator's rows; diverged episodes have infinite scores."""
     diverged = np.array([row["diverged"] for row in rows])
 
     def values(name: str) -> np.ndarray:
@@ -93,7 +96,7 @@ def _modulo(rows: Sequence[Row]) -> float | None:
 
 
 def _of(statistic: Callable[..., Any], rows: Sequence[Row], name: str) -> float | None:
-    """A statistic of an optional score, over the episodes that have it."""
+    """Return a statistic of an optional score over the episodes that have it."""
     values = [row[name] for row in rows if row[name] is not None]
     return float(statistic(values)) if values else None
 
@@ -104,7 +107,7 @@ def _anees(rows: Sequence[Row]) -> Interval | None:
 
 
 def training_of(rows: Sequence[Row]) -> str:
-    """How the estimator was trained, in a few words: budget or iterations, and CPU seconds."""
+    """Return a short description of the training: budget or iterations, and CPU seconds."""
     facts = [row["training"] for row in rows if row["training"]]
     if not facts:
         return ""

@@ -17,21 +17,21 @@ from pinnobs_gym.scoring.rows import Row, game_of
 
 @dataclass(frozen=True)
 class Table:
-    """The standings in one game, best first, online before offline."""
+    """The standings of one game, best first, online before offline."""
 
     game: GameName
     standings: tuple[Standing, ...]
     note: str = ""
-    """What to know about it, if anything."""
+    """Remarks on the table, possibly empty."""
 
     @property
     def title(self) -> str:
-        """What is played."""
+        """The game in words."""
         return ", ".join(self.game)
 
 
 def tables(runs: Iterable[Run], failures: Iterable[Row] = ()) -> list[Table]:
-    """A table per game, those with failures alone included; jobs that failed are in the notes."""
+    """Return a table per game, including games with failures only; failed jobs are in the notes."""
     played: dict[GameName, list[Run]] = defaultdict(list)
     for run in runs:
         played[run.game].append(run)
@@ -43,8 +43,8 @@ def tables(runs: Iterable[Run], failures: Iterable[Row] = ()) -> list[Table]:
 
 
 def table(game: GameName, runs: Iterable[Run], notes: Sequence[str] = ()) -> Table:
-    """The table of a game's runs, with notes. Within a track estimators stand in the order of their
-    median NRMSE over the whole episode, diverged episodes counting as infinite."""
+    """Return the table of a game's runs, with notes. Within a track, estimators are sorted by
+    median NRMSE over the whole episode, with diverged episodes as infinite."""
     runs = list(runs)
     standings = [run.standing for run in runs]
     standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
@@ -52,14 +52,14 @@ def table(game: GameName, runs: Iterable[Run], notes: Sequence[str] = ()) -> Tab
 
 
 def _failed(row: Row) -> str:
-    """What failed, in a sentence."""
+    """Return a sentence about a failed job."""
     many = row["episodes"] > 1
     which = f"{row['episodes']} episodes" if many else f"episode {row['episode_seed']}"
     return f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}."
 
 
 def _uneven(runs: Sequence[Run]) -> str:
-    """A warning if estimators of one track were not run on the same episodes."""
+    """Return a warning if estimators of one track were not run on the same episodes."""
     for track in dict.fromkeys(run.track for run in runs):
         episodes = {
             frozenset(row["episode_seed"] for row in run.rows) for run in runs if run.track == track
@@ -89,11 +89,11 @@ HEADER = (
     "knows",
     "training",
 )
-"""The columns of a table."""
+"""The column headings of a table."""
 
 
 def cells(table: Table, intervals: bool = True) -> list[list[str]]:
-    """The table's rows as text, a cell per column of `HEADER`, with or without the intervals."""
+    """Return the table's rows as text, a cell per column of `HEADER`, with or without intervals."""
     lines, ranks = [], defaultdict(int)
     for standing in table.standings:
         ranks[standing.track] += 1
@@ -102,7 +102,7 @@ def cells(table: Table, intervals: bool = True) -> list[list[str]]:
 
 
 def _cells(s: Standing, intervals: bool) -> list[str]:
-    """The cells of a standing, but for its rank."""
+    """Return the cells of a standing, except its rank."""
     shown = _interval if intervals else lambda interval: number(interval.value)
     tail = shown(s.tail)
     if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
@@ -129,7 +129,7 @@ def _cells(s: Standing, intervals: bool) -> list[str]:
 
 
 def markdown(tables: Iterable[Table]) -> str:
-    """The tables in Markdown."""
+    """Return the tables in Markdown."""
     parts = ["# Each game\n", NOTE + "\n"]
     for table in tables:
         parts.append(f"\n## {table.title}\n")
@@ -139,7 +139,7 @@ def markdown(tables: Iterable[Table]) -> str:
 
 
 def markdown_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """One table in Markdown."""
+    """Return one table in Markdown."""
     rules = ["---"] * len(header)
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rules, *lines))
 
@@ -157,11 +157,11 @@ NOTE = (
     "95 % band: errors are larger than P says, ▼ below); how many errors the central 90 % interval "
     "covers; NIS, which should be 1; and the correlation of successive innovations, 0 if white."
 )
-"""How to read the tables."""
+"""Explanation of the tables."""
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A score in so many significant digits."""
+    """Format a score with this number of significant digits."""
     if not np.isfinite(value):
         return "∞"
     if abs(value) >= 10**digits:
@@ -174,7 +174,7 @@ def _optional(value: float | None, digits: int = 3) -> str:
 
 
 def _banded(value: Interval | None) -> str:
-    """The value, and on which side of its band it is."""
+    """Format the value, marked if it is outside its band."""
     if value is None:
         return ""
     side = " ▲" if value.value > value.high else " ▼" if value.value < value.low else ""

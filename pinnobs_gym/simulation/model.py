@@ -15,28 +15,29 @@ from pinnobs_gym.simulation.system import Array, System
 _STAGES = np.array([0, 1, 1, 2])
 """Which of a step's start, middle and end each of the four Runge-Kutta stages looks at."""
 
+_PARTS = np.array([0.0, 0.5, 1.0])
+"""A step's start, middle and end, in steps."""
 
-def runge_kutta(
-    rate: Callable[[int, Array], Array], x: Array, h: Array | float
-) -> tuple[Array, tuple[Array, Array, Array, Array]]:
-    """One step of the classical Runge-Kutta method (Kutta 1901), of order 4.
+
+def runge_kutta(rate: Callable[[int, Array], Array], x: Array, h: Array | float) -> Array:
+    """Where one step of the classical Runge-Kutta method (Kutta 1901) ends, of order 4.
 
     Args:
         rate: dx/dt at a stage, 0 to 3, and the point there; the stages are at the start, twice at
             the middle and at the end of the step.
         x: where the step begins.
         h: the step.
-
-    Returns:
-        Where it ends, and the points of the four stages.
     """
     k1 = rate(0, x)
-    second = x + h / 2 * k1
-    k2 = rate(1, second)
-    third = x + h / 2 * k2
-    k3 = rate(2, third)
-    fourth = x + h * k3
-    k4 = rate(3, fourth)
+    point = h / 2 * k1
+    point += x
+    k2 = rate(1, point)
+    point = h / 2 * k2
+    point += x
+    k3 = rate(2, point)
+    point = h * k3
+    point += x
+    k4 = rate(3, point)
     # x + h(k1 + 2k2 + 2k3 + k4)/6, in one array
     end = k2 + k3
     end *= 2
@@ -44,7 +45,7 @@ def runge_kutta(
     end += k4
     end *= h / 6
     end += x
-    return end, (x, second, third, fourth)
+    return end
 
 
 def model_step(
@@ -58,7 +59,7 @@ def model_step(
     straight line, only if the system's input is a measured one.
     """
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
-        x, _ = runge_kutta(partial(_rate, system, t, u), x, step)
+        x = runge_kutta(partial(_rate, system, t, u), x, step)
     return x
 
 
@@ -81,42 +82,37 @@ def model_step_jacobian(
     F = None
     batch, nx = x.shape
     x = np.ascontiguousarray(x.T)  # the batch comes last here; the system is shown transposed views
+    start = identity(nx, batch)
+    points = np.empty((4, nx, batch))
+    shown = points.transpose(0, 2, 1)
     for t, step, u in substeps(system, t0, t1, x.T, u0, u1):
         by_row = t.ndim == 2
         h = step[:, 0] if by_row else step
-        x, points = runge_kutta(partial(_transposed_rate, system, t, u), x, h)
-        # The variational equation Φ' = A(t)Φ, by the same method along the same points.
         times, inputs = t[_STAGES], u[_STAGES]
+
+        def rate(
+            stage: int, at: np.ndarray, times: np.ndarray = times, inputs: np.ndarray = inputs
+        ) -> np.ndarray:
+            points[stage] = at
+            return system.f(times[stage], shown[stage], inputs[stage]).T
+
+        x = runge_kutta(rate, x, h)
+        # The variational equation Φ' = A(t)Φ, Φ = I, by the same method along the same points.
         A = system.f_jacobian(
             times if by_row else times[:, None],
-            np.stack(points).transpose(0, 2, 1),
+            shown,
             inputs[:, None] if u.ndim == 2 else inputs,
         )
         A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
-        flow, _ = runge_kutta(partial(_variation, A), _NOTHING, h)
-        flow += identity(nx, batch)
+        flow = runge_kutta(partial(_variation, A), start, h)
         F = flow if F is None else product(flow, F)
     assert F is not None  # there is at least one substep
     return x.T, F.transpose(2, 0, 1)
 
 
-_NOTHING = np.zeros(())
-
-
-def _transposed_rate(
-    system: System, t: np.ndarray, u: np.ndarray, stage: int, x: np.ndarray
-) -> np.ndarray:
-    """`_rate` of states (nx, batch)."""
-    return _rate(system, t, u, stage, x.T).T
-
-
-def _variation(A: np.ndarray, stage: int, change: np.ndarray) -> np.ndarray:
-    """Φ' = AΦ, (nx, nx, batch), of the change Φ − I since the step began, A (4, nx, nx, batch)."""
-    if stage == 0:  # where Φ = I
-        return A[0]
-    rate = product(A[stage], change)
-    rate += A[stage]
-    return rate
+def _variation(A: np.ndarray, stage: int, flow: np.ndarray) -> np.ndarray:
+    """Φ' = AΦ, (nx, nx, batch), of the flow Φ since the step began, A (4, nx, nx, batch)."""
+    return A[stage] if stage == 0 else product(A[stage], flow)  # Φ = I at the first
 
 
 def substeps(
@@ -140,8 +136,9 @@ def substeps(
     whole = t1 - t0
     count = max(1, math.ceil(float(whole.max() if by_row else whole) / longest - 1e-6))
     step = whole[:, None] / count if by_row else float(whole) / count
+    parts = _PARTS if xp is np else xp.asarray(_PARTS, dtype=x.dtype)
     for k in range(count):
-        part = xp.asarray([k, k + 0.5, k + 1], dtype=x.dtype)
+        part = parts + k if k else parts
         after = part * step
         t = t0 + (after.T if by_row else after)
         if system.measured_input:

@@ -148,7 +148,7 @@ def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
     away = np.zeros(len(x), dtype=bool)
     with np.errstate(all="ignore"):
         for _ in range(steps):
-            now, _ = runge_kutta(lambda stage, x: system.f(t, x, u), now, h)
+            now = runge_kutta(lambda stage, x: system.f(t, x, u), now, h)
             away |= ~(abs(now) < FAR * scale).all(axis=-1)
             now = np.where(away[:, None], x, now)
     return away

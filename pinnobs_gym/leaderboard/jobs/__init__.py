@@ -1,1 +1,1 @@
-"""The jobs of a leaderboard: what one is, which are left, and the processes that run them."""
+"""The jobs of a leaderboard: their definition, planning, and the processes that run them."""

@@ -1,7 +1,7 @@
-"""Jobs on the workers of a Dask scheduler.
+"""Running jobs on the workers of a Dask scheduler.
 
-Dask's own futures are waited for, not those of ``Client.get_executor``, which hand a result over
-without a limit of time and are never done if the scheduler goes at that moment.
+Dask's own futures are used instead of those of ``Client.get_executor``. The latter wait for a
+result without a timeout, and never complete if the scheduler dies meanwhile.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 CONNECT = 5.0
-"""Seconds in which the scheduler must answer."""
+"""Timeout in s for an answer of the scheduler."""
 WORKERS = 60.0
-"""Seconds in which the first worker must be there."""
+"""Timeout in s for the first worker."""
 
 
 @contextmanager
 def connected(address: str) -> Iterator[DaskPool]:
-    """The workers of a scheduler, for as long as there is a connection to it.
+    """Connect to a scheduler and yield the pool of its workers.
 
     Raises:
         ValueError: in one line, if Dask is not installed, or there is no scheduler or no worker.
@@ -42,7 +42,7 @@ def connected(address: str) -> Iterator[DaskPool]:
     if not re.fullmatch(r"\w+://.+:\d+", address):
         raise ValueError(f"scheduler={address!r}; expected an address such as tcp://host:8786")
     for name in logging.root.manager.loggerDict:
-        if name.partition(".")[0] == "distributed":  # they would report every retry
+        if name.partition(".")[0] == "distributed":  # they log every retry
             logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CONNECT, set_as_default=False)
@@ -63,7 +63,7 @@ def connected(address: str) -> Iterator[DaskPool]:
         with DaskPool(client) as pool:
             yield pool
     finally:
-        with suppress(Exception):  # it may be gone, which is reported elsewhere
+        with suppress(Exception):  # a lost scheduler is reported elsewhere
             client.close(timeout=2)
 
 
@@ -74,14 +74,14 @@ class DaskPool(Pool):
         client: the connection to the scheduler.
     """
 
-    queued = None  # all are queued at the scheduler: workers may come and go
+    queued = None  # all are queued at the scheduler, as the number of workers may change
     children = False
 
     def __init__(self, client: Client) -> None:
         self._client = client
         self._futures: set[Future] = set()
         workers: Any = client.nthreads()
-        self.size = len(workers)  # a worker's threads take turns
+        self.size = len(workers)  # one job at a time per worker, whatever its threads
 
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future:
         try:

@@ -1,10 +1,9 @@
-"""Running jobs in processes, of this machine or of many.
+"""Running jobs in processes of this or other machines.
 
-The engine hands jobs to a `Pool` and takes in what becomes of them as they end. There are three
-pools: this very process, worker processes of this machine
-(`pinnobs_gym.leaderboard.jobs.processes`) and the workers of a Dask scheduler
-(`pinnobs_gym.leaderboard.jobs.cluster`). Each process runs one job at a time on one numerical
-thread; see `pinnobs_gym.leaderboard.jobs.worker`.
+The engine submits jobs to a `Pool` and handles their outcomes as they end. There are three pools:
+the current process, worker processes of this machine (`pinnobs_gym.leaderboard.jobs.processes`) and
+the workers of a Dask scheduler (`pinnobs_gym.leaderboard.jobs.cluster`). Each process runs one job
+at a time on one numerical thread; see `pinnobs_gym.leaderboard.jobs.worker`.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob
 from pinnobs_gym.scoring.rows import CannotWrite
 
 LISTEN = 0.5
-"""Seconds between two looks for Ctrl-C while no job ends: Windows does not interrupt a wait."""
+"""Seconds between two checks for Ctrl-C while no job ends: Windows does not interrupt a wait."""
 
 
 class Ended(NamedTuple):
@@ -36,27 +35,27 @@ class Ended(NamedTuple):
 
     job: Any
     error: str | None
-    """What went wrong, in one line; None if nothing."""
+    """The error in one line; None if the job succeeded."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes that run jobs."""
+    """Configuration of the processes that run jobs."""
 
     processes: int = 1
-    """How many of this machine. One is this very process: debuggers and profilers see the job, and
-    nothing has to be started; but a job that kills its process then ends the run. More are worker
-    processes."""
+    """Number of processes on this machine. With 1, jobs run in the current process: debuggers and
+    profilers see them and no process has to be started, but a job that kills its process ends the
+    run. With more, jobs run in worker processes."""
     scheduler: str | None = None
-    """Address of a Dask scheduler, whose workers are then used instead."""
+    """Address of a Dask scheduler, whose workers are used instead."""
 
 
 class Engine:
-    """Runs jobs, one thread each, and tells of each as it ends.
+    """Runs jobs, one thread each, and yields each as it ends.
 
-    A job whose process dies may take the others of its pool with it. All that were handed out are
-    then run again, one at a time after the rest, and one that dies once more has failed. Dask does
-    the like by itself.
+    If the process of a job dies, other jobs of the pool may be lost with it. All lost jobs are run
+    again, one at a time after the others; a job whose process dies again has failed. Dask does this
+    by itself.
 
     Args:
         workers: the processes.
@@ -70,16 +69,16 @@ class Engine:
 
     @property
     def running(self) -> list[PicklableJob]:
-        """The jobs that run now: of those handed out, those that have waited longest."""
+        """The running jobs, assumed to be those submitted first of all unfinished ones."""
         return list(self._under_way.values())[: self.processes]
 
     def run(self, jobs: Sequence[PicklableJob]) -> Iterator[Ended]:
         """Run jobs in this order, and yield each as it ends.
 
         Raises:
-            ValueError: in one line, if nothing can be written, the scheduler or its workers are not
-                there, or a worker does not see the folder.
-            WorkersLost: in one line, if the scheduler is gone.
+            ValueError: in one line, if nothing can be written, the scheduler or its workers cannot
+                be reached, or a worker does not see the folder.
+            WorkersLost: in one line, if the connection to the scheduler is lost.
         """
         if not jobs:
             return
@@ -91,13 +90,13 @@ class Engine:
                 self._under_way.clear()
 
     def _run(self, jobs: dict[int, PicklableJob], pool: Pool, origin: Origin) -> Iterator[Ended]:
-        """Run all jobs, and those whose process died once more, each alone."""
+        """Run all jobs, then those whose process died once more, each on its own."""
         suspects: dict[int, PicklableJob] = {}
         for number, future in self._futures(jobs.items(), pool, origin):
             try:
                 outcome = pool.outcome(future)
             except WorkerLost:
-                suspects[number] = jobs[number].anew()  # it may have written something
+                suspects[number] = jobs[number].anew()  # it may have written rows
                 continue
             yield _ended(jobs[number], outcome)
         for suspect in sorted(suspects.items()):
@@ -111,8 +110,8 @@ class Engine:
     def _futures(
         self, jobs: Iterable[tuple[int, PicklableJob]], pool: Pool, origin: Origin
     ) -> Iterator[tuple[int, Any]]:
-        """Hand out jobs, as many as the pool queues, and yield the number and the future of each
-        as it is done. They are under way until then."""
+        """Submit jobs, up to the pool's queue length, and yield the number and future of each when
+        it is done."""
         done: SimpleQueue[tuple[int, Any]] = SimpleQueue()
         waiting = iter(jobs)
         while True:
@@ -133,7 +132,7 @@ def _put(done: SimpleQueue[tuple[int, Any]], number: int, future: Any) -> None:
 
 
 def _next(done: SimpleQueue[tuple[int, Any]]) -> tuple[int, Any]:
-    """What is done next, which may be interrupted."""
+    """Wait for the next finished job, interruptible by Ctrl-C."""
     while True:
         try:
             return done.get(timeout=LISTEN)
@@ -142,10 +141,10 @@ def _next(done: SimpleQueue[tuple[int, Any]]) -> tuple[int, Any]:
 
 
 def _ended(job: PicklableJob, outcome: Outcome) -> Ended:
-    """What became of a job.
+    """Return the result of a job, after recording a failure if its process died.
 
     Raises:
-        CannotWrite: if no other job would fare better.
+        CannotWrite: if the outcome means that no other job can succeed.
     """
     if outcome.ends_all:
         raise CannotWrite(outcome.error)
@@ -157,7 +156,7 @@ def _ended(job: PicklableJob, outcome: Outcome) -> Ended:
 
 
 def _pool(workers: Workers) -> AbstractContextManager[Pool]:
-    """The pool, which gives up what it started when it is left with an error."""
+    """Return the pool; it stops its jobs if its context ends with an error."""
     if workers.scheduler is not None:
         from pinnobs_gym.leaderboard.jobs.cluster import connected
 
@@ -171,10 +170,10 @@ def _pool(workers: Workers) -> AbstractContextManager[Pool]:
 
 @contextmanager
 def _origin(folder: Path, pool: Pool) -> Iterator[Origin]:
-    """Make the mark of an `Origin` in a folder, for as long as jobs are run.
+    """Create the mark of an `Origin` in a folder for the duration of the run.
 
-    This process holds it. A mark that nobody holds is of a run that was killed, and is deleted: on
-    the same machine only, since not every shared folder passes locks on.
+    This process holds the mark. Marks that nobody holds are left by killed runs and deleted, but
+    only those of this machine, since not every shared folder supports locks.
     """
     host = socket.gethostname()
     mark = folder / f".running-{host}-{uuid4().hex}"

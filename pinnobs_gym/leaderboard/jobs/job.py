@@ -1,4 +1,5 @@
-"""The jobs of a leaderboard, each a pure function of what it says that appends its own rows."""
+"""The jobs of a leaderboard. The result of a job depends only on its fields; it appends its own
+rows."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from pinnobs_gym.training.log import Log
 
 @dataclass(frozen=True)
 class Job:
-    """One evaluation, to be run in any process."""
+    """One evaluation, which any process can run."""
 
     game: Game
     """What is played."""
@@ -33,17 +34,17 @@ class Job:
     episodes: int
     seed: int
     folder: Path
-    """Where rows, TensorBoard's log and trained files go."""
+    """Folder of rows, TensorBoard log and trained files."""
     training: Mapping[str, Any] = field(default_factory=dict)
-    """Choices in the trainer's Config, for estimators that learn."""
+    """Values of the trainer's Config, for trained estimators."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The estimator's own settings."""
     label: str | None = None
-    """The estimator's name in rows, if not its own."""
+    """Name of the estimator in rows; its own name if None."""
     known: frozenset[tuple[str, int | None, int]] | None = None
-    """What is stored already; see `Results`."""
+    """Keys of the stored rows; see `Results`."""
     failed: bool = False
-    """Whether it failed before, and is tried again."""
+    """Whether the job failed before and is retried."""
 
     @property
     def rows(self) -> Path:
@@ -52,32 +53,32 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What the job does, in a few words."""
+        """Short description of the job."""
         many = f"{self.episodes} episodes" if self.episodes > 1 else f"episode {self.seed}"
         system, condition = self.game.system.partition(":")[2], self.game.name.condition
         return f"{self.label or self.estimator} on {system}, {condition}, {many}"
 
     @property
     def digest(self) -> str:
-        """A hash of all that is asked for."""
+        """Hash of the job's specification."""
         aside = {f.name: None for f in fields(self) if f.name in ("folder", "known", "failed")}
         return _digest({f.name: getattr(self, f.name) for f in fields(self)} | aside)
 
     def run(self) -> None:
-        """Append the rows that are missing; see `run_job`."""
+        """Append the missing rows; see `run_job`."""
         run_job(self)
         if self.failed:
             rows_module.append(self.rows, [self._event("recovery")])
 
     def anew(self) -> Self:
-        """The same job, when it is not known any more what is stored."""
+        """Return the same job without its knowledge of stored rows."""
         return replace(self, known=None)
 
     def fail(self, error: str) -> None:
-        """Append a row that says what went wrong.
+        """Append a row with the error.
 
         Raises:
-            CannotWrite: if it cannot.
+            CannotWrite: if it cannot be written.
         """
         rows_module.append(self.rows, [self._event("failure") | {"error": error}])
 
@@ -96,7 +97,7 @@ class Job:
 
 
 def run_job(job: Job) -> None:
-    """Train if the estimator needs it, evaluate, and append the rows that are missing."""
+    """Train the estimator if needed, evaluate it, and append the missing rows."""
     cls = ESTIMATORS.resolve(job.estimator)
     if cls.needs_training or cls.trains_on_record:
         import torch
@@ -116,13 +117,14 @@ def run_job(job: Job) -> None:
     results = Results(job.rows, job.known)
     found = run_episodes(job.game, estimator, seeds, results, label=job.label)
     scored = [row for row in found.rows if "nrmse" in row]
-    if found.first_played is not None:  # not all of it was there already
+    if found.first_played is not None:  # some episodes were not stored
         with Log(log_folder(job.folder, scored[0])) as log:
             log_episodes(log, scored, found.first_played)
 
 
 def trained(cls: type[Estimator], job: Job) -> Estimator:
-    """The estimator trained on episodes that are never scored, loaded if that was done before."""
+    """Return the estimator trained on episodes that are never scored; load it if it was trained
+    before."""
     name = str(cls.needs_training)
     recipe = TRAINERS.resolve(name).configured({**cls.recipe, **job.training})
     label = f"{job.game.name.file_stem}-{name}-{_digest(recipe)}"
@@ -130,12 +132,12 @@ def trained(cls: type[Estimator], job: Job) -> Estimator:
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
             result = train_by_name(name, recipe, job.game, log=log)
-        if not path.exists():  # of two that trained at the same time, the first counts
+        if not path.exists():  # of two simultaneous trainings, the first counts
             result.save(path)
     return load(cls, path, job.game)
 
 
 def _digest(recipe: Any) -> str:
-    """Tells recipes apart in the names of files."""
+    """Return a hash that distinguishes recipes in file names."""
     text = json.dumps(canonical(recipe), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]

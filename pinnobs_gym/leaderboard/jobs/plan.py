@@ -1,4 +1,4 @@
-"""Which jobs a suite is, and which of them are left."""
+"""The jobs of a suite, and selection of those still to run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pinnobs_gym.systems import SYSTEMS
 
 
 def default_estimators() -> tuple[str, ...]:
-    """All that can be scored on episodes they have not seen."""
+    """Return the names of all estimators that can be scored on unseen episodes."""
     return tuple(
         name
         for name, cls in ESTIMATORS.classes().items()
@@ -30,13 +30,14 @@ def default_estimators() -> tuple[str, ...]:
 
 
 def jobs_of(suite: Suite, folder: Path) -> list[Job]:
-    """The jobs of a suite, in a folder: those that train first, since they are the longest; the
-    others game by game, since what an episode's reference takes is kept from one to the next.
+    """Return the jobs of a suite in a folder.
 
-    Estimators that train on each record get their own, smaller number of episodes, a job each.
+    Jobs with training come first, since they take longest. The others are ordered by game, since
+    the references of episodes are cached from one job to the next. Estimators that train on each
+    record play fewer episodes, with one job per episode.
 
     Raises:
-        ValueError: in one line, naming what does not fit, before anything is run.
+        ValueError: in one line, naming the invalid value, before anything is run.
     """
     estimators = suite.estimators or tuple(map(Entry, default_estimators()))
     chosen = [(entry, _class(suite, entry)) for entry in estimators]
@@ -59,11 +60,11 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
 
 @dataclass(frozen=True)
 class PlannedGame:
-    """A game, and who plays it."""
+    """A game, and which estimators play it."""
 
     game: Game
     untrained_only: bool
-    """Whether estimators that need training leave it out."""
+    """Whether only estimators that need no training play it."""
 
 
 def _job(suite: Suite, entry: Entry, game: Game, folder: Path, **more: Any) -> Job:
@@ -81,8 +82,8 @@ def _job(suite: Suite, entry: Entry, game: Game, folder: Path, **more: Any) -> J
 def _learning(
     suite: Suite, entry: Entry, cls: type[Estimator], game: Game, folder: Path
 ) -> Iterator[Job]:
-    """The jobs of an estimator that learns: of each budget and seed one or, if it trains on each
-    record, one for each episode."""
+    """Yield the jobs of a trained estimator: one per budget and training seed or, if it trains on
+    each record, also one per episode."""
     seeds = [{"seed": seed} for seed in suite.training_seeds] or [{}]
     for budget, seed in product(suite.budgets, seeds):
         training = {"budget": budget, **seed, **entry.settings}
@@ -96,8 +97,8 @@ def _learning(
 
 
 def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[Job], list[Job]]:
-    """The jobs to run, each told what of it is stored already, and those that are left out since
-    they failed before; with ``retry_failed`` they are run again."""
+    """Return the jobs to run, with the keys of their stored rows, and the jobs left out because
+    they failed before; with ``retry_failed`` the latter are run again."""
     known_rows: dict[tuple[GameName, str], list[tuple[str, int | None, int]]] = defaultdict(list)
     for row in stored.rows:
         known_rows[game_of(row), row["estimator"]].append(
@@ -110,7 +111,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
         if again and not retry_failed:
             left_out.append(job)
             continue
-        known = None  # if it may have another name in rows, the job looks for itself
+        known = None  # the name in rows may be another one: the job reads the file itself
         cls = ESTIMATORS.resolve(job.estimator)
         if job.label is not None or cls.label is Estimator.label:
             name = job.label or ESTIMATORS.name_of(cls)
@@ -132,7 +133,7 @@ def _class(suite: Suite, entry: Entry) -> type[Estimator]:
 
 
 def _tables(suite: Suite, system: str) -> list[PlannedGame]:
-    """What of a system is played."""
+    """Return the games of a system in a suite."""
     try:
         cls = SYSTEMS.resolve(system)
     except ValueError as error:

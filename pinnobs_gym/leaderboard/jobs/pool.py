@@ -1,4 +1,4 @@
-"""What the engine asks of processes that run jobs, and the simplest pool: this very process."""
+"""The interface of process pools, and the simplest pool: the current process."""
 
 from __future__ import annotations
 
@@ -11,39 +11,39 @@ from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, a
 
 
 class WorkerLost(Exception):
-    """A process has died, and this job may have been its; the message says how it died."""
+    """A process died, possibly while running this job; the message has the exit codes."""
 
 
 class WorkersLost(ConnectionError):
-    """All workers are gone; what was finished is kept."""
+    """All workers are lost; finished results are kept."""
 
 
 class Pool(ABC):
-    """Processes that run jobs. As a context it is entered before the first job; left with an error,
-    it stops those that run."""
+    """Processes that run jobs. The context is entered before the first job; if it ends with an
+    error, running jobs are stopped."""
 
     size: int
-    """How many jobs it runs at a time."""
+    """Number of jobs run at a time."""
     queued: int | None
-    """How many jobs are handed to it at most, the running ones included; None for all of them."""
+    """Largest number of unfinished jobs submitted, including running ones; None for no limit."""
     children: ClassVar[bool]
-    """Whether its processes are children of this one."""
+    """Whether the workers are children of this process."""
 
     @abstractmethod
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Any:
-        """Queue an `attempt` at a job; returns its future, with an ``add_done_callback``.
+        """Queue an `attempt` at a job and return its future, which has an ``add_done_callback``.
 
         Raises:
-            WorkersLost: in one line, if all workers are gone.
+            WorkersLost: in one line, if all workers are lost.
         """
 
     @abstractmethod
     def outcome(self, future: Any) -> Outcome:
-        """What became of a job whose future is done.
+        """Return the outcome of a job whose future is done.
 
         Raises:
-            WorkerLost: if its process may have died of it; it is to be run again, alone.
-            WorkersLost: in one line, if all workers are gone.
+            WorkerLost: if the job may have killed its process; it must be run again on its own.
+            WorkersLost: in one line, if all workers are lost.
         """
 
     def __enter__(self) -> Self:
@@ -59,7 +59,7 @@ class Pool(ABC):
 
 
 class ThisProcess(Pool):
-    """Runs each job as it is handed over, in this very process."""
+    """Runs each job in the current process when it is submitted."""
 
     size = 1
     queued = 1

@@ -1,9 +1,8 @@
-"""Jobs in worker processes of this machine, which loky starts.
+"""Running jobs in worker processes of this machine, started by loky.
 
-loky's executor is that of `concurrent.futures` with what is needed here besides: its workers are
-started afresh instead of forked, on every operating system; it can be shut down at once, jobs
-that run included; and if a worker dies, whatever it was doing, the executor is broken instead of
-waiting for ever.
+loky's executor has the interface of `concurrent.futures` and three further properties: its workers
+are started afresh instead of forked, on every operating system; it can be shut down at once,
+including running jobs; and if a worker dies, the executor breaks instead of waiting for ever.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkerLost
 from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt, interrupts
 
 IDLE = 300
-"""Seconds after which workers end that have nothing to do; the next run uses them until then."""
+"""Seconds after which idle workers exit; the next run may reuse them until then."""
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -30,32 +29,32 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-"""Environment of the workers: one thread for each numerical library."""
+"""Environment of the workers: one thread per numerical library."""
 
 
 class ProcessPool(Pool):
     """Worker processes of this machine.
 
-    If one dies, all that were handed jobs are lost with it, and are replaced for the next job.
+    If one dies, all submitted jobs are lost with it; new workers are started for the next job.
 
     Args:
-        size: how many.
+        size: number of processes.
     """
 
     children = True
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self.queued = 2 * size  # so that no worker waits for its next job
+        self.queued = 2 * size  # a worker always finds its next job in the queue
         self._executor = self._usable()
 
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future[Outcome]:
-        with interrupts(signal.SIG_IGN, unless=signal.SIG_IGN):  # which new workers inherit
+        with interrupts(signal.SIG_IGN, unless=signal.SIG_IGN):  # inherited by new workers
             while True:
                 self._executor = self._usable()
                 try:
                     return self._executor.submit(attempt, number, job, origin)
-                except BrokenProcessPool:  # just now
+                except BrokenProcessPool:  # it broke since the check
                     continue
 
     def outcome(self, future: Future[Outcome]) -> Outcome:
@@ -75,8 +74,8 @@ class ProcessPool(Pool):
             self._executor.shutdown(kill_workers=True)
 
     def _usable(self) -> ProcessPoolExecutor:
-        """The executor, or a new one in its place if it is broken. Workers ignore Ctrl-C, also
-        those that loky starts later: it is for the client, which then stops them."""
+        """Return the executor, or a new one if it is broken. Workers ignore Ctrl-C, including those
+        that loky starts later: the client handles it and stops them."""
         return get_reusable_executor(
             self.size,
             timeout=IDLE,

@@ -1,4 +1,4 @@
-"""What happens to a job in a worker, whichever process that is."""
+"""Execution of a job in a worker process of any pool."""
 
 from __future__ import annotations
 
@@ -21,69 +21,70 @@ from pinnobs_gym.files import is_held
 from pinnobs_gym.scoring.rows import CannotWrite
 
 SEEN_AFTER = 5.0
-"""Seconds that a file takes at most to be seen on other machines of a shared folder."""
+"""Longest time in s until other machines of a shared folder see a new file."""
 
 
 class PicklableJob(Protocol):
-    """What the engine runs: anything that can be pickled and does all of its work by itself."""
+    """A job for the engine: it can be pickled and needs nothing but its own fields."""
 
     @property
     def folder(self) -> Path:
-        """Where it writes."""
+        """The folder to which it writes."""
         ...
 
     @property
     def name(self) -> str:
-        """What it does, in a few words."""
+        """Short description of the job."""
         ...
 
     def run(self) -> None:
-        """Do the work and write what comes of it."""
+        """Do the work and write its results."""
 
     def anew(self) -> Self:
-        """The same job, to be run although it was under way before."""
+        """Return the same job, to be run again after an interrupted attempt."""
         ...
 
     def fail(self, error: str) -> None:
-        """Write down what went wrong.
+        """Record an error.
 
         Raises:
-            CannotWrite: if it cannot.
+            CannotWrite: if it cannot be written.
         """
 
 
 class Outcome(NamedTuple):
-    """What became of a job."""
+    """The outcome of a job."""
 
     error: str | None
-    """What went wrong, in one line; None if nothing."""
+    """The error in one line; None if the job succeeded."""
     ends_all: bool = False
-    """Whether no other job would fare better."""
+    """Whether no other job can succeed either."""
     died: bool = False
-    """Whether its process died, and could not say so."""
+    """Whether its process died without reporting an outcome."""
 
 
 class Origin(NamedTuple):
-    """The client: the process that hands out the jobs."""
+    """The client: the process that submits the jobs."""
 
     pid: int
     host: str
     folder: str
     """Working folder, where plug-ins may be."""
     mark: Path
-    """A folder that is there, and is held by the client, while jobs are run. By it workers know
-    that they see the folder that is written to. For each job that has ended there is a file in it,
-    named by the job's number, that holds what went wrong."""
+    """A folder that exists, and is held by the client, while jobs are run. Its existence shows a
+    worker that it sees the folder to which rows are written. It holds a file for each job that has
+    ended, named by the job's number, with the error as content."""
     children: bool
     """Whether workers are children of the client."""
 
 
 _ONE_AT_A_TIME = threading.Lock()
-"""Jobs of one process run after each other: numerical libraries share state between threads."""
+"""Serialises the jobs of a process: numerical libraries share state between threads."""
 
 
 def attempt(number: int, job: PicklableJob, origin: Origin) -> Outcome:
-    """Run a job in a worker, unless that was done and the worker died before it could say so."""
+    """Run a job in a worker, unless an earlier attempt finished and its worker died before
+    reporting it."""
     with _ONE_AT_A_TIME:
         try:
             _prepare(origin)
@@ -97,7 +98,7 @@ def attempt(number: int, job: PicklableJob, origin: Origin) -> Outcome:
 
 
 def _run(job: PicklableJob) -> str | None:
-    """Run a job; what went wrong, in one line, is written down."""
+    """Run a job; record and return its error in one line, None if it succeeded."""
     try:
         with interrupts(_stop, only=signal.default_int_handler):
             job.run()
@@ -113,7 +114,8 @@ def _run(job: PicklableJob) -> str | None:
 
 
 def _earlier_outcome(number: int, mark: Path) -> Outcome | None:
-    """What became of a job that has ended already; nothing went wrong if nobody waits for it."""
+    """Return the outcome of a job that has already ended, None if it has not. Report success if the
+    client no longer waits for the job."""
     try:
         return Outcome((mark / str(number)).read_text(encoding="utf-8") or None)
     except OSError:
@@ -121,19 +123,19 @@ def _earlier_outcome(number: int, mark: Path) -> Outcome | None:
 
 
 def _note(number: int, outcome: Outcome, mark: Path) -> None:
-    """Write down that a job has ended."""
+    """Record that a job has ended."""
     unfinished = mark / f"{number}.{uuid4().hex}"
     try:
         unfinished.write_text(outcome.error or "", encoding="utf-8")
         os.replace(unfinished, mark / str(number))
-    except FileNotFoundError:  # nobody waits for the outcome any more
+    except FileNotFoundError:  # the client no longer waits for the outcome
         return
     except OSError as cause:
         raise CannotWrite(f"cannot write {mark / str(number)}: {cause}") from None
 
 
 def _prepare(origin: Origin) -> None:
-    """Make a process ready for jobs, and see that it can do them.
+    """Prepare a process for jobs, and check that it sees the client's folder.
 
     Raises:
         CannotWrite: if it does not see the folder.
@@ -142,10 +144,10 @@ def _prepare(origin: Origin) -> None:
     if (here, os.getpid()) == (origin.host, origin.pid):
         return
     if origin.children and _is_orphan(origin):
-        os._exit(1)  # nobody waits for this job
+        os._exit(1)  # the client no longer waits for this job
     _one_thread()
     if origin.folder not in sys.path:
-        sys.path.append(origin.folder)  # for module:Class of the user's folder
+        sys.path.append(origin.folder)  # to import module:Class from the user's folder
     deadline = time.monotonic() + SEEN_AFTER
     while not origin.mark.exists():
         if time.monotonic() > deadline:
@@ -157,20 +159,24 @@ def _prepare(origin: Origin) -> None:
 
 
 def _is_orphan(origin: Origin) -> bool:
-    """Whether the client was killed. On Windows a process keeps its parent's number for good."""
+    """Return whether the client was killed. On Windows a process keeps its parent's id, so that the
+    client's lock is checked instead."""
     return os.getppid() != origin.pid if os.name == "posix" else not is_held(origin.mark)
 
 
 @cache
 def _one_thread() -> None:
-    """Run numerical libraries on one thread, once for a process."""
+    """Limit numerical libraries to one thread, once per process."""
     threadpool_limits(1)
 
 
 @contextmanager
 def interrupts(handler: Any, *, only: Any = None, unless: Any = None) -> Iterator[None]:
-    """Another handler of Ctrl-C, in the main thread: in place of ``only`` this one, or of any
-    ``unless`` it is that one."""
+    """Install a handler of Ctrl-C for the duration of the context, in the main thread only.
+
+    With ``only``, the present handler is replaced only if it is that one; with ``unless``, only if
+    it is not that one.
+    """
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
     if before is None or before is unless or (only is not None and before is not only):
@@ -184,8 +190,8 @@ def interrupts(handler: Any, *, only: Any = None, unless: Any = None) -> Iterato
 
 
 class _Stopped(BaseException):
-    """Ctrl-C while a job is run in this very process. Trainers answer to a KeyboardInterrupt with
-    what they have so far, which must not be scored."""
+    """Ctrl-C during a job in the current process. It differs from KeyboardInterrupt, on which
+    trainers return their result so far, which must not be scored."""
 
 
 def _stop(number: int, frame: object) -> None:

@@ -1,8 +1,8 @@
-"""Suites: what a leaderboard plays, each a TOML file.
+"""Suites: the games and estimators of a leaderboard, each a TOML file.
 
-Those of this folder are known by their names, and a file put here is found; a user's own is given
-by its path. Each key is a field of `Suite`, and every key may be left out. An estimator is a name,
-``module:Class``, or a table of ``name``, ``label`` (its name in tables) and ``settings``::
+A file in this folder is known by its name; any other is given by its path. Each key is a field of
+`Suite`, and every key is optional. An estimator is a name, ``module:Class``, or a table of
+``name``, ``label`` (its name in tables) and ``settings``::
 
     systems = ["ReverseDuffing", "my_module:VanDerPol"]
     estimators = ["ekf", { name = "ekf", label = "robust ekf", settings = { huber = 1.345 } }]
@@ -24,50 +24,52 @@ FOLDER = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Entry:
-    """An estimator that is played."""
+    """An estimator of a suite."""
 
     name: str
     """Name or ``module:Class``."""
     label: str | None = None
-    """Its name in tables, if not its own."""
+    """Its name in tables; its own name if None."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Its settings or, if it learns, its trainer's."""
+    """Its settings or, if it is trained, its trainer's."""
 
 
 @dataclass(frozen=True)
 class Suite:
-    """What is played: the cross of systems, estimators and conditions."""
+    """The combinations of systems, estimators and conditions to play."""
 
     systems: tuple[str, ...] = ()
-    """Names or ``module:Class``; all that are known if empty."""
+    """Names or ``module:Class``; all known systems if empty."""
     estimators: tuple[Entry, ...] = ()
-    """All that can be ranked if empty."""
+    """All estimators that can be ranked if empty."""
     conditions: tuple[str, ...] = ()
-    """Nominal, and the one that a system is ranked under, if empty. With "all", those that need no
-    training play every condition that fits the system as well."""
+    """If empty, nominal and the system's ranked condition. With "all", estimators that need no
+    training also play every other condition that applies to the system."""
     setup: str = "benchmark"
     """Setup that is played."""
     episodes: int = 100
     """Episodes of each estimator and system."""
     trained_episodes: int = 5
-    """Episodes of those that train on every record."""
+    """Episodes of estimators that train on every record."""
     seed: int = 0
     """Seed of the first episode."""
     training_seeds: tuple[int, ...] = ()
-    """Seeds of each training; the trainer's own if empty."""
+    """Seeds of each training; the trainer's default if empty."""
     budgets: tuple[float, ...] = (45.0,)
-    """CPU seconds of each training, one after the other."""
+    """CPU seconds of each training; each budget is a separate training."""
     file: str = field(default="", kw_only=True)
-    """Where it was read from."""
+    """The file it was read from."""
     given: frozenset[str] = field(default=frozenset(), kw_only=True)
-    """The keys that the file gives."""
+    """The keys present in the file."""
 
     def wrong(self, key: str, what: object) -> ValueError:
-        """An error in what a key says, naming the file and the key, if it stands in one."""
+        """Return an error about the value of a key, naming the file and the key if the key is in
+        the file."""
         return ValueError(f"{self.file}: {key}: {what}" if key in self.given else str(what))
 
     def changed(self, **changes: Any) -> Suite:
-        """The suite with other values, checked; those that are None or empty change nothing.
+        """Return the suite with other values, checked; values that are None or empty change
+        nothing.
 
         Raises:
             ValueError: in one line, naming the value and what was expected.
@@ -79,12 +81,12 @@ class Suite:
 
 
 def names() -> list[str]:
-    """The suites that are known by name."""
+    """Return the names of the suites in this folder."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def load(spec: str) -> Suite:
-    """A suite by its name or its file's path.
+    """Load a suite by its name or its file's path.
 
     Raises:
         ValueError: in one line, naming the file, the key, its value and what was expected.
@@ -114,7 +116,7 @@ def load(spec: str) -> Suite:
 
 
 def _checked(key: str, value: Any) -> Any:
-    """A value as the suite keeps it."""
+    """Check a value and return it in the form that the suite stores."""
     expected, fits = _EXPECTED[key]
     several = key in _SEVERAL
     if several and not isinstance(value, list):
@@ -177,4 +179,4 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
         lambda v: type(v) in (int, float) and 0 < v < float("inf"),
     ),
 }
-"""What each key takes."""
+"""The expected value of each key, in words and as a check of one item."""
