@@ -18,7 +18,7 @@ from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.cli.system_page import field_docs, page, variable_docs
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.leaderboard.standings_table import markdown_table
@@ -123,7 +123,7 @@ def _episode(cls: type[System]) -> Any:
     return play(game, ekf, [0]).figure(f"{game.name.env_id}, {game.name.condition}: ekf")
 
 
-def estimator_page(name: str, cls: type[Estimator]) -> str:
+def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
     """What an estimator is, what it knows, its equations and settings."""
     trainer = cls.needs_training or cls.trains_on_record
     told = [
@@ -135,7 +135,7 @@ def estimator_page(name: str, cls: type[Estimator]) -> str:
     parts = [f"# {name}\n", docstring(cls), "\n", markdown_table(("", ""), told)]
     if cls.equations:
         parts += ["\n## Equations\n", _math(cls.equations), _NOTATION]
-    base = {f.name for f in fields(Estimator)}
+    base = {f.name for f in fields(BaseEstimator)}
     lines = _settings(cls, {f.name for f in fields(cls) if f.name not in base and f.repr})
     if lines:
         parts += ["\n## Settings\n", "On the command line `--set name=value`.\n"]
@@ -229,7 +229,7 @@ def _sizes(system: System) -> tuple[str, str, str]:
     return states, outputs, inputs
 
 
-def _estimators(estimators: Mapping[str, type[Estimator]]) -> str:
+def _estimators(estimators: Mapping[str, type[BaseEstimator]]) -> str:
     lines = [
         (f"[{name}]({name}.md)", cls.track, ", ".join(cls.knows), first_line(cls))
         for name, cls in estimators.items()

@@ -45,19 +45,19 @@ def register(cls: type) -> type:
     """Make a system or an estimator of your own known by its name; usable as a decorator.
 
     A `System` becomes an env (``pinnobs/<class name>-v<version>``), and every estimator, trainer
-    and command takes it. An `Estimator` is then found by its class attribute ``name``.
+    and command takes it. An estimator is then found by its class attribute ``name``.
 
     Raises:
         TypeError: in one line, if the class is neither or is not complete.
         ValueError: if its name is taken.
     """
-    from pinnobs_gym.estimation.estimator import Estimator
+    from pinnobs_gym.estimation.estimator import BaseEstimator
     from pinnobs_gym.estimators import ESTIMATORS
     from pinnobs_gym.simulation.system import System
 
     if isinstance(cls, type) and issubclass(cls, System):
         register_system(cls)
-    elif isinstance(cls, type) and issubclass(cls, Estimator):
+    elif isinstance(cls, type) and issubclass(cls, BaseEstimator):
         ESTIMATORS.register(cls)
     else:
         raise TypeError(f"{cls!r} is neither a System nor an Estimator")

@@ -25,7 +25,7 @@ import tyro
 from pinnobs_gym import evaluate
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.learned.trained_file import check_same, plain
 from pinnobs_gym.estimators.sb3 import Sb3
 from pinnobs_gym.files import check_writable
@@ -68,7 +68,7 @@ class Main:
             for seed in range(self.seed, self.seed + self.seeds):
                 self._score(name, self._trained(name, seed), f"{self.algorithm}, seed {seed}")
 
-    def _trained(self, name: str, seed: int) -> Estimator:
+    def _trained(self, name: str, seed: int) -> BaseEstimator:
         """The agent, trained unless its file is there."""
         changes = {"seed": seed, "steps": self.steps, "budget": self.budget}
         config = RLTrainer.configured({"preset": self.algorithm, **changes})
@@ -91,7 +91,7 @@ class Main:
         check_same(path, made.trained.config, plain(asdict(config)))
         return made
 
-    def _score(self, name: str, estimator: Estimator | str, label: str) -> None:
+    def _score(self, name: str, estimator: BaseEstimator | str, label: str) -> None:
         results = self.out / "rows.jsonl"
         rows = evaluate(estimator, env_id(name), episodes=self.episodes, results=results)
         tail, whole = (_median(rows, part) for part in ("nrmse_tail_modulo", "nrmse_modulo"))

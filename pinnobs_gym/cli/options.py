@@ -11,7 +11,7 @@ from typing import Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 import tyro
 from rich.text import Text
 
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.registry import TRAINERS
 
 T = TypeVar("T")
@@ -47,13 +47,13 @@ def _first_of(box: str) -> str:
     return next(filter(None, said), "the arguments are wrong").removesuffix(".")
 
 
-def settings_of(cls: type[Estimator], settings: Sequence[str]) -> dict[str, Any]:
+def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, Any]:
     """The values of ``name=value`` settings of an estimator, or of the recipe it trains by.
 
     Raises:
         ValueError: in one line, naming what is unknown and what is known.
     """
-    base = {f.name for f in fields(Estimator)}
+    base = {f.name for f in fields(BaseEstimator)}
     own = {f.name: f for f in fields(cls) if f.name not in base and f.repr}
     trained_by = cls.trains_on_record
     hints = {n: h for n, h in get_type_hints(cls).items() if n in own}

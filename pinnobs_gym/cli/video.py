@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.files import check_writable
 
 FPS = 30.0
@@ -53,7 +53,7 @@ def check_video(path: Path) -> None:
     check_writable(path.parent)
 
 
-def write_video(path: Path, estimator: Estimator, game: Game, seed: int) -> Pace:
+def write_video(path: Path, estimator: BaseEstimator, game: Game, seed: int) -> Pace:
     """Write the video of an episode, from its first sample to its last, which is held for a second;
     a file that is there is replaced when the new one is whole.
 

@@ -1,34 +1,16 @@
-"""Adapters: estimators that see whole records, and objects that estimate one episode."""
+"""The adapter of objects that estimate one episode."""
 
 from __future__ import annotations
 
 import copy
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
-from pinnobs_gym.simulation.record import Prior, Record
-
-
-@dataclass(frozen=True)
-class OfflineEstimator(Estimator):
-    """An estimator that sees an episode's whole record before it estimates any of it."""
-
-    track = "offline"
-
-    @abstractmethod
-    def run(self, record: Record) -> Estimates:
-        """The estimates over whole records."""
-
-    def reset(self, prior: Prior) -> State:
-        raise TypeError(f"{type(self).__name__} is offline: it takes whole records; call run")
-
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        raise TypeError(f"{type(self).__name__} is offline: it takes whole records; call run")
+from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.simulation.record import Prior
 
 
 class SingleEpisode(Protocol):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates, Estimator, State
 from pinnobs_gym.simulation.checks import initial_states
 from pinnobs_gym.simulation.conformance import (
     Found,
@@ -35,7 +35,7 @@ the EKF of the induction motor to 3e-12."""
 NUM_SAMPLES = 40
 """Length of the records on which estimators are checked."""
 
-ESTIMATOR_CHECKS: dict[str, Callable[[Estimator], None]] = {}
+ESTIMATOR_CHECKS: dict[str, Callable[[BaseEstimator], None]] = {}
 """The checks of an estimator, by name. Each raises `CheckFailed`.
 
 An offline estimator is only held to those that make sense for one: ``immutable``,
@@ -43,19 +43,19 @@ An offline estimator is only held to those that make sense for one: ``immutable`
 """
 
 
-def check_estimator(estimator: Estimator) -> None:
+def check_estimator(estimator: BaseEstimator) -> None:
     """Run all of `ESTIMATOR_CHECKS` on an estimator, on short records of its own system.
 
     Raises:
         CheckFailed: if any fails, with a line for each: its name, what was found and expected.
         TypeError: in one line, if it is not an instance.
     """
-    if not isinstance(estimator, Estimator):
+    if not isinstance(estimator, BaseEstimator):
         raise TypeError(f"{estimator!r} is not an instance of an Estimator; expected one")
     run_all(ESTIMATOR_CHECKS, estimator)
 
 
-def _record(estimator: Estimator, batch: int = 3, *, irregular: bool = False) -> Record:
+def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False) -> Record:
     """A short record of the estimator's own system, with the benchmark's initial states and noise.
 
     It is simulated here, and not taken from an env, which would register a system that is only
@@ -86,7 +86,7 @@ def _updates(estimator: Estimator, record: Record) -> Iterator[State]:
 
 
 def _require_same(
-    estimator: Estimator, a: Estimates, b: Estimates, tolerance: float, what: str
+    estimator: BaseEstimator, a: Estimates, b: Estimates, tolerance: float, what: str
 ) -> None:
     """All that two runs return must agree."""
     for field in fields(Estimates):
@@ -102,12 +102,8 @@ def _require_same(
             require_close(left, right, tolerance, size, f"{field.name} of {what}")
 
 
-def _online(estimator: Estimator) -> bool:
-    return estimator.track == "online"
-
-
 @add_check(ESTIMATOR_CHECKS, "immutable")
-def _estimator_immutable(estimator: Estimator) -> None:
+def _estimator_immutable(estimator: BaseEstimator) -> None:
     """The estimator is immutable."""
     cls = type(estimator)
     params = vars(cls).get("__dataclass_params__")
@@ -119,12 +115,14 @@ def _estimator_immutable(estimator: Estimator) -> None:
 
 
 @add_check(ESTIMATOR_CHECKS, "shapes")
-def _estimator_shapes(estimator: Estimator) -> None:
+def _estimator_shapes(estimator: BaseEstimator) -> None:
     """Estimates, covariances and innovations have their shapes and are finite."""
     record = _record(estimator)
     batch, n, nx, ny = record.batch, record.num_samples, estimator.system.nx, estimator.system.ny
     expected = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
-    for k, state in enumerate(_updates(estimator, record) if _online(estimator) else ()):
+    for k, state in enumerate(
+        _updates(estimator, record) if isinstance(estimator, Estimator) else ()
+    ):
         when = "after reset" if k == 0 else f"after sample {k - 1}"
         _check_values(state, (batch,), expected, when)
         t = None if k == 0 else record.t[k - 1]
@@ -153,7 +151,7 @@ def _check_values(
 
 
 @add_check(ESTIMATOR_CHECKS, "rows_independent")
-def _estimator_rows_independent(estimator: Estimator) -> None:
+def _estimator_rows_independent(estimator: BaseEstimator) -> None:
     """A row of a batch gives the same as that row alone."""
     record = _record(estimator)
     together = estimator.run(record)
@@ -172,7 +170,7 @@ def _rows(estimates: Estimates, rows: slice) -> Estimates:
 
 
 @add_check(ESTIMATOR_CHECKS, "purity")
-def _estimator_purity(estimator: Estimator) -> None:
+def _estimator_purity(estimator: BaseEstimator) -> None:
     """The same record gives the same estimates, and neither it nor earlier states are modified."""
     record = _record(estimator)
     before = _copy(record)
@@ -183,7 +181,7 @@ def _estimator_purity(estimator: Estimator) -> None:
         require(np.array_equal(array, kept[name]), f"run modifies {name} of the record")
     again = estimator.run(record)
     _require_same(estimator, again, first, 0.0, "a second run and the first")
-    if _online(estimator):
+    if isinstance(estimator, Estimator):
         states = [(state, state.xhat.copy()) for state in _updates(estimator, _copy(record))]
         for k, (state, xhat) in enumerate(states):
             same = np.array_equal(state.xhat, xhat, equal_nan=True)
@@ -210,9 +208,9 @@ def _copy(record: Record) -> Record:
 
 
 @add_check(ESTIMATOR_CHECKS, "causality")
-def _estimator_causality(estimator: Estimator) -> None:
+def _estimator_causality(estimator: BaseEstimator) -> None:
     """Changing later outputs changes no earlier estimate."""
-    if not _online(estimator):
+    if not isinstance(estimator, Estimator):
         return
     record = _record(estimator)
     xhat = estimator.run(record).xhat
@@ -226,9 +224,9 @@ def _estimator_causality(estimator: Estimator) -> None:
 
 
 @add_check(ESTIMATOR_CHECKS, "missing_samples")
-def _estimator_missing_samples(estimator: Estimator) -> None:
+def _estimator_missing_samples(estimator: BaseEstimator) -> None:
     """A NaN in y is a missing sample, and none sticks; all may be missing."""
-    if not _online(estimator):
+    if not isinstance(estimator, Estimator):
         return
     record = _record(estimator)
     rng = np.random.default_rng(3)
@@ -255,9 +253,9 @@ def _estimator_missing_samples(estimator: Estimator) -> None:
 
 
 @add_check(ESTIMATOR_CHECKS, "irregular_times")
-def _estimator_irregular_times(estimator: Estimator) -> None:
+def _estimator_irregular_times(estimator: BaseEstimator) -> None:
     """Samples may come at irregular times."""
-    if not _online(estimator):
+    if not isinstance(estimator, Estimator):
         return
     record = _record(estimator, irregular=True)
     xhat = estimator.run(record).xhat
@@ -266,9 +264,9 @@ def _estimator_irregular_times(estimator: Estimator) -> None:
 
 
 @add_check(ESTIMATOR_CHECKS, "run_equals_updates")
-def _estimator_run_equals_updates(estimator: Estimator) -> None:
+def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
     """`run` gives what looping `update` does."""
-    if not _online(estimator):
+    if not isinstance(estimator, Estimator):
         return
     for irregular in (False, True):
         record = _record(estimator, irregular=irregular)
@@ -285,9 +283,9 @@ def _estimator_run_equals_updates(estimator: Estimator) -> None:
 
 
 @add_check(ESTIMATOR_CHECKS, "diverging_row")
-def _estimator_diverging_row(estimator: Estimator) -> None:
+def _estimator_diverging_row(estimator: BaseEstimator) -> None:
     """A row that diverges is marked by what it holds; it neither raises nor touches the others."""
-    if not _online(estimator):
+    if not isinstance(estimator, Estimator):
         return
     record = _record(estimator)
     others = np.array([0, 2])
@@ -304,7 +302,7 @@ def _estimator_diverging_row(estimator: Estimator) -> None:
 
 
 @add_check(ESTIMATOR_CHECKS, "save_load")
-def _estimator_save_load(estimator: Estimator) -> None:
+def _estimator_save_load(estimator: BaseEstimator) -> None:
     """What can be saved is the same when loaded."""
     cls: Any = type(estimator)
     if not (hasattr(cls, "save") and hasattr(cls, "load")):

@@ -65,13 +65,12 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Estimator(ABC):
-    """An online estimator: x̂(k|k) from y₀..y_k, for a batch of episodes at once.
+class BaseEstimator(ABC):
+    """What estimators have in common, `Estimator` the online and `OfflineEstimator` the offline
+    ones.
 
-    It is immutable, and its running state is explicit: `reset` makes one from the prior, and each
-    `update` makes the next from one sample, the first of which is y₀. An estimator sees outputs,
-    inputs and the model alone: the model may differ from the true plant, and the state, the
-    reward and an env's ``info`` are not shown to it.
+    They are immutable. An estimator sees outputs, inputs and the model alone: the model may differ
+    from the true plant, and the state, the reward and an env's ``info`` are not shown to it.
     """
 
     system: System
@@ -80,7 +79,7 @@ class Estimator(ABC):
     """The standard deviation of the output noise that the estimator is told, in output units; the
     benchmark's if None."""
 
-    track: ClassVar[str] = "online"
+    track: ClassVar[str]
     """``online`` (causal) or ``offline`` (sees the whole record first); ranked apart."""
     trains_on_record: ClassVar[str | None] = None
     """The name of the trainer that it runs on every record it is given, if it does."""
@@ -100,6 +99,51 @@ class Estimator(ABC):
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
         """The estimator with default tuning for a model and what a setup says of the noise."""
         return cls(system, noise_std=setup.noise_std, **options)
+
+    @abstractmethod
+    def run(self, record: Record) -> Estimates:
+        """The estimates over whole records."""
+
+    @property
+    def output_variance(self) -> np.ndarray:
+        """Diagonal of R, shape (ny,), in squared output units.
+
+        Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; see
+        `output_scale`.
+        """
+        benchmark = self.system.setups["benchmark"].noise_std
+        known_noise = benchmark if self.noise_std is None else self.noise_std
+        std = vector(known_noise, self.system.ny, "noise_std")
+        if not (np.isfinite(std).all() and (std >= 0).all()):
+            raise ValueError(f"noise_std={known_noise}; expected numbers of at least 0")
+        return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
+
+    @property
+    def label(self) -> str:
+        """Its name in tables: the class attribute ``name``, or else the class's own."""
+        return getattr(type(self), "name", type(self).__name__)
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How it was trained, in plain numbers and strings; empty for those that are not."""
+        return {}
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Its own settings by name, beyond the model and the noise."""
+        own = {f.name for f in fields(BaseEstimator)}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in own and f.repr}
+
+
+@dataclass(frozen=True)
+class Estimator(BaseEstimator):
+    """An online estimator: x̂(k|k) from y₀..y_k, for a batch of episodes at once.
+
+    Its running state is explicit: `reset` makes one from the prior, and each `update` makes the
+    next from one sample, the first of which is y₀.
+    """
+
+    track = "online"
 
     @abstractmethod
     def reset(self, prior: Prior) -> State:
@@ -137,35 +181,13 @@ class Estimator(ABC):
             raise TypeError(f"{name}.{method} returned {kind}; expected a State")
         return state
 
-    @property
-    def output_variance(self) -> np.ndarray:
-        """Diagonal of R, shape (ny,), in squared output units.
 
-        Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; see
-        `output_scale`.
-        """
-        benchmark = self.system.setups["benchmark"].noise_std
-        known_noise = benchmark if self.noise_std is None else self.noise_std
-        std = vector(known_noise, self.system.ny, "noise_std")
-        if not (np.isfinite(std).all() and (std >= 0).all()):
-            raise ValueError(f"noise_std={known_noise}; expected numbers of at least 0")
-        return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
+@dataclass(frozen=True)
+class OfflineEstimator(BaseEstimator):
+    """An estimator that sees an episode's whole record before it estimates any of it; it has `run`
+    alone."""
 
-    @property
-    def label(self) -> str:
-        """Its name in tables: the class attribute ``name``, or else the class's own."""
-        return getattr(type(self), "name", type(self).__name__)
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """How it was trained, in plain numbers and strings; empty for those that are not."""
-        return {}
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Its own settings by name, beyond the model and the noise."""
-        own = {f.name for f in fields(Estimator)}
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in own and f.repr}
+    track = "offline"
 
 
 def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.estimator import BaseEstimator, Range, State
 from pinnobs_gym.estimation.kalman import predict
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, vector
 
 
 @dataclass(frozen=True)
-class GaussianEstimator(Estimator):
-    """What estimators that carry a mean and a covariance are told.
+class GaussianEstimator(BaseEstimator):
+    """The settings of estimators that carry a mean and a covariance.
 
     The same rule for all systems: x̂₀ and P₀ from the prior, R diagonal from the noise level they
-    are told (`Estimator.output_variance`), Q = diag(`process_noise`·scale)² per sample.
+    are given (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)² per sample.
     """
 
     process_noise: float = 1e-4

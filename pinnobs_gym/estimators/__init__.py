@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from pinnobs_gym.registry import Registry
 
 if TYPE_CHECKING:
-    from pinnobs_gym.estimation.estimator import Estimator
+    from pinnobs_gym.estimation.estimator import BaseEstimator
 
-ESTIMATORS: Registry[Estimator] = Registry(
-    "estimator", "pinnobs_gym.estimation.estimator:Estimator", __name__, "name"
+ESTIMATORS: Registry[BaseEstimator] = Registry(
+    "estimator", "pinnobs_gym.estimation.estimator:BaseEstimator", __name__, "name"
 )
 """All estimators by name."""

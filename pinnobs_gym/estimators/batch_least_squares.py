@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimation.adapters import OfflineEstimator
-from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
 from pinnobs_gym.simulation.matrices import sandwich
@@ -25,7 +24,7 @@ class BatchLeastSquares(OfflineEstimator):
     are those of the smoothed states, Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`).
+    given (`BaseEstimator.output_variance`).
     """
 
     max_iterations: int = 20

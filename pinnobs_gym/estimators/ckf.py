@@ -15,7 +15,7 @@ class CKF(SigmaPointFilter):
     x̂ ± √nx·columns of √P, of equal weight.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
     """
 
     name = "ckf"

@@ -40,7 +40,7 @@ class EKF(RecursiveEstimator, GaussianEstimator):
     positive semidefinite. A missing output leaves its part of the update out.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
     """
 
     gate: float | None = None

@@ -43,7 +43,7 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     mean over the ensemble is removed.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
     """
 
     members: int = 50

@@ -25,7 +25,7 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     the sum of variances over scale².
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), θ by 20 time constants per benchmark episode.
+    given (`BaseEstimator.output_variance`), θ by 20 time constants per benchmark episode.
     """
 
     process_noise: float = 0.0

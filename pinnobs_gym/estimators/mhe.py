@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Range, State
+from pinnobs_gym.estimation.estimator import Estimator, Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
 from pinnobs_gym.estimation.least_squares import Fit, linearised
@@ -37,7 +37,7 @@ class WindowMemory:
 
 
 @dataclass(frozen=True)
-class MHE(GaussianEstimator):
+class MHE(Estimator, GaussianEstimator):
     """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the model's trajectory over the last
     samples that is nearest to their outputs and to what was known before them.
 
@@ -48,7 +48,7 @@ class MHE(GaussianEstimator):
     than the record is the whole of it.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), Q = (`process_noise`·scale)² between windows.
+    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)² between windows.
     """
 
     process_noise: float = 2e-5

@@ -50,7 +50,7 @@ class ParticleFilter(RecursiveEstimator):
     results are reproducible, and an episode's does not depend on those estimated with it.
 
     Default tuning, the same rule for all systems: particles from the Gaussian prior, the likelihood
-    from the noise level it is told (`Estimator.output_variance`).
+    from the noise level it is given (`BaseEstimator.output_variance`).
     """
 
     particles: int = 500

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.estimation.adapters import OfflineEstimator
-from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.estimation.estimator import Estimates, Estimator, OfflineEstimator, State
 from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained

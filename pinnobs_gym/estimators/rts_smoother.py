@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.estimation.adapters import OfflineEstimator
-from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.smoother import backward, forward
 from pinnobs_gym.simulation.record import Record
@@ -23,7 +22,7 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
     not.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
     """
 
     name = "rts_smoother"

@@ -24,7 +24,7 @@ class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
     of R⁻¹, in one unit. Joseph's form; a missing output counts as no innovation.
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), and the numbers below.
+    given (`BaseEstimator.output_variance`), and the numbers below.
     """
 
     gamma: float = 1e-6

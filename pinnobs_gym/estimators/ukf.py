@@ -18,7 +18,7 @@ class UKF(SigmaPointFilter):
     covariances the centre has β more (van der Merwe 2004).
 
     Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    told (`Estimator.output_variance`), Q = (`process_noise`·scale)².
+    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
     """
 
     beta: float = 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.scoring.metrics import DIVERGED
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.rows import Row
@@ -32,7 +32,7 @@ class Replay:
         return self.played.scores.rows()[0]
 
 
-def replays(estimator: Estimator, game: Game, seed: int) -> list[Replay]:
+def replays(estimator: BaseEstimator, game: Game, seed: int) -> list[Replay]:
     """Run an estimator on the record of that seed; on one from the same initial state with fresh
     output noise of the benchmark's size; and on two from other initial states.
 

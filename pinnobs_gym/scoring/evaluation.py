@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
@@ -45,7 +45,7 @@ class Results:
 
 
 def evaluate(
-    estimator: Estimator | type[Estimator] | str,
+    estimator: BaseEstimator | type[BaseEstimator] | str,
     env_id: str,
     *,
     episodes: int = 100,
@@ -120,7 +120,7 @@ class Evaluated:
 
 def run_episodes(
     game: Game,
-    estimator: Estimator,
+    estimator: BaseEstimator,
     seeds: range,
     results: Results | None = None,
     progress: Callable[[int], None] | None = None,
@@ -163,8 +163,8 @@ def _scored(played: Played) -> list[Row]:
 
 
 def make_estimator(
-    estimator: Estimator | type[Estimator] | str, game: Game, options: Mapping[str, Any]
-) -> Estimator:
+    estimator: BaseEstimator | type[BaseEstimator] | str, game: Game, options: Mapping[str, Any]
+) -> BaseEstimator:
     """The estimator that a name, a class or an instance means in a game.
 
     Raises:
@@ -172,7 +172,7 @@ def make_estimator(
             options, or has another model than the game's.
     """
     system, setup = game.source.system, game.source.setup
-    if isinstance(estimator, Estimator):
+    if isinstance(estimator, BaseEstimator):
         if options:
             raise ValueError(f"options {dict(options)} go with a name or a class, not an instance")
         _check_model(estimator.system, system)
@@ -197,7 +197,7 @@ def _check_model(model: System, system: System) -> None:
         raise ValueError(f"the estimator's model is {found}; the env plays {expected}")
 
 
-def _common(estimator: Estimator, game: Game) -> Row:
+def _common(estimator: BaseEstimator, game: Game) -> Row:
     """What all rows of an evaluation share."""
     system = game.source.system
     identity = {

@@ -12,7 +12,7 @@ import numpy as np
 
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.envs.game import Game, GameName
-from pinnobs_gym.estimation.estimator import Estimates, Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates
 from pinnobs_gym.scoring.cramer_rao import Reference, reference
 from pinnobs_gym.scoring.metrics import Scores, score
 from pinnobs_gym.simulation.record import Record
@@ -90,7 +90,7 @@ class Played:
 
 
 def play(
-    game: Game, estimator: Estimator, seeds: Sequence[int], x0: np.ndarray | None = None
+    game: Game, estimator: BaseEstimator, seeds: Sequence[int], x0: np.ndarray | None = None
 ) -> Played:
     """Run an estimator on the episodes of a game.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.metrics import score
 from pinnobs_gym.scoring.playing import play
@@ -35,10 +35,10 @@ class Tried:
 
 @dataclass(frozen=True)
 class Search:
-    """A search for the settings that an estimator class declares in `Estimator.tunable`, by
+    """A search for the settings that an estimator class declares in `BaseEstimator.tunable`, by
     Optuna's tree-structured Parzen estimator (Bergstra et al. 2011)."""
 
-    estimator: type[Estimator]
+    estimator: type[BaseEstimator]
     game: Game
     episodes: int
     """How many episodes each trial is of, of the seeds from `TUNING_SEED` on."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.training.loop import train
@@ -51,7 +51,7 @@ def train_by_name(
     return train(trainer_of(name, config, game, episode), **options)
 
 
-def load(cls: type[Estimator], path: Path, game: Game) -> Estimator:
+def load(cls: type[BaseEstimator], path: Path, game: Game) -> BaseEstimator:
     """The trained estimator in a file, given the noise of the game's setup if it makes use of it.
 
     Raises:

@@ -11,7 +11,7 @@ from benchmarks import Figure, at_least, at_most, cpu_seconds
 from benchmarks.core import filterpy_ekf, system_step
 from pinnobs_gym import evaluate
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ckf import CKF
@@ -212,7 +212,7 @@ def over_the_reference() -> Iterator[Figure]:
         for label, cls in ESTIMATORS.classes().items():
             if cls.track != "online" or cls.needs_training or cls.trains_on_record:
                 continue
-            own: Estimator = cls.for_setup(source.system, source.setup)
+            own: BaseEstimator = cls.for_setup(source.system, source.setup)
             scores = score(source.system, record, x, own.run(record))
             now = float(np.median(scores.nrmse_modulo / reference))
             if now < ratio:

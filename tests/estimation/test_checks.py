@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 
-from pinnobs_gym.estimation.adapters import OfflineEstimator, PerEpisode
+from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator
-from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.estimation.estimator import Estimates, Estimator, OfflineEstimator, State
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.open_loop import OpenLoop

@@ -10,7 +10,7 @@ from pinnobs_gym.cli.console import console, print_table, progress
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import standings_table
@@ -73,7 +73,7 @@ class Evaluate:
     def _rows(self) -> Path:
         return self.out / "rows.jsonl"
 
-    def _score(self, game: Game, estimator: Estimator, episodes: int) -> list[Row]:
+    def _score(self, game: Game, estimator: BaseEstimator, episodes: int) -> list[Row]:
         """The rows of that many episodes, which are logged."""
         seeds = seeds_of(self.seed, episodes)
         with progress() as bar:

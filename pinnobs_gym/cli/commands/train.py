@@ -14,7 +14,7 @@ from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.registry import TRAINERS
@@ -114,7 +114,7 @@ def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> 
 
 
 def _report_training(
-    label: str, estimator: Estimator, game: Game, episode: int, loss: float
+    label: str, estimator: BaseEstimator, game: Game, episode: int, loss: float
 ) -> Played:
     """Print how a trained estimator does; returns what it makes of its own record."""
     if estimator.track == "online":

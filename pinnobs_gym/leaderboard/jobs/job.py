@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import rows as rows_module
@@ -104,7 +104,7 @@ def run_job(job: Job) -> None:
 
         torch.set_num_threads(1)  # a job is one thread
     options = dict(job.settings)
-    chosen: Estimator | type[Estimator] = cls
+    chosen: BaseEstimator | type[BaseEstimator] = cls
     if cls.trains_on_record is not None:
         recipe = TRAINERS.resolve(cls.trains_on_record).configured(job.training)
         stem = job.game.name.file_stem
@@ -122,7 +122,7 @@ def run_job(job: Job) -> None:
             log_episodes(log, scored, found.first_played)
 
 
-def trained(cls: type[Estimator], job: Job) -> Estimator:
+def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:
     """Return the estimator trained on episodes that are never scored; load it if it was trained
     before."""
     name = str(cls.needs_training)

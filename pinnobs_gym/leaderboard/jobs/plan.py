@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pinnobs_gym.envs.game import Game, GameName
-from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
@@ -80,7 +80,7 @@ def _job(suite: Suite, entry: Entry, game: Game, folder: Path, **more: Any) -> J
 
 
 def _learning(
-    suite: Suite, entry: Entry, cls: type[Estimator], game: Game, folder: Path
+    suite: Suite, entry: Entry, cls: type[BaseEstimator], game: Game, folder: Path
 ) -> Iterator[Job]:
     """Yield the jobs of a trained estimator: one per budget and training seed or, if it trains on
     each record, also one per episode."""
@@ -113,7 +113,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
             continue
         known = None  # the name in rows may be another one: the job reads the file itself
         cls = ESTIMATORS.resolve(job.estimator)
-        if job.label is not None or cls.label is Estimator.label:
+        if job.label is not None or cls.label is BaseEstimator.label:
             name = job.label or ESTIMATORS.name_of(cls)
             found = known_rows[job.game.name, name]
             seeds = range(job.seed, job.seed + job.episodes)
@@ -122,7 +122,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
     return to_run, left_out
 
 
-def _class(suite: Suite, entry: Entry) -> type[Estimator]:
+def _class(suite: Suite, entry: Entry) -> type[BaseEstimator]:
     try:
         cls = ESTIMATORS.resolve(entry.name)
         if cls.needs_training is not None and cls.track == "offline":
@@ -163,7 +163,7 @@ def _tables(suite: Suite, system: str) -> list[PlannedGame]:
 def _check_settings(
     suite: Suite,
     entry: Entry,
-    cls: type[Estimator],
+    cls: type[BaseEstimator],
     game: Game,
     training: Mapping[str, Any],
 ) -> None:
@@ -173,7 +173,7 @@ def _check_settings(
         if trainer is not None:
             TRAINERS.resolve(trainer).configured({**cls.recipe, **training})
             return
-        aside = {f.name for f in fields(Estimator)}
+        aside = {f.name for f in fields(BaseEstimator)}
         known = sorted(f.name for f in fields(cls) if f.init and f.repr and f.name not in aside)
         for setting in entry.settings:
             if setting not in known:
