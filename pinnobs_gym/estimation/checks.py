@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from pinnobs_gym.simulation.conformance import (
     run_all,
 )
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import vector
+from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import truth
 
 ROUNDING = 1e-10
@@ -41,6 +41,19 @@ ESTIMATOR_CHECKS: dict[str, Callable[[BaseEstimator], None]] = {}
 An offline estimator is only held to those that make sense for one: ``immutable``,
 ``shapes``, ``rows_independent``, ``purity`` and ``save_load``.
 """
+
+
+@runtime_checkable
+class Saved(Protocol):
+    """An estimator that can be saved, a learned one or a plug-in."""
+
+    def save(self, path: Path) -> None:
+        """Write the estimator to a file."""
+
+    @classmethod
+    def load(cls, path: Path, system: System) -> Self:
+        """The estimator in a file, on a system."""
+        ...
 
 
 def check_estimator(estimator: BaseEstimator) -> None:
@@ -304,13 +317,12 @@ def _estimator_diverging_row(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "save_load")
 def _estimator_save_load(estimator: BaseEstimator) -> None:
     """What can be saved is the same when loaded."""
-    cls: Any = type(estimator)
-    if not (hasattr(cls, "save") and hasattr(cls, "load")):
+    if not isinstance(estimator, Saved):
         return
     record = _record(estimator)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "saved"
-        cls.save(estimator, path)
-        loaded = cls.load(path, estimator.system)
+        estimator.save(path)
+        loaded = type(estimator).load(path, estimator.system)
     found, expected = loaded.run(record), estimator.run(record)
     _require_same(estimator, found, expected, ROUNDING, "a loaded estimator and the one saved")

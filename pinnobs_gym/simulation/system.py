@@ -223,7 +223,7 @@ class System(ABC):
             TypeError: in one line, naming the class and what is missing or of the wrong size.
         """
         for name in ("state_names", "output_names", "scale", "setups"):
-            if not hasattr(cls, name):
+            if getattr(cls, name, None) is None:
                 raise TypeError(f"system {cls.__name__} has no class attribute {name!r}")
         for name in ("f", "h"):
             taken = list(inspect.signature(getattr(cls, name)).parameters)

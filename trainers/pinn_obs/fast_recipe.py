@@ -92,9 +92,9 @@ class FastRecipe(Recipe):
             config.activation,
             config.dtype,
             span=(float(t[0]), float(t[-1])),
-            decays=tuple(decays),
-            frequencies=frequencies,
-            scale=(*x_scale, *(_GAIN * per_gain).ravel()),
+            decays=tuple(map(float, decays)),
+            frequencies=tuple(map(float, frequencies)),
+            scale=tuple(map(float, (*x_scale, *(_GAIN * per_gain).ravel()))),
         )
         self.objective = Objective(self.architecture, system, self.points, weights, lead)
 

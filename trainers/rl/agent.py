@@ -12,6 +12,7 @@ import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import nn
 
@@ -97,7 +98,7 @@ def options(config: RLConfig, actions: int) -> dict[str, Any]:
 
 def policy_layers(policy: Any) -> tuple[tuple[Layer, ...], bool, tuple[Layer, Layer] | None]:
     """The layers of SB3's policy, whether its action is squashed, and its recurrent layer."""
-    if not hasattr(policy, "mlp_extractor"):  # off-policy
+    if not isinstance(policy, ActorCriticPolicy):  # off-policy
         actor = policy.actor
         parts = [actor.mu] if isinstance(actor.mu, nn.Sequential) else [actor.latent_pi, actor.mu]
         return _linear(parts), True, None

@@ -47,10 +47,6 @@ class Architecture:
     row by row; None for one."""
 
     def __post_init__(self) -> None:
-        for name in ("span", "decays", "frequencies", "scale"):
-            value = getattr(self, name)
-            if value is not None:  # a file's lists
-                object.__setattr__(self, name, tuple(float(v) for v in value))
         if self.span is None and (self.decays or self.frequencies):
             raise ValueError("span=None; decays and frequencies need the times they begin at")
         if self.scale is not None and len(self.scale) != self.nx * (1 + self.ny):

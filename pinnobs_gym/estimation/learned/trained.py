@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_type_hints
+from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_origin, get_type_hints
 
 from pinnobs_gym.estimation.learned.trained_file import (
     check_same,
@@ -117,7 +117,11 @@ def from_content(kind: type, content: Mapping[str, Any]) -> Any:
         value = content[field.name]
         within = (hints[field.name], *get_args(hints[field.name]))  # of an optional one as well
         kinds = [hint for hint in within if isinstance(hint, type) and is_dataclass(hint)]
-        found[field.name] = from_content(kinds[0], value) if kinds and value is not None else value
+        if kinds and value is not None:
+            value = from_content(kinds[0], value)
+        elif isinstance(value, list) and any(get_origin(hint) is tuple for hint in within):
+            value = tuple(value)  # JSON has lists only
+        found[field.name] = value
     return kind(**found)
 
 

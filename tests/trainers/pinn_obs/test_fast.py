@@ -32,12 +32,12 @@ SMALL = PinnObsConfig(depth=2, width=8, iterations=60, log_every=10)
 
 def by_autograd(network, system, points, weights, lead):
     """The loss of `Objective` in torch, its gradient and the time derivative by autograd."""
-    t, y, u, there = (torch.tensor(getattr(points, n)) for n in ("t", "y", "u", "there"))
+    t, y, u, present = (torch.tensor(getattr(points, n)) for n in ("t", "y", "u", "present"))
     t.requires_grad_()
     xhat, L = network(t)
     options = {"create_graph": True, "retain_graph": True}
     rate = [torch.autograd.grad(xhat[:, i].sum(), t, **options)[0] for i in range(system.nx)]
-    innovation = (y - system.h(t, xhat, u)) * there
+    innovation = (y - system.h(t, xhat, u)) * present
     residual = torch.stack(rate, -1) - system.f(t, xhat, u) - (L @ innovation[..., None])[..., 0]
     initial = xhat[0] - torch.tensor(points.xhat0)
     w = {n: torch.tensor(getattr(weights, n)) for n in ("initial", "equation", "output")}
@@ -94,13 +94,13 @@ def test_points_lie_on_the_records_lines():
     np.testing.assert_allclose(points.output.sum(0), 1)
     for j in range(2):
         expected = np.interp(points.t, record.t, record.y[0, :, j])
-        there = points.there[:, j] > 0
+        there = points.present[:, j] > 0
         np.testing.assert_allclose(points.y[there, j], expected[there], atol=1e-12)
         expected = np.interp(points.t, record.t, record.u[0, :, j])
         np.testing.assert_allclose(points.u[:, j], expected, atol=1e-12)
     lost = (points.t > record.t[6]) & (points.t < record.t[8])
-    assert np.array_equal(points.there[:, 1] == 0, lost)
-    assert points.there[:, 0].all()
+    assert np.array_equal(points.present[:, 1] == 0, lost)
+    assert points.present[:, 0].all()
 
 
 def test_a_fast_oscillation_is_found():
