@@ -1,19 +1,19 @@
-"""Files that are whole or not there, also where several processes write them at once.
+"""Atomic writing of files, also when several processes write them at once.
 
-- `replacing` writes a new file: under a temporary name, which becomes the file's own when it is
-  whole. Readers see the old file or the new one.
-- `check_writable` finds out before long work whether its results can be written.
-- `locked` opens a file to be appended to, by one process and thread at a time; `write_whole` then
-  appends all of the data or nothing, and a full disk leaves the file as it was. `append_lines` does
+- `replacing` writes a new file under a temporary name and renames it when it is complete. Readers
+  see either the old file or the new one.
+- `check_writable` checks before a long computation that its results can be written.
+- `locked` opens a file for appending by one process and thread at a time; `write_whole` then
+  appends all of the data or nothing, and a full disk leaves the file unchanged. `append_lines` does
   both for JSON lines.
-- `holding` and `is_held` tell whether the process still lives that something belongs to.
+- `holding` and `is_held` tell whether the process that owns a path is alive.
 
-A file ``name`` is locked by an empty file ``.name.lock`` beside it: on Windows a file that is
-locked itself cannot even be read. The lock is the operating system's (``flock``, or ``LockFileEx``
-on Windows; the package filelock knows both), which gives it up when a process ends, however it
-ends, so that a killed process blocks nobody. It holds between machines where their shared folder
-passes locks on, as NFS and SMB do. On a system without such locks, filelock falls back on a file
-that names the process that made it, and a dead one is recognised on the same machine.
+A file ``name`` is locked through an empty file ``.name.lock`` beside it, since on Windows a locked
+file cannot even be read. The lock is the operating system's (``flock``, or ``LockFileEx`` on
+Windows; the package filelock uses either). It is released when a process ends in any way, so that a
+killed process blocks nobody. It works between machines if their shared folder supports locks, as
+NFS and SMB do. On a system without such locks, filelock uses a file with the id of the process that
+created it, and recognises a dead process on the same machine.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ POLL = 0.01
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A context whose value is a temporary path, to be written; it becomes ``path`` at the end of
-    the context, or is deleted if that ends with an error. Folders are made as needed.
+    """Yield a temporary path to write to. It is renamed to ``path`` at the end of the context, or
+    deleted if the context ends with an error. Folders are created as needed.
 
     Raises:
-        ValueError: in one line, if nothing can be written there.
+        ValueError: in one line, if the file cannot be written.
     """
     temporary = path.with_name(f".{path.name}.{uuid4().hex}")
     try:
@@ -60,10 +60,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def check_writable(folder: Path) -> None:
-    """Make a folder, and a file in it that is deleted again.
+    """Create a folder if needed, and check that a file can be created in it.
 
     Raises:
-        ValueError: in one line, if nothing can be written there.
+        ValueError: in one line, if the folder cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -75,11 +75,11 @@ def check_writable(folder: Path) -> None:
 
 
 def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
-    """Append objects to a file of JSON lines, all or none of them, under a lock. They begin a line
-    of their own if the file ends in half a line. The file and its folder are made as needed.
+    """Append objects to a file of JSON lines, all or none of them, under a lock. They start on a
+    new line if the file ends in an incomplete one. The file and its folder are created as needed.
 
     Raises:
-        ValueError: in one line, if the file cannot be written; what it held is untouched.
+        ValueError: in one line, if the file cannot be written; its content is unchanged.
     """
     data = b"".join(map(json_line, objects))
     try:
@@ -93,7 +93,7 @@ def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
 
 
 def json_line(values: Mapping[str, Any]) -> bytes:
-    """One line of JSON, with null where a number is not finite."""
+    """Return one line of JSON, with null for numbers that are not finite."""
     encoded = {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in values.items()
@@ -103,8 +103,8 @@ def json_line(values: Mapping[str, Any]) -> bytes:
 
 @contextmanager
 def locked(path: Path) -> Iterator[FileIO]:
-    """A file opened for reading anywhere and writing at its end, which nobody else has locked
-    meanwhile. It and its folder are made as needed.
+    """Yield a file opened for reading and appending, under an exclusive lock. The file and its
+    folder are created as needed.
 
     Raises:
         OSError: if the file cannot be opened or locked.
@@ -118,7 +118,7 @@ def write_whole(file: FileIO, data: bytes) -> None:
     """Append to a locked file, all or nothing.
 
     Raises:
-        OSError: if it does not fit; the file is as it was.
+        OSError: if not all data can be written; the file is unchanged.
     """
     size = file.seek(0, os.SEEK_END)
     try:
@@ -132,11 +132,11 @@ def write_whole(file: FileIO, data: bytes) -> None:
 
 @contextmanager
 def holding(path: Path) -> Iterator[None]:
-    """Hold a path, whatever is there, for as long as this process lives and the context lasts, so
-    that others can tell by `is_held`.
+    """Hold a path, which need not exist, for the duration of the context, or until the process
+    ends. Other processes can check this by `is_held`.
 
     Raises:
-        OSError: if it cannot be locked.
+        OSError: if the path cannot be locked.
     """
     lock = _lock(path)
     try:
@@ -147,7 +147,8 @@ def holding(path: Path) -> Iterator[None]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process that lives is `holding` a path. What a dead one left of it is deleted."""
+    """Return whether a live process is `holding` a path. A lock file left by a dead process is
+    deleted."""
     lock = _lock(path)
     try:
         with lock.acquire(blocking=False):

@@ -1,7 +1,6 @@
-"""How a file becomes a name: systems, estimators and trainers are found by reading their sources.
+"""Registries of systems, estimators and trainers, found by reading their sources.
 
-A name is resolved by importing the one file that gives it. Only a list of all classes takes
-importing everything.
+Resolving a name imports only the file that defines it. Listing all classes imports all files.
 """
 
 from __future__ import annotations
@@ -22,26 +21,27 @@ T = TypeVar("T")
 
 
 class NameSource(NamedTuple):
-    """Where a name comes from, as the source of a file shows it."""
+    """The origin of a name, according to the source of a file."""
 
     module: str
     """Dotted name of the module."""
     constants: dict[str, Any]
-    """The class attributes that are given as plain constants."""
+    """The class attributes assigned to constants; others have the value None."""
 
 
 class Registry(Generic[T]):
-    """The classes of one kind that can be named.
+    """The named classes of one kind.
 
-    Found are: the classes of the package's modules whose source assigns one of the ``attributes``,
-    those that installed packages announce in the entry-point group of the package's name, and those
-    given to `register`. A class is named by its class attribute ``name``, or else by its own name.
+    The registry contains the classes of the package's modules whose source assigns one of the
+    ``attributes``, those of installed packages in the entry-point group with the package's name,
+    and those given to `register`. The name of a class is its attribute ``name``, or else its own
+    name.
 
     Args:
-        kind: what one is called in messages, such as ``"system"``.
-        base: ``module:Class`` of the base class; imported when it is first needed.
-        package: dotted name of the package whose files are looked at.
-        attributes: the class attributes by which a source shows that a class is one.
+        kind: name of the kind in messages, such as ``"system"``.
+        base: ``module:Class`` of the base class, imported on first use.
+        package: dotted name of the package whose files are read.
+        attributes: class attributes that identify a class of this kind in a source.
     """
 
     def __init__(self, kind: str, base: str, package: str, *attributes: str) -> None:
@@ -50,43 +50,43 @@ class Registry(Generic[T]):
         self._package = package
         self._attributes = attributes
         self._known: dict[str, type[T]] = {}
-        """The classes that are imported."""
+        """The imported classes by name."""
         self._all_imported = False
         self._sources: dict[str, NameSource] | None = None
 
     @property
     def sources(self) -> dict[str, NameSource]:
-        """The names that the sources of the package show, without importing any of them; a warning
-        for each file that is no Python, or gives a name that another has."""
+        """The names defined in the sources of the package, without importing them. Warns of each
+        file that is not valid Python, and of each name that is already taken."""
         if self._sources is None:
-            self._sources = _shown(self._kind, self._package, self._attributes)
+            self._sources = _scanned_sources(self._kind, self._package, self._attributes)
         return self._sources
 
     def classes(self) -> dict[str, type[T]]:
-        """All classes by name, sorted; imports their modules on the first call, with a warning for
-        each that cannot be."""
+        """Return all classes by name, sorted. Imports their modules on the first call, with a
+        warning for each module that cannot be imported."""
         if not self._all_imported:
             self._all_imported = True
             for name in self.sources:
                 try:
-                    self._take(name)
+                    self._import_class(name)
                 except ValueError as error:
                     warnings.warn(str(error), stacklevel=2)
             self.plug_ins()
         return dict(sorted(self._known.items()))
 
     def plug_ins(self) -> list[type[T]]:
-        """The classes that installed packages announce, which are imported; a warning for each that
-        cannot be."""
-        found = []
+        """Import and return the classes announced by installed packages, with a warning for each
+        that cannot be imported."""
+        classes = []
         for point in entry_points(group=self._package):
             try:
-                found.append(self.register(point.load()))
+                classes.append(self.register(point.load()))
             except Exception as error:  # whatever another package raises
                 warnings.warn(
                     f"{self._kind} plug-in {point.name!r} is left out: {error}", stacklevel=2
                 )
-        return found
+        return classes
 
     def register(self, cls: type[T]) -> type[T]:
         """Add a class; usable as a decorator.
@@ -95,7 +95,7 @@ class Registry(Generic[T]):
             TypeError: if it is not a concrete class of this kind.
             ValueError: if another class has its name.
         """
-        if not self._is_one(cls):
+        if not self._is_concrete(cls):
             base = self._base
             if not (isinstance(cls, type) and issubclass(cls, base)):
                 raise TypeError(f"{cls!r} is not a subclass of {base.__name__}")
@@ -106,11 +106,11 @@ class Registry(Generic[T]):
         taken = self._owner(name)
         if taken is not None and taken != (cls.__module__, cls.__qualname__):
             raise ValueError(f"{self._kind} {name!r} is already {taken[0]}.{name}")
-        self._known[name] = cls  # a class that was imported anew replaces what it was
+        self._known[name] = cls  # a reloaded class replaces its earlier version
         return cls
 
     def resolve(self, spec: str | type[T]) -> type[T]:
-        """The class that a name, a ``module:Class`` path or the class itself means.
+        """Return the class for a name, a ``module:Class`` path or the class itself.
 
         Raises:
             ValueError: in one line; for an unknown name it lists the known ones.
@@ -120,12 +120,12 @@ class Registry(Generic[T]):
         if ":" in spec:
             return self._imported(spec)
         if spec not in self._known and spec in self.sources:
-            self._take(spec)
+            self._import_class(spec)
         if spec not in self._known:
             self.plug_ins()
         if spec not in self._known:
             known = ", ".join(sorted({*self._known, *self.sources}))
-            if not known:  # as of a folder of that name in the working folder
+            if not known:  # e.g. if a folder in the working folder shadows the package
                 place = ", ".join(importlib.import_module(self._package).__path__)
                 raise ValueError(
                     f"unknown {self._kind} {spec!r}; there is none in {place}, which is imported "
@@ -135,12 +135,12 @@ class Registry(Generic[T]):
         return self._known[spec]
 
     def name_of(self, cls: type[T]) -> str:
-        """The name a class is found by."""
+        """Return the name under which a class is registered."""
         return getattr(cls, "name", cls.__name__)
 
     @contextmanager
     def isolated(self) -> Iterator[None]:
-        """A context after which everything that was registered in it is forgotten."""
+        """Yield a context at whose end all registrations made in it are undone."""
         before, whole = dict(self._known), self._all_imported
         try:
             yield
@@ -153,12 +153,16 @@ class Registry(Generic[T]):
         return getattr(importlib.import_module(module), name)
 
     def _imported(self, spec: str) -> type[T]:
-        """The class at ``module:Class``, which is registered."""
+        """Import and register the class at ``module:Class``.
+
+        Raises:
+            ValueError: in one line, if it cannot be imported or registered.
+        """
         module, _, name = spec.partition(":")
         try:
             return self.register(getattr(importlib.import_module(module), name))
         except Exception as error:  # whatever the user's module raises
-            for cls in self._known.values():  # of a function or a notebook's cell
+            for cls in self._known.values():  # a class defined in a function or a notebook's cell
                 if (cls.__module__, cls.__qualname__) == (module, name):
                     return cls
             if isinstance(error, AttributeError) and ("<locals>" in name or module == "__main__"):
@@ -171,14 +175,14 @@ class Registry(Generic[T]):
             raise ValueError(f"cannot load {self._kind} {spec!r}: {kind}: {error}") from error
 
     def _owner(self, name: str) -> tuple[str, str] | None:
-        """Module and qualified name of the class that has a name, if one has."""
+        """Return the module and qualified name of the class with this name, or None."""
         if name not in self._known and name in self.sources:
-            self._take(name)
+            self._import_class(name)
         cls = self._known.get(name)
         return None if cls is None else (cls.__module__, cls.__qualname__)
 
-    def _take(self, name: str) -> None:
-        """Import the class that a source shows under a name.
+    def _import_class(self, name: str) -> None:
+        """Import the class that a source defines under a name.
 
         Raises:
             ValueError: in one line, if its module cannot be imported.
@@ -193,19 +197,19 @@ class Registry(Generic[T]):
             ) from error
         for cls in vars(module).values():
             if (
-                self._is_one(cls)
+                self._is_concrete(cls)
                 and cls.__module__ == module.__name__
                 and self.name_of(cls) == name
             ):
                 self._known.setdefault(name, cls)
 
-    def _is_one(self, cls: object) -> bool:
+    def _is_concrete(self, cls: object) -> bool:
         return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
 
 
-def _shown(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, NameSource]:
-    """What `Registry.sources` returns."""
-    found: dict[str, NameSource] = {}
+def _scanned_sources(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, NameSource]:
+    """Read the sources for `Registry.sources`, which describes the result and the warnings."""
+    sources: dict[str, NameSource] = {}
     for module in _modules(package):
         try:
             tree = ast.parse(_source(module))
@@ -218,23 +222,24 @@ def _shown(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, Na
                 constants = _constants(node)
                 if constants.keys() & set(attributes):
                     name = constants.get("name", node.name)
-                    if name in found:
-                        other = f"{found[name].module} has one of that name"
+                    if name in sources:
+                        other = f"{sources[name].module} has one of that name"
                         message = f"{node.name!r} in {module}: {other}"
                         warnings.warn(f"left out as a {kind}: {message}", stacklevel=3)
                         continue
-                    found[name] = NameSource(module, constants)
-    return dict(sorted(found.items()))
+                    sources[name] = NameSource(module, constants)
+    return dict(sorted(sources.items()))
 
 
 def _modules(package: str) -> tuple[str, ...]:
-    """Dotted names of the modules of a package, sorted; the package alone is imported."""
+    """Return the sorted dotted names of the modules of a package; only the package itself is
+    imported."""
     path = importlib.import_module(package).__path__
     return tuple(sorted(m.name for m in pkgutil.iter_modules(path, f"{package}.")))
 
 
 def _source(module: str) -> str:
-    """A module's source, without importing it."""
+    """Return a module's source without importing the module."""
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:
         raise ImportError(f"module {module} has no source")
@@ -242,17 +247,18 @@ def _source(module: str) -> str:
 
 
 def _constants(node: ast.ClassDef) -> dict[str, Any]:
-    """The class attributes that a body assigns, with their values where these are constants."""
-    found = {}
+    """Return the class attributes that a body assigns, with their values if these are constants."""
+    constants = {}
     for statement in node.body:
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
             value = statement.value
             constant = value.value if isinstance(value, ast.Constant) else None
-            found[statement.targets[0].id] = constant
-    return found
+            constants[statement.targets[0].id] = constant
+    return constants
 
 
 TRAINERS: Registry[Any] = Registry(
     "trainer", "pinnobs_gym.training.trainer:Trainer", "trainers", "name"
 )
-"""All trainers by name. It stands here for estimators, which know no trainer but by name."""
+"""All trainers by name. The registry is defined here for estimators, which know trainers only by
+name."""

@@ -1,4 +1,4 @@
-"""The command `pinnobs`: each of its commands is a module of `pinnobs_gym.cli.commands`."""
+"""The command line interface `pinnobs`; each command is a module of `pinnobs_gym.cli.commands`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from io import TextIOWrapper
 from pinnobs_gym.cli import commands
 
 COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
-"""What the command can do."""
+"""Names of the commands."""
 
 
 def usage() -> str:
-    """One line for each command, from the first line of its module."""
+    """Return the help text, with one line per command from the first line of its module."""
     lines = ["usage: pinnobs COMMAND ...", ""]
     for name in COMMANDS:
         source = resources.files(commands).joinpath(f"{name}.py").read_text(encoding="utf-8")
-        docstring = ast.get_docstring(ast.parse(source)) or name  # importing it takes long
+        docstring = ast.get_docstring(ast.parse(source)) or name  # importing the module is slow
         call, _, what = docstring.partition("\n")[0].partition(": ")
         lines.append(f"  {call.strip('`'):21} {what.rstrip('.')}")
     return "\n".join(
@@ -37,10 +37,12 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status: 0, 1 if a job failed, 2 for bad input."""
+    """Run the command and return its exit status: 0 for success, 1 if a job failed or an unexpected
+    error occurred, 2 for invalid input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # into a file Windows writes few characters
+        # The encoding of redirected output on Windows has few characters.
+        if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
@@ -57,12 +59,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"pinnobs: error: {error}", file=sys.stderr)
         return 2
-    except ConnectionError as error:  # to other machines, while they worked
+    except ConnectionError as error:  # connection lost to other machines during the run
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
         print(f"pinnobs: error: {error}", file=sys.stderr)
         return 1
-    except Exception as error:  # of a plug-in, or a fault of ours
+    except Exception as error:  # a fault of a plug-in or of this package
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
         what = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -74,10 +76,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _one_thread() -> None:
-    """Run numerical libraries on one thread unless OMP_NUM_THREADS says otherwise: the arrays are
-    so small that several threads mostly wait for each other."""
+    """Limit numerical libraries to one thread unless OMP_NUM_THREADS is set: the arrays are so
+    small that several threads mostly wait for each other."""
     if "OMP_NUM_THREADS" not in os.environ:
         from threadpoolctl import threadpool_limits
 
-        os.environ["OMP_NUM_THREADS"] = "1"  # for what is loaded later, torch and workers among it
+        os.environ["OMP_NUM_THREADS"] = "1"  # for libraries loaded later and for worker processes
         threadpool_limits(1)

@@ -1,4 +1,4 @@
-"""The terminal: one console, a progress bar, a leaderboard's table."""
+"""Terminal output: the console, progress bars and tables."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from rich.text import Text
 from pinnobs_gym.leaderboard import standings_table
 
 WIDE = 190
-"""Columns that a leaderboard's table takes with its intervals."""
+"""Width of a leaderboard's table with its intervals, in characters."""
 console = Console() if Console().is_terminal else Console(width=WIDE)
-"""Where everything is printed; wide enough for the tables where there is no terminal."""
+"""The console for all output; wide enough for the tables if it is not a terminal."""
 
 
 def print_table(table: standings_table.Table) -> None:
-    """Print a leaderboard's table; a narrow terminal is spared the intervals."""
+    """Print a leaderboard's table, without intervals on a narrow terminal."""
     wide = console.width >= WIDE
     shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
     hidden = {"knows", "training", "NIS", "corr.", "tail / CRR"}
@@ -51,7 +51,7 @@ def print_table(table: standings_table.Table) -> None:
 
 
 def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
-    """Print a table of text whose first column is of names."""
+    """Print a table of text with names in its first column."""
     shown = RichTable(title=title, title_justify="left", title_style="bold", box=box.SIMPLE)
     for i, name in enumerate(header):
         shown.add_column(name, justify="right" if i else "left", overflow="fold")
@@ -61,7 +61,7 @@ def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]
 
 
 def progress() -> Progress:
-    """A bar with counts and times."""
+    """Return a progress bar with counts and times."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -73,18 +73,19 @@ def progress() -> Progress:
 
 
 class RunView:
-    """What becomes of many jobs, live in a terminal: how many are done, run and have failed, what
-    runs now, and the time left. Elsewhere it is a line now and then. Failures are told at once.
+    """Progress of many jobs. In a terminal it shows live the counts of finished, running and failed
+    jobs, the names of running ones, and the time left. Elsewhere it prints a line at intervals.
+    Failures are printed at once.
 
     Args:
-        total: how many jobs there are.
-        running: names what runs now.
+        total: number of jobs.
+        running: returns the names of the running jobs.
     """
 
     EVERY = 10.0
-    """Least seconds from one line to the next."""
+    """Shortest time in s between two lines."""
     SHOWN = 8
-    """Of the jobs that run, how many are named."""
+    """Largest number of running jobs that are named."""
 
     def __init__(self, total: int, running: Callable[[], Sequence[str]]) -> None:
         self.done = 0
@@ -110,7 +111,7 @@ class RunView:
         self._live.stop()
 
     def ended(self, name: str, error: str | None) -> None:
-        """Take in that a job has ended."""
+        """Report that a job has ended."""
         self.done += error is None
         self.failed += error is not None
         self._bar.advance(self._task)
@@ -141,7 +142,7 @@ class RunView:
 
 
 def _duration(seconds: float) -> str:
-    """Such as 3 min."""
+    """Format a duration, such as 3 min."""
     for size, unit in ((3600, "h"), (60, "min")):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"

@@ -1,4 +1,4 @@
-"""What is given on a command line: options, and ``name=value`` settings of an estimator."""
+"""Parsing of command lines: options, and ``name=value`` settings of an estimator."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ T = TypeVar("T")
 
 
 def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any) -> T:
-    """A command's options from its arguments; ``options`` are those of `tyro.cli`.
+    """Parse a command's options from its arguments; ``options`` are passed to `tyro.cli`.
 
     Raises:
-        ValueError: in one line, if they are not what the command takes.
+        ValueError: in one line, if the arguments are invalid.
     """
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
             return tyro.cli(kind, prog=f"pinnobs {command}", args=arguments, **options)
     except SystemExit as end:
-        if not end.code:  # help was asked for, and printed
+        if not end.code:  # help was printed
             raise
     message = _first_of(errors.getvalue()).removeprefix("Error parsing config: ")
     raise ValueError(f"{message}; see pinnobs {command} --help") from None
 
 
 def _first_of(box: str) -> str:
-    """What a framed message says between its title and its next rule, in one line."""
+    """Return the text of a framed message between its title and its next rule, in one line."""
     parts: list[list[str]] = [[]]
     for line in Text.from_ansi(box).plain.splitlines():
         text = line.strip("│| ")
@@ -48,10 +48,10 @@ def _first_of(box: str) -> str:
 
 
 def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, Any]:
-    """The values of ``name=value`` settings of an estimator, or of the recipe it trains by.
+    """Parse ``name=value`` settings of an estimator, or of the trainer that it runs on the record.
 
     Raises:
-        ValueError: in one line, naming what is unknown and what is known.
+        ValueError: in one line, naming the invalid setting and the known names.
     """
     base = {f.name for f in fields(BaseEstimator)}
     own = {f.name: f for f in fields(cls) if f.name not in base and f.repr}
@@ -80,7 +80,7 @@ def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, 
 
 
 def _parsed(setting: str, text: str, hint: Any) -> Any:
-    """The text as the number or string that a field is declared to hold."""
+    """Convert the text to the type of the field: an int, a float or a string."""
     kinds = get_args(hint) or (hint,)
     for kind in (int, float):
         if kind in kinds:

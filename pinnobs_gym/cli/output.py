@@ -1,4 +1,4 @@
-"""Files that commands write: estimates and pictures."""
+"""Writing of result files: estimates and figures."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 def write_estimates(path: Path, system: System, record: Record, estimates: Estimates) -> None:
-    """Write the first episode's estimates as CSV: t, a column per state, and where there are
-    covariances a column ``<state>_std`` of their standard deviations."""
+    """Write the first episode's estimates as CSV: t, a column per state, and with covariances a
+    column ``<state>_std`` of standard deviations per state."""
     header = ["t", *system.state_names]
     columns = [record.t[:, None], estimates.xhat[0]]
     if estimates.P is not None:
@@ -33,6 +33,6 @@ def write_estimates(path: Path, system: System, record: Record, estimates: Estim
 
 
 def write_figure(path: Path, figure: Figure) -> None:
-    """Write a picture; the ending says which kind."""
+    """Write a figure in the format of the path's suffix."""
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=120, format=path.suffix[1:])

@@ -14,8 +14,8 @@ from pinnobs_gym.simulation.system import System, vector
 
 
 def page(cls: type[System], env_id: str) -> str:
-    """The env page of a system in Markdown, under Gymnasium's headings: its docstring, and what
-    follows from its attributes."""
+    """Return the env page of a system in Markdown under Gymnasium's headings, from its docstring
+    and attributes."""
     system, setup = cls.configured()
     number_of_actions = f"{setup.num_steps} actions, {setup.duration:g} s at {setup.dt:g} s"
     parts = [
@@ -115,15 +115,15 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def field_docs(cls: type) -> dict[str, str]:
-    """The docstring under each attribute of a class, those that it inherits included."""
-    found: dict[str, str] = {}
+    """Return the docstring below each attribute of a class, including inherited ones."""
+    docs: dict[str, str] = {}
     for each in reversed(cls.__mro__[:-1]):
-        found |= variable_docs(each)
-    return found
+        docs |= variable_docs(each)
+    return docs
 
 
 def variable_docs(where: ModuleType | type) -> dict[str, str]:
-    """The docstring under each variable of a module, or of a class's own body."""
+    """Return the docstring below each variable of a module, or of a class's own body."""
     return {
         p.arg_name: inspect.cleandoc(p.description or "")
         for p in parse_from_object(where).params

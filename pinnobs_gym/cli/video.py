@@ -1,4 +1,4 @@
-"""A video of an episode: the picture that an env draws while an estimator plays it."""
+"""Video of an episode: an env's frames while an estimator plays it."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.files import check_writable
 
 FPS = 30.0
-"""Most frames in a second."""
+"""Largest number of frames per second."""
 SHORTEST, LONGEST = 5.0, 20.0
-"""How long videos last in s: shorter episodes are slowed down, longer ones sped up."""
+"""Limits of a video's duration in s; shorter episodes are slowed down, longer ones sped up."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How an episode is shown."""
+    """The pace of a video."""
 
     stride: int
-    """Samples from one frame to the next."""
+    """Samples per frame."""
     fps: float
-    """Frames in a second, at most `FPS`."""
+    """Frames per second, at most `FPS`."""
 
     @classmethod
     def of(cls, duration: float, dt: float) -> Pace:
-        """In real time if the video lasts neither too short nor too long then."""
+        """Return real time, or the pace that keeps the duration between `SHORTEST` and
+        `LONGEST`."""
         speed = duration / min(max(duration, SHORTEST), LONGEST)
         stride = max(1, math.ceil(speed / (FPS * dt) - 1e-9))
         return cls(stride, speed / (stride * dt))
 
 
 def check_video(path: Path) -> None:
-    """Find out whether a video can be written, before the work that it takes.
+    """Check before the work that a video can be written.
 
     Raises:
-        ValueError: in one line, if the ending is not ``.mp4``, moviepy is missing, or nothing can
-            be written there.
+        ValueError: in one line, if the suffix is not ``.mp4``, moviepy is missing, or the path
+            cannot be written.
     """
     if path.suffix != ".mp4":
         raise ValueError(f"video {path}; expected a name that ends in .mp4")
@@ -54,17 +55,17 @@ def check_video(path: Path) -> None:
 
 
 def write_video(path: Path, estimator: BaseEstimator, game: Game, seed: int) -> Pace:
-    """Write the video of an episode, from its first sample to its last, which is held for a second;
-    a file that is there is replaced when the new one is whole.
+    """Write the video of an episode from its first sample to its last, which is shown for one more
+    second. An existing file is replaced once the new one is complete.
 
     Args:
         path: the file.
-        estimator: whose estimates are the actions.
+        estimator: its estimates are the actions.
         game: what is played.
         seed: of the episode.
 
     Raises:
-        ValueError: in one line, if it cannot be written.
+        ValueError: in one line, if the file cannot be written.
     """
     save_video = _recorder()
     pace = Pace.of(game.source.setup.duration, game.source.setup.dt)
@@ -84,7 +85,7 @@ def write_video(path: Path, estimator: BaseEstimator, game: Game, seed: int) -> 
     frames += frames[-1:] * round(pace.fps)
     try:
         with tempfile.TemporaryDirectory(prefix=".video", dir=path.parent) as folder:
-            # It chooses the name itself.
+            # save_video chooses the file's name.
             save_video(frames, folder, episode_trigger=lambda _: True, fps=pace.fps)
             (written,) = Path(folder).iterdir()
             os.replace(written, path)
@@ -94,7 +95,7 @@ def write_video(path: Path, estimator: BaseEstimator, game: Game, seed: int) -> 
 
 
 def _recorder() -> Any:
-    """Gymnasium's function that makes a video of frames."""
+    """Return Gymnasium's function that writes frames as a video."""
     try:
         from gymnasium.utils.save_video import save_video
     except gym.error.DependencyNotInstalled:

@@ -1,1 +1,1 @@
-"""The environments: a system's episodes, simulated whole at reset and played step by step."""
+"""The environments: episodes of a system, simulated completely at reset and played step by step."""

@@ -1,8 +1,8 @@
-"""What an agent's action means, and what it observes: forms of the same estimation task.
+"""Forms of the estimation task: the meaning of an agent's actions, and its observations.
 
-A form turns the samples of a batch of episodes into features and actions into estimates. It sees
-what an estimator sees, outputs, inputs and the model, and is the same for single and vectorised
-envs, and for a trained agent at work (`pinnobs_gym.estimators.sb3`).
+A form converts the samples of a batch of episodes into features, and actions into estimates. It has
+the same information as an estimator (outputs, inputs and the model) and is the same for single and
+vectorised envs, and for a trained agent used as an estimator (`pinnobs_gym.estimators.sb3`).
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_scale, vector
 
 LARGEST_REWARD = 10.0
-"""Where the reward ``improvement`` is cut off, on either side."""
+"""Bound of the absolute value of the reward ``improvement``."""
 OUTSIDE = 2.0
-"""Estimates of the gain and correction forms stay in the box of estimates times this."""
+"""Estimates of the gain and correction forms are clipped to the box of estimates times this
+factor."""
 _DRAWS = 33
-"""Episodes of the model that the typical error is taken from."""
+"""Number of simulated episodes of the model from which the typical error is computed."""
 
 
 @dataclass(frozen=True)
 class AgentMemory:
-    """What a form remembers of a batch of episodes."""
+    """The memory of a form for a batch of episodes."""
 
     xhat: np.ndarray
     """The prediction x̂(k|k−1), or after an action the estimate x̂(k|k), shape (batch, nx)."""
@@ -46,11 +47,11 @@ class AgentMemory:
     missing."""
 
     def rows(self, rows: np.ndarray) -> AgentMemory:
-        """That of some rows."""
+        """Return the memory of some rows."""
         return AgentMemory(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def with_rows(self, rows: np.ndarray, other: AgentMemory) -> AgentMemory:
-        """The same with some rows replaced."""
+        """Return the memory with some rows replaced."""
         merged = {}
         for f in fields(self):
             merged[f.name] = getattr(self, f.name).copy()
@@ -63,13 +64,13 @@ class Form(ABC):
 
     Args:
         system: the model.
-        setup: how it is played; says the length of episodes, the prior and the noise.
-        stack: how many of the last outputs the features hold.
+        setup: defines the length of episodes, the prior and the noise.
+        stack: number of the last outputs in the features.
     """
 
     name: ClassVar[str]
     action_space: Box
-    """The space of actions of one episode."""
+    """The action space of one episode."""
 
     def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
         if not (isinstance(stack, int | np.integer) and stack >= 1):
@@ -84,24 +85,24 @@ class Form(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """Set ``action_space`` and what else the form needs.
+        """Set ``action_space`` and other attributes of the form.
 
         Raises:
-            ValueError: in one line, if the form does not fit the system or the stack.
+            ValueError: in one line, if the form does not support the system or the stack.
         """
 
     @property
     @abstractmethod
     def num_features(self) -> int:
-        """Number of features; the last is a time from 0 to 1."""
+        """Number of features; the last one is a time from 0 to 1."""
 
     def begin(self, mean: np.ndarray, t: np.ndarray, u: np.ndarray) -> AgentMemory:
-        """The memory before the first samples.
+        """Return the memory before the first samples.
 
         Args:
             mean: prior means x̂₀, shape (batch, nx).
             t: times of the first samples in s, shape (batch,).
-            u: inputs at these, shape (batch, nu).
+            u: inputs at these times, shape (batch, nu).
         """
         y = np.full((len(mean), self.stack, self.system.ny), np.nan)
         return AgentMemory(np.asarray(mean, dtype=float), t, t, u, y, y[:, 0])
@@ -109,12 +110,12 @@ class Form(ABC):
     def observe(
         self, memory: AgentMemory, t: np.ndarray, y: np.ndarray, u: np.ndarray
     ) -> tuple[np.ndarray, AgentMemory]:
-        """The features (batch, num_features) of the samples at times t.
+        """Return the features (batch, num_features) of the samples at times t, and the new memory.
 
         Args:
-            memory: after the action before.
+            memory: memory after the previous action.
             t: sample times in s, shape (batch,).
-            y: outputs, shape (batch, ny); NaN is a missing one.
+            y: outputs, shape (batch, ny); NaN marks a missing output.
             u: inputs, shape (batch, nu).
         """
         outputs = np.concatenate([y[:, None], memory.y[:, :-1]], axis=1)
@@ -124,22 +125,22 @@ class Form(ABC):
 
     @abstractmethod
     def predict(self, memory: AgentMemory, t: np.ndarray, u: np.ndarray) -> AgentMemory:
-        """The memory with what the model says of the samples at times t, whose outputs it holds
-        already."""
+        """Return the memory with the model's prediction for the samples at times t, whose outputs
+        it already holds."""
 
     @abstractmethod
     def features(self, memory: AgentMemory) -> np.ndarray:
-        """The features (batch, num_features) of the last samples."""
+        """Return the features (batch, num_features) of the last samples."""
 
     @abstractmethod
     def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
-        """The memory with the estimates that actions (batch, ...) mean."""
+        """Return the memory with the estimates that result from actions (batch, ...)."""
 
     def checked(self, actions: np.ndarray) -> np.ndarray:
-        """Actions (batch, ...) in double precision.
+        """Return actions (batch, ...) in double precision.
 
         Raises:
-            ValueError: in one line, if their shape does not fit.
+            ValueError: in one line, if their shape is wrong.
         """
         actions = np.asarray(actions, dtype=float)
         shape: tuple[int, ...] = self.action_space.shape
@@ -152,8 +153,8 @@ class Form(ABC):
 
 
 class EstimateForm(Form):
-    """What the forms share whose action is an estimate: features are the last outputs, newest
-    first, then u and t/T; the model is not looked at."""
+    """Base class of forms whose action is an estimate. Features are the last outputs, newest first,
+    then u and t/T; the model is not used."""
 
     @property
     def num_features(self) -> int:
@@ -163,7 +164,7 @@ class EstimateForm(Form):
         return memory
 
     def outputs_and_time(self, memory: AgentMemory) -> np.ndarray:
-        """The last outputs, newest first, zero before the first; then u and t/T."""
+        """Return the last outputs, newest first, with zeros before the first; then u and t/T."""
         y = memory.y
         if self.stack > 1:
             y = np.concatenate([y[:, :1], np.nan_to_num(y[:, 1:])], axis=1)
@@ -172,7 +173,7 @@ class EstimateForm(Form):
 
 
 class Estimate(EstimateForm):
-    """The action is x̂ in physical units; the features are y, u and t/T, as the env gives them."""
+    """The action is x̂ in physical units; the features are y, u and t/T, as in the env."""
 
     name = "estimate"
 
@@ -188,8 +189,8 @@ class Estimate(EstimateForm):
 
 
 class Normalized(EstimateForm):
-    """The action is x̂ over the largest states to expect; features are zero where an output is
-    missing, which no network takes."""
+    """The action is x̂ over the bounds of the states. Features are zero where an output is missing,
+    since networks cannot process NaN."""
 
     name = "normalized"
 
@@ -205,11 +206,11 @@ class Normalized(EstimateForm):
 
 
 class PredictionForm(Form):
-    """What the forms share whose action corrects the model's prediction x̂⁻, by a share of the
-    typical error σ(k), a fixed schedule that is the same in all episodes (`typical`).
+    """Base class of forms whose action corrects the model's prediction x̂⁻ by a fraction of the
+    typical error σ(k), a fixed schedule common to all episodes (`typical`).
 
-    Features: asinh of the innovation over √S, x̂⁻ over its scale, u over its largest, and
-    log(1 + k)/log(1 + N), k the sample's number and N the episode's last.
+    Features: asinh of the innovation over √S, x̂⁻ over its scale, u over its largest value, and
+    log(1 + k)/log(1 + N), with k the index of the sample and N that of the last sample.
     """
 
     def prepare(self) -> None:
@@ -225,7 +226,7 @@ class PredictionForm(Form):
     @property
     @abstractmethod
     def num_actions(self) -> int:
-        """Numbers in an action, each from −1 to 1."""
+        """Number of components of an action, each from −1 to 1."""
 
     @property
     def num_features(self) -> int:
@@ -244,17 +245,19 @@ class PredictionForm(Form):
         return np.concatenate([*parts, time[:, None]], axis=1)
 
     def corrected(self, memory: AgentMemory, share: np.ndarray) -> AgentMemory:
-        """The predictions corrected by a share (batch, nx) of the typical error, within bounds."""
+        """Return the predictions corrected by a fraction (batch, nx) of the typical error, within
+        bounds."""
         largest = OUTSIDE * self.bound
         xhat = memory.xhat + share * self.sigma[self._samples(memory.t, memory)]
         return replace(memory, xhat=np.clip(xhat, -largest, largest))
 
     def improvement(self, memory: AgentMemory, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """By how much the correction lessened the squared error, over the typical one, (batch,).
+        """Return the decrease of the squared error due to the correction, relative to the typical
+        one, (batch,).
 
-        Which gain is best at a sample is the same as for −mean(((x̂ − x)/scale)²), since what is
-        subtracted and divided by do not depend on the action; but the rewards of all samples are of
-        one size, where squared errors span six powers of ten.
+        At each sample the best gain is the same as for −mean(((x̂ − x)/scale)²), because the
+        subtracted and dividing terms do not depend on the action. The rewards of all samples have a
+        similar size, however, while squared errors span six powers of ten.
         """
         nis = (memory.surprise**2).sum(axis=1) / self.system.ny
         with np.errstate(all="ignore"):
@@ -263,18 +266,19 @@ class PredictionForm(Form):
             return np.clip(less.mean(axis=1) / (1 + nis), -LARGEST_REWARD, LARGEST_REWARD)
 
     def _samples(self, t: np.ndarray, memory: AgentMemory) -> np.ndarray:
-        """The place of samples in the schedules."""
+        """Return the indices of samples in the schedules."""
         k = np.rint((t - memory.start) / self.setup.dt).astype(int)
         return np.minimum(k, len(self.sigma) - 1)
 
 
 class Gain(PredictionForm):
-    """The action is a gain L on the innovation: x̂ = x̂⁻ + L(y − h(t, x̂⁻, u)), x̂⁻ from the model.
+    """The action defines a gain L on the innovation: x̂ = x̂⁻ + L(y − h(t, x̂⁻, u)), x̂⁻ from the
+    model.
 
-    Kalman's gain of state i and output j is ρσᵢ/√Sⱼ, where σᵢ is the standard deviation of the
-    prediction's error, √Sⱼ that of the innovation, and ρ their correlation. The action is ρ, nx·ny
-    numbers, row by row; σ(k) and S(k) are the schedules, so that the agent need not find over which
-    powers of ten a gain decays. What the right ρ is in this episode, it must say.
+    The Kalman gain of state i and output j is ρσᵢ/√Sⱼ, where σᵢ is the standard deviation of the
+    prediction error, √Sⱼ that of the innovation, and ρ their correlation. The action is ρ, nx·ny
+    numbers, row by row. σ(k) and S(k) are the schedules, so that the agent need not learn over
+    which powers of ten a gain decays; it must find the right ρ in each episode.
     """
 
     name = "gain"
@@ -285,13 +289,13 @@ class Gain(PredictionForm):
 
     def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         correlation = self.checked(actions).reshape(-1, self.system.nx, self.system.ny)
-        with np.errstate(all="ignore"):  # of rows that are not finite
+        with np.errstate(all="ignore"):  # rows may contain values that are not finite
             share = np.einsum("bij,bj->bi", correlation, memory.surprise)
         return self.corrected(memory, share)
 
 
 class Correction(PredictionForm):
-    """The action is what is added to the model's prediction, over `LARGEST_CORRECTION` times the
+    """The action is the correction of the model's prediction, over `LARGEST_CORRECTION` times the
     typical error σ(k)."""
 
     name = "correction"
@@ -305,17 +309,17 @@ class Correction(PredictionForm):
 
 
 LARGEST_CORRECTION = 3.0
-"""Typical errors that an action of one adds, as `Correction`."""
+"""Correction for an action of one, in typical errors; see `Correction`."""
 
 FORMS: dict[str, type[Form]] = {f.name: f for f in (Estimate, Normalized, Gain, Correction)}
-"""The forms by the name that ``action_mode`` gives."""
+"""The forms by their ``action_mode``."""
 
 
 def form_of(action_mode: str, system: System, setup: Setup, stack: int = 1) -> Form:
-    """The form of that name.
+    """Return the form of that name.
 
     Raises:
-        ValueError: listing the known ones, if it is unknown.
+        ValueError: listing the known names, if it is unknown.
     """
     if action_mode not in FORMS:
         raise ValueError(f"unknown action_mode {action_mode!r}; known are {', '.join(FORMS)}")
@@ -323,11 +327,14 @@ def form_of(action_mode: str, system: System, setup: Setup, stack: int = 1) -> F
 
 
 def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
-    """How large errors of a prediction typically are, σ (num_steps + 1, nx) in state units, and
+    """Return the typical size of prediction errors, σ (num_steps + 1, nx) in state units, and of
     innovations, √S (num_steps + 1, ny) in output units, at each sample of an episode.
 
-    Both are medians of a Kalman filter's covariances along trajectories of the model that begin at
-    draws from the prior; they depend on the model, prior and noise alone.
+    Both are medians of a Kalman filter's covariances along trajectories of the model from initial
+    states drawn from the prior. They depend on the model, prior and noise alone.
+
+    Raises:
+        ValueError: in one line, if the model diverges from every draw.
     """
     times, nx = setup.times, system.nx
     mean, std = vector(setup.xhat0, nx, "xhat0"), vector(setup.P0_std, nx, "P0_std")
@@ -341,11 +348,12 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
     u = np.broadcast_to(np.asarray(system.input(times))[:, None], (len(times), _DRAWS, system.nu))
     zero = np.zeros((_DRAWS, system.ny))
     variance, S_all = np.empty((len(times), nx, _DRAWS)), np.empty((len(times), system.ny, _DRAWS))
-    with np.errstate(all="ignore"):  # of draws from which the model runs away
+    with np.errstate(all="ignore"):  # the model may diverge from some draws
         for k, t in enumerate(times):
             if k:
                 x, P, _ = predict(system, (times[k - 1], t), x, P, Q, (u[k - 1], u[k]))
             variance[k] = np.einsum("iib->ib", P)
+            # Covariances of the update; the zero innovation leaves the trajectory unchanged.
             H = system.h_jacobian(t, x, u[k]).transpose(1, 2, 0)
             _, P, S = joseph_update(x, P, zero, H, R)
             S_all[k] = np.einsum("iib->ib", S)
@@ -358,7 +366,7 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unit_box(size: int) -> Box:
-    """Actions of so many numbers from −1 to 1."""
+    """Return a box of numbers from −1 to 1."""
     return Box(-1.0, 1.0, (size,), np.float32)
 
 

@@ -1,4 +1,4 @@
-"""The agent's side of an env: what it observes of the episodes, and what its actions mean."""
+"""The agent's interface to an env: its observations and the interpretation of its actions."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 
 
 class AgentSide:
-    """What stands between an agent and the episodes of an env: the form of its actions and
-    observations, and that form's memory of the episodes now playing.
+    """Converts between an agent and the episodes of an env: holds the form of the task, and the
+    form's memory of the current episodes.
 
     Args:
-        source: where the episodes come from.
-        action_mode: the form's name.
+        source: source of the episodes.
+        action_mode: name of the form.
         reward: ``error`` or ``improvement``; see `pinnobs_gym.envs.env.EstimationEnv`.
-        stack: how many of the last outputs an observation holds.
+        stack: number of the last outputs in an observation.
     """
 
     def __init__(self, source: EpisodeSource, action_mode: str, reward: str, stack: int) -> None:
@@ -38,13 +38,13 @@ class AgentSide:
     def begin(
         self, mean: np.ndarray, samples: np.ndarray, k: np.ndarray, rows: np.ndarray | None = None
     ) -> np.ndarray:
-        """The observations (batch, features) after a reset of rows, all if None.
+        """Return the observations (batch, features) after a reset of rows, all if None.
 
         Args:
             mean: prior means, shape (batch, nx).
             samples: the env's own observations, shape (batch, ny + nu + 1).
-            k: numbers of the samples, shape (batch,).
-            rows: those reset; the others observe what they did.
+            k: indices of the samples, shape (batch,).
+            rows: the rows that are reset; the observations of the others do not change.
         """
         rows = np.arange(len(k)) if rows is None else rows
         if self._memory is None:
@@ -57,24 +57,25 @@ class AgentSide:
         return self._features.copy()
 
     def forget(self, mean: np.ndarray, rows: np.ndarray) -> None:
-        """Begin the episodes of rows (n,) anew, whose first samples are still to be looked at."""
+        """Start new episodes in rows (n,), whose first samples are observed later."""
         self._memory = self._playing.with_rows(rows, self._initial(mean[rows]))
 
     def observe(self, samples: np.ndarray, k: np.ndarray) -> np.ndarray:
-        """The observations (batch, features) of the next samples; arguments as in `begin`."""
-        with np.errstate(all="ignore"):  # rows whose action was not finite
+        """Return the observations (batch, features) of the next samples; arguments as in
+        `begin`."""
+        with np.errstate(all="ignore"):  # actions may not be finite
             features, self._memory = self.form.observe(self._playing, *self._sample(samples, k))
         self._features = features.astype(np.float32)
         return self._features.copy()
 
     def act(self, actions: np.ndarray) -> np.ndarray:
-        """The estimates (batch, nx) that actions mean."""
+        """Return the estimates (batch, nx) that result from actions."""
         self._before = self._playing
         self._memory = self.form.act(self._before, actions)
         return self._memory.xhat
 
     def improvement(self, xhat: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """The reward of the last actions, (batch,); see `PredictionForm.improvement`."""
+        """Return the reward of the last actions, (batch,); see `PredictionForm.improvement`."""
         assert isinstance(self.form, PredictionForm)
         return self.form.improvement(self._before, xhat, x)
 

@@ -1,4 +1,4 @@
-"""What the single and the vectorised environment do with their arguments alike."""
+"""Handling of arguments common to the single and the vectorised environment."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.simulation.system import System
 
 NOT_FINITE_REWARD = -1e4
-"""Reward of an action that is not finite; it ends the episode."""
+"""Reward of an action that is not finite, which ends the episode."""
 
 
 def reward_weights(system: System) -> np.ndarray:
-    """What each squared error counts in minus the reward."""
+    """Return the weight of each squared error in the negative reward."""
     return 1 / (np.asarray(system.scale, dtype=float) ** 2 * system.nx)
 
 
 def seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
-    """The seeds that Gymnasium made an env's generator from."""
+    """Return the seed sequence of a generator made by Gymnasium."""
     seeds = rng.bit_generator.seed_seq
     if not isinstance(seeds, np.random.SeedSequence):
         raise TypeError(f"np_random was made from {type(seeds).__name__}; expected SeedSequence")
@@ -29,20 +29,20 @@ def seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
 
 
 def check_render_mode(mode: str | None, known: Sequence[str]) -> None:
-    """Check a render mode; None is none.
+    """Check a render mode; None means no rendering.
 
     Raises:
-        ValueError: in one line, listing the known ones.
+        ValueError: in one line, listing the known modes.
     """
     if mode is not None and mode not in known:
         raise ValueError(f"render_mode={mode!r}; expected {' or '.join(known)}")
 
 
 def check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
-    """The options of a reset, none if there are none.
+    """Return the options of a reset, empty if None.
 
     Raises:
-        ValueError: in one line, listing the known ones, if one is unknown.
+        ValueError: in one line, listing the known options, if one is unknown.
     """
     for name in options or {}:
         if name not in known:
@@ -51,8 +51,12 @@ def check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[
 
 
 def given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.ndarray | None:
-    """The initial states (batch, nx) among the reset options, if there; a warning if they are
-    outside the setup's set."""
+    """Return the initial states (batch, nx) from the reset options, None if not given. Warn if they
+    are outside the setup's set.
+
+    Raises:
+        ValueError: in one line, if their shape is wrong or they are not finite.
+    """
     if "x0" not in options:
         return None
     nx = source.system.nx

@@ -1,4 +1,4 @@
-"""The environment: one episode at a time."""
+"""The single environment."""
 
 from __future__ import annotations
 
@@ -25,31 +25,33 @@ from pinnobs_gym.simulation.system import System
 
 
 class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
-    """One episode at a time of estimating a plant's state from its noisy outputs.
+    """Estimation of a plant's state from its noisy outputs, one episode at a time.
 
-    `reset` returns the observation of y₀. The action is the estimate x̂(k|k), in physical units; it
+    `reset` returns the observation of y₀. The action is the estimate x̂(k|k) in physical units. It
     is scored against the true x_k, and time advances. The reward is −mean(((x̂ − x)/scale)²). The
-    estimate never acts on the plant. Raw actions are scored, never clipped; one that is not finite
+    estimate never acts on the plant. Actions are scored unclipped. An action that is not finite
     ends the episode with `NOT_FINITE_REWARD`; otherwise only the time limit ends it. The
     observation after the last action is never scored.
 
-    For agents that learn, ``action_mode`` gives actions another meaning and, with it, observations:
-    `pinnobs_gym.envs.actions` has the forms. What they make of an action is then the estimate.
+    For learning agents, ``action_mode`` selects other actions and observations;
+    `pinnobs_gym.envs.actions` has the forms. The estimate is then computed from the action by the
+    form.
 
     Args:
         system: name, ``module:Class`` or class of the system.
         setup: ``benchmark`` or ``paper``.
-        condition: how episodes depart from the setup; see `pinnobs_gym.simulation.conditions`.
+        condition: change of the episodes relative to the setup; see
+            `pinnobs_gym.simulation.conditions`.
         action_mode: ``estimate``, ``normalized``, ``gain`` or ``correction``.
-        reward: ``error``, as above, or ``improvement`` on the model's prediction, for training with
-            actions that are gains or corrections; see
+        reward: ``error``, as above, or ``improvement`` over the model's prediction, for training
+            with actions that are gains or corrections; see
             `pinnobs_gym.envs.actions.PredictionForm.improvement`.
-        stack_outputs: how many of the last outputs an observation holds.
+        stack_outputs: number of the last outputs in an observation.
         render_mode: ``rgb_array`` or ``human``.
         changes: ``dt``, ``duration``, ``noise_std``, ``parameters``; see `Changes`.
 
     Reset options: ``x0``, the true initial state (nx,), and ``xhat0``, the initial estimate (nx,),
-    which is only reported in ``info``. ``info`` holds ``state``, the true state behind the
+    from which forms with a prediction start. ``info`` holds ``state``, the true state at the
     observation, for scoring only, and after a reset ``xhat0`` and ``P0``, the prior.
     """
 
@@ -139,7 +141,8 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         return observation, reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The true states so far over their estimates: an image (height, width, 3), or a window."""
+        """Draw the true states so far with their estimates: an image (height, width, 3), or a
+        window."""
         if self.render_mode is None:
             gym.logger.warn("render() draws nothing: make the env with render_mode='rgb_array'")
             return None

@@ -1,4 +1,4 @@
-"""Where episodes come from: what chance decides in them, and their simulation."""
+"""The source of episodes: their random draws and their simulation."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from pinnobs_gym.simulation.truth import disturbed_truth, truth
 from pinnobs_gym.systems import SYSTEMS
 
 _DRAWS = 64
-"""Initial states drawn at a time."""
+"""Number of initial states drawn at a time."""
 _ATTEMPTS = 1000
-"""Such draws without an admissible state before the initial set is taken to be empty."""
+"""Number of such draws without an admissible state after which the initial set counts as empty."""
 
 _SAMPLES_AHEAD = 65536
-"""Samples simulated at a time where rows begin anew one by one."""
+"""Number of samples simulated at a time when rows restart one by one."""
 
 
 class Changes(TypedDict, total=False):
-    """Values that replace those of a setup; None keeps the setup's."""
+    """Values that replace those of a setup; None keeps the setup's value."""
 
     dt: float | None
     """Time between samples in s."""
@@ -41,47 +41,48 @@ class Changes(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Draws:
-    """All that chance decides in a batch of episodes."""
+    """All random numbers of a batch of episodes."""
 
     x0: np.ndarray
     """Initial states, shape (batch, nx)."""
     noise: np.ndarray
     """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
     seeds: tuple[int, ...]
-    """A seed per episode for what its condition draws; none if that draws nothing."""
+    """A seed per episode for the draws of its condition; empty if the condition draws nothing."""
 
     def row(self, i: int) -> Draws:
-        """Those of one episode."""
+        """Return the draws of one episode."""
         return Draws(self.x0[i : i + 1], self.noise[i : i + 1], self.seeds[i : i + 1])
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Simulated episodes of a system on common sample times, (time, batch, dim)."""
+    """Simulated episodes of a system with common sample times, (time, batch, dim)."""
 
     x: np.ndarray
     """True states, shape (num_steps + 1, batch, nx)."""
     y: np.ndarray
-    """Outputs as measured, shape (num_steps + 1, batch, ny)."""
+    """Measured outputs, shape (num_steps + 1, batch, ny)."""
     observations: np.ndarray
     """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
 
     def row(self, i: int) -> Episodes:
-        """One of them."""
+        """Return one of the episodes."""
         return Episodes(*(getattr(self, f.name)[:, i : i + 1] for f in fields(self)))
 
 
 class EpisodeSource:
-    """Makes the episodes of an env: every seed names an endless sequence of them.
+    """Generates the episodes of an env: every seed defines an endless sequence of them.
 
-    What chance decides in an episode (`Draws`) depends on the seed and on how many episodes of that
-    seed came before, and the rest on these draws alone: the same seed gives the same episodes in
-    any batch.
+    The random numbers of an episode (`Draws`) depend on the seed and on the number of earlier
+    episodes of that seed. Everything else depends on these draws alone. The same seed thus gives
+    the same episodes in any batch.
 
     Args:
         system: name, ``module:Class`` or class of the system.
         setup: the setup's name.
-        condition: how episodes depart from the setup; see `pinnobs_gym.simulation.conditions`.
+        condition: change of the episodes relative to the setup; see
+            `pinnobs_gym.simulation.conditions`.
         changes: values that replace the setup's.
     """
 
@@ -98,7 +99,7 @@ class EpisodeSource:
                 raise ValueError(f"unknown argument {name!r}; known are {known}")
         self.system, chosen = SYSTEMS.resolve(system).configured(setup, **changes)
         self.condition = parse_condition(condition)
-        self.condition.plant(self.system, ())  # a condition that does not fit says so now
+        self.condition.plant(self.system, ())  # raises if the condition does not apply
         self.setup = self.condition.setup(self.system, chosen)
         self.fixed_x0 = self.setup.fixed_x0
         self.process_noise = self.condition.process_noise(self.system)
@@ -111,13 +112,13 @@ class EpisodeSource:
         self._noise_std = vector(self.setup.noise_std, self.system.ny, "noise_std")
 
     def contains(self, x0: np.ndarray) -> np.ndarray:
-        """Which initial states (..., nx) belong to the setup's set: bool (...)."""
+        """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
         inside = np.asarray(((x0 >= self.x0_low) & (x0 <= self.x0_high)).all(axis=-1))
         return inside if self.fixed_x0 else inside & self.system.admissible(x0)
 
     def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
-        """What chance decides in the next episode of each stream; a stream may stand there several
-        times. The array ``noise``, of the right size, is written anew if given."""
+        """Draw the random numbers of the next episode of each stream; a stream may occur several
+        times. The array ``noise``, if given, must have the right size and is overwritten."""
         x0 = np.empty((len(streams), self.system.nx))
         if noise is None:
             noise = np.empty((len(streams), len(self.times), self.system.ny))
@@ -130,12 +131,12 @@ class EpisodeSource:
     def play(
         self, draws: Draws, x0: np.ndarray | None = None, into: Episodes | None = None
     ) -> Episodes:
-        """The episodes of these draws.
+        """Simulate the episodes of these draws.
 
         Args:
-            draws: what chance decided.
-            x0: initial states (batch, nx) that replace those drawn.
-            into: episodes of the same size that are over, whose arrays are written anew.
+            draws: the random numbers.
+            x0: initial states (batch, nx) that replace the drawn ones.
+            into: finished episodes of the same size, whose arrays are overwritten.
         """
         start = draws.x0 if x0 is None else x0
         episodes = self._empty(len(start)) if into is None else into
@@ -171,7 +172,8 @@ class EpisodeSource:
         )
 
     def record(self, episodes: Episodes, xhat0: object = None) -> Record:
-        """What an estimator may see of the episodes: their samples up to the last action's."""
+        """Return the record of the episodes, which estimators are given: the samples up to that of
+        the last action."""
         batch, last = episodes.y.shape[1], self.setup.num_steps
         u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
         prior = Prior.of(self.system, self.setup, batch, xhat0)
@@ -179,14 +181,15 @@ class EpisodeSource:
 
 
 class EpisodeBuffer:
-    """The next episodes of an env's rows, simulated before they are played.
+    """Buffer of the next episodes of an env's rows, simulated before they are played.
 
-    Many episodes take little longer than one: where rows begin anew one by one, a block is
-    simulated at a time, of the rows that have none waiting and then of those that ask.
+    Simulating many episodes takes little longer than one. When rows restart one by one, a block of
+    episodes is simulated at a time: one for each requested row and each other row without a waiting
+    episode, and then further ones of the requested rows.
 
     Args:
-        source: of the episodes.
-        rows: how many rows there are.
+        source: source of the episodes.
+        rows: number of rows.
     """
 
     def __init__(self, source: EpisodeSource, rows: int) -> None:
@@ -194,20 +197,20 @@ class EpisodeBuffer:
         self._waiting: list[deque[tuple[Draws, Episodes]]] = [deque() for _ in range(rows)]
 
     def forget(self, rows: Iterable[int]) -> None:
-        """Drop what waits for these rows, whose streams are others now."""
+        """Drop the waiting episodes of these rows, whose streams have changed."""
         for row in rows:
             self._waiting[row].clear()
 
     def any(self, rows: Iterable[int]) -> bool:
-        """Whether an episode waits for one of these rows."""
+        """Return whether an episode waits for one of these rows."""
         return any(self._waiting[row] for row in rows)
 
     def _draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
-        """What chance decides in the next episodes of these rows, waiting or not."""
+        """Return the draws of the next episodes of these rows, waiting or not."""
         waiting = [self._waiting[row].popleft()[0] if self._waiting[row] else None for row in rows]
         drawn = [
-            self._source.draw([streams[row]]) if found is None else found
-            for row, found in zip(rows, waiting, strict=True)
+            self._source.draw([streams[row]]) if draws is None else draws
+            for row, draws in zip(rows, waiting, strict=True)
         ]
         seeds = tuple(seed for draws in drawn for seed in draws.seeds)
         x0 = np.concatenate([draws.x0 for draws in drawn])
@@ -216,13 +219,15 @@ class EpisodeBuffer:
     def take(
         self, rows: Sequence[int], streams: Sequence[Stream], x0: np.ndarray | None = None
     ) -> Episodes:
-        """The next episodes of these rows, from initial states (len(rows), nx) if given."""
+        """Return the next episodes of these rows, from initial states (len(rows), nx) if given."""
         if x0 is not None:
             return self._source.play(self._draw(rows, streams), x0)
         missing = [row for row in rows if not self._waiting[row]]
         if missing:
-            asked = set(missing)
-            others = (r for r, found in enumerate(self._waiting) if not found and r not in asked)
+            requested = set(missing)
+            others = (
+                r for r, queue in enumerate(self._waiting) if not queue and r not in requested
+            )
             size = max(len(missing), _SAMPLES_AHEAD // len(self._source.times))
             block = list(islice(chain(missing, others, cycle(missing)), size))
             draws = self._source.draw([streams[row] for row in block])
@@ -235,7 +240,7 @@ class EpisodeBuffer:
 
 
 class Stream:
-    """The random numbers that one seed stands for, and its queue of initial states."""
+    """The random number generators of one seed, and its queue of initial states."""
 
     def __init__(self, seeds: np.random.SeedSequence) -> None:
         states, noise, conditions = (np.random.default_rng(seed) for seed in seeds.spawn(3))
@@ -245,7 +250,11 @@ class Stream:
         self.conditions = conditions
 
     def next_x0(self, source: EpisodeSource) -> np.ndarray:
-        """The next initial state (nx,): from the setup's set, as the condition changes it."""
+        """Return the next initial state (nx,) from the setup's set, as changed by the condition.
+
+        Raises:
+            ValueError: in one line, if no drawn state is admissible.
+        """
         for _ in range(1 if source.fixed_x0 else _ATTEMPTS):
             if self._queue:
                 return self._queue.pop(0)

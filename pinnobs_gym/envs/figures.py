@@ -1,4 +1,4 @@
-"""Pictures: true states over their estimates, as env frames, TensorBoard figures and files."""
+"""Figures of true states and their estimates, for env frames, TensorBoard and files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
 """Colours of true states, estimates and measured outputs."""
 _LARGEST = 1e100
-"""Estimates beyond it have diverged, and are not drawn: an axis cannot span all numbers."""
+"""Largest absolute estimate that is drawn, since an axis cannot span all numbers."""
 
 
 def state_figure(
@@ -27,16 +27,16 @@ def state_figure(
     P: np.ndarray | None = None,
     title: str = "",
 ) -> Figure:
-    """A picture of estimates over time, a panel per state.
+    """Return a figure of estimates over time, with a panel per state.
 
     Args:
         system: names and units.
         t: times in s, shape (num_samples,).
         xhat: estimates, shape (num_samples, nx).
         x: true states (num_samples, nx), if known.
-        y: outputs (num_samples, ny); each is drawn as dots where it measures one state alone.
-        P: covariances (num_samples, nx, nx); drawn as a band of two standard deviations.
-        title: a line above.
+        y: outputs (num_samples, ny); those that directly measure a state are drawn as dots.
+        P: covariances (num_samples, nx, nx), drawn as a band of two standard deviations.
+        title: title of the figure.
     """
     from matplotlib.figure import Figure
 
@@ -51,11 +51,11 @@ def state_figure(
             panel.plot(t, dots, ".", ms=2, color=MEASURED, label="measured")
         if x is not None:
             panel.plot(t, x[:, i], color=TRUE, lw=1.5, label="true")
-        estimate = _drawn(xhat[:, i])
+        estimate = _drawable(xhat[:, i])
         kept = np.isfinite(estimate)
         panel.plot(t[kept], estimate[kept], "--", color=ESTIMATE, lw=1.3, label="estimate")
         if P is not None:
-            band = 2 * np.sqrt(_drawn(np.maximum(P[:, i, i], 0)))
+            band = 2 * np.sqrt(_drawable(np.maximum(P[:, i, i], 0)))
             low, high = estimate - band, estimate + band
             panel.fill_between(t, low, high, color=ESTIMATE, alpha=0.15, lw=0)
         seen = x[:, i] if x is not None else estimate[kept]
@@ -69,8 +69,8 @@ def state_figure(
 
 
 def measured_states(system: System) -> dict[int, int]:
-    """The states that are measured alone, each with the index of the output that does so: an output
-    that is the state itself, whatever the time and the input."""
+    """Return the index of each directly measured state, with the index of its output: an output
+    that equals the state at any time and input."""
     setup = system.setups["benchmark"]
     t = setup.duration * np.array([0.0, 0.37])
     x = np.tile(vector(setup.xhat0, system.nx, "xhat0"), (2, 1))
@@ -84,8 +84,8 @@ def measured_states(system: System) -> dict[int, int]:
     return measured
 
 
-def _drawn(values: np.ndarray) -> np.ndarray:
-    """The values, NaN where they are not drawn."""
+def _drawable(values: np.ndarray) -> np.ndarray:
+    """Return the values, with NaN in place of those that are too large to be drawn."""
     return np.where(abs(values) <= _LARGEST, values, np.nan)
 
 
@@ -96,9 +96,9 @@ def _limits(values: np.ndarray, scale: float) -> tuple[float, float]:
 
 
 class EpisodePicture:
-    """The running picture of an episode that an env renders.
+    """The running figure of an episode that an env renders.
 
-    What stays the same in an episode is drawn once, and only the curves are drawn anew.
+    Static parts are drawn once per episode; each frame redraws only the curves.
     """
 
     def __init__(self, system: System, mode: str) -> None:
@@ -108,18 +108,19 @@ class EpisodePicture:
         self._window: Any = None
 
     def begin(self, times: np.ndarray, x: np.ndarray, observations: np.ndarray) -> None:
-        """Start an episode: sample times (num_samples,), true states and observations over it."""
+        """Start an episode, given its sample times (num_samples,), true states and observations."""
         self._times, self._x = times, x
         self._y = observations[:, : self._system.ny]
         self._xhat = np.full_like(x, np.nan)
         self._background: Any = None
 
     def add(self, k: int, estimate: np.ndarray) -> None:
-        """Keep the estimate (nx,) made at sample k."""
+        """Store the estimate (nx,) of sample k."""
         self._xhat[k] = estimate
 
     def draw(self, k: int) -> np.ndarray | None:
-        """Draw the episode up to sample k: an image (height, width, 3) of bytes, or the window."""
+        """Draw the episode up to sample k, as an image (height, width, 3) of bytes or in the
+        window."""
         if self._background is None:
             self._prepare()
         self._canvas.restore_region(self._background)
@@ -138,7 +139,7 @@ class EpisodePicture:
         return image
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window if it is open."""
         if self._window is not None:
             from matplotlib import pyplot
 
@@ -185,5 +186,5 @@ class EpisodePicture:
         window, shown = self._window
         shown.set_data(image)
         window.canvas.draw_idle()
-        # What pyplot.pause does but for raising the window: it would take the focus at each frame.
+        # As pyplot.pause, but without raising the window, which would take the focus at each frame.
         window.canvas.start_event_loop(1e-3)

@@ -1,4 +1,4 @@
-"""What is played: a system's setup under a condition."""
+"""A game: a system's setup under a condition."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from pinnobs_gym.simulation.system import System
 
 
 class GameName(NamedTuple):
-    """What was played, as rows name it."""
+    """The name of a game, as stored in rows."""
 
     env_id: str
     """Such as ``pinnobs/ReverseDuffing-v0``."""
     setup: str
-    """``benchmark`` or ``paper``, or another of the system's."""
+    """``benchmark`` or ``paper``, or another setup of the system."""
     condition: str
-    """Its canonical name; see `pinnobs_gym.simulation.conditions.canonical_name`."""
+    """Canonical name of the condition; see `pinnobs_gym.simulation.conditions.canonical_name`."""
 
     @property
     def system(self) -> str:
@@ -35,15 +35,15 @@ class GameName(NamedTuple):
 
     @property
     def file_stem(self) -> str:
-        """The name as the beginning of a file's."""
+        """The name as the beginning of file names."""
         return "-".join([self.system, self.setup, self.condition])
 
 
 @dataclass(frozen=True)
 class Game:
-    """What is played: everything that makes an episode but its seed. Made by `Game.of`.
+    """A game: all that defines an episode except its seed. Created by `Game.of`.
 
-    A game can be pickled; its episodes are made anew wherever it arrives.
+    A game can be pickled; its episode source is created again when it is unpickled and used.
     """
 
     name: GameName
@@ -60,17 +60,17 @@ class Game:
         condition: str = "nominal",
         **changes: Unpack[Changes],
     ) -> Self:
-        """The game of a system, setup and condition.
+        """Return the game of a system, setup and condition.
 
         Args:
             system: name, ``module:Class``, class or env id of the system, which is registered.
             setup: the setup's name.
-            condition: how episodes depart from the setup, such as ``noise5+dropout10``.
+            condition: change of the episodes relative to the setup, such as ``noise5+dropout10``.
             changes: values that replace the setup's: ``dt``, ``duration``, ``noise_std``,
                 ``parameters``.
 
         Raises:
-            ValueError: in one line, if one of them is unknown, or they do not fit each other.
+            ValueError: in one line, if one of them is unknown, or they are incompatible.
         """
         if isinstance(system, str) and system.startswith("pinnobs/"):
             name, spec = system, _system_of(system)
@@ -79,7 +79,7 @@ class Game:
             name = env_id(system)
             spec = _system_of(name)
         game = cls(GameName(name, setup, canonical_name(condition)), spec, dict(changes))
-        _ = game.source  # what does not fit is refused now
+        _ = game.source  # reject incompatible arguments now
         return game
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -87,25 +87,25 @@ class Game:
 
     @cached_property
     def source(self) -> EpisodeSource:
-        """What makes the episodes; it has the model and the setup that estimators are told."""
+        """The source of the episodes, with the model and the setup that estimators are given."""
         return EpisodeSource(self.system, self.name.setup, self.name.condition, **self.changes)
 
     def episodes(self, seeds: Iterable[int], x0: np.ndarray | None = None) -> Episodes:
-        """The episodes that single envs reset with these seeds begin with.
+        """Return the first episodes of single envs that are reset with these seeds.
 
         Args:
-            seeds: one for each episode.
-            x0: initial states (batch, nx) that replace those drawn.
+            seeds: one per episode.
+            x0: initial states (batch, nx) that replace the drawn ones.
         """
         streams = [Stream(np.random.SeedSequence(seed)) for seed in seeds]
         return self.source.play(self.source.draw(streams), x0)
 
     def record(self, seeds: Iterable[int]) -> Record:
-        """What an estimator may see of the episodes of these seeds."""
+        """Return the record, given to estimators, of the episodes of these seeds."""
         return self.source.record(self.episodes(seeds))
 
     def vector_env(self, num_envs: int, **arguments: Any) -> EstimationVectorEnv:
-        """The vectorised env of the game; ``arguments`` are further ones of it, such as
+        """Return the vectorised env of the game; ``arguments`` are passed to it, such as
         ``action_mode``."""
         name, setup, condition = self.name
         env: Any = gym.make_vec(
@@ -121,7 +121,7 @@ class Game:
 
 
 def _system_of(name: str) -> str:
-    """The system of an env id, as ``module:Class``."""
+    """Return the system of an env id as ``module:Class``."""
     if name not in gym.registry:
         known = ", ".join(sorted(each for each in gym.registry if each.startswith("pinnobs/")))
         raise ValueError(f"unknown env id {name!r}; known are {known}")

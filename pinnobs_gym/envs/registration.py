@@ -1,4 +1,4 @@
-"""How a system becomes an env id."""
+"""Registration of systems as env ids."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def register_system(cls: type[System]) -> None:
-    """Make a system known by its name, and its env to Gymnasium.
+    """Register a system by its name, and its env with Gymnasium.
 
     Raises:
-        TypeError: in one line, if the class is not complete.
+        TypeError: in one line, if the class is incomplete.
         ValueError: if its name is taken.
     """
     cls.validate()
@@ -25,8 +25,8 @@ def register_system(cls: type[System]) -> None:
 
 
 def register_envs() -> None:
-    """Make an env of every system known to Gymnasium: of this package, without importing any, and
-    of the installed packages that announce some."""
+    """Register an env of every system with Gymnasium: of this package, without importing the
+    systems, and of installed plug-ins."""
     for name, origin in SYSTEMS.sources.items():
         version = origin.constants.get("version", 0)
         _register_env(f"pinnobs/{name}-v{version}", f"{origin.module}:{name}")
@@ -35,7 +35,8 @@ def register_envs() -> None:
 
 
 def env_id(system: str | type[System]) -> str:
-    """The env id of a system, given by class, name or ``module:Class``, which is then registered.
+    """Return the env id of a system, given by class, name or ``module:Class``, and register the
+    system.
 
     Raises:
         ValueError: listing the known systems, if it is unknown.
@@ -55,5 +56,5 @@ def _register_env(name: str, system: str) -> None:
             name,
             entry_point="pinnobs_gym.envs.env:EstimationEnv",
             vector_entry_point="pinnobs_gym.envs.vector_env:EstimationVectorEnv",
-            kwargs={"system": system},  # with its module, so that a new process finds it
+            kwargs={"system": system},  # the module allows a new process to import it
         )

@@ -1,4 +1,4 @@
-"""Our vectorised env as Stable-Baselines3 wants one."""
+"""The vectorised env with the interface of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from pinnobs_gym.envs.vector_env import EstimationVectorEnv
 class Sb3VecEnv(VecEnv):
     """An `EstimationVectorEnv` as a `VecEnv` of Stable-Baselines3.
 
-    A row whose episode is over begins its next one in the same step, as SB3 expects: its info then
-    holds ``terminal_observation`` and ``TimeLimit.truncated``. Infos hold nothing else: what an
-    episode's true states were is not handed to agents. `seed` seeds the episodes that begin with
-    the next reset, row i with seed + i.
+    A row whose episode is over starts its next one in the same step, as SB3 expects; its info then
+    holds ``terminal_observation`` and ``TimeLimit.truncated``. Infos hold nothing else, so that
+    agents do not get the true states. `seed` seeds the episodes that start with the next reset, row
+    i with seed + i.
 
     Args:
         env: the env; its autoreset is not used.
-        spread: cut episodes short, so that a batch of rows holds samples of all times in an
-            episode, and more of the first ones, where most happens. Of n rows, those of even
-            number i play whole episodes but for their first, which ends after the part s = (i+1)/n;
-            those of odd number end every episode after the part s².
+        spread: shorten episodes, so that a batch of rows has samples from all times of an episode,
+            and more from the transient. Of n rows, those with an even index i play whole episodes
+            except the first, which ends after the fraction s = (i+1)/n; those with an odd index end
+            every episode after the fraction s².
     """
 
     def __init__(self, env: EstimationVectorEnv, *, spread: bool = False) -> None:
@@ -91,14 +91,15 @@ class Sb3VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """Call a method of the vectorised env once; every row asked for gets what it returns."""
+        """Call a method of the vectorised env once; its result is returned for every requested
+        row."""
         value = getattr(self.env, method_name)(*method_args, **kwargs)
         return [value for _ in self._get_indices(indices)]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """No row is wrapped: what wrappers do to single envs, action modes do to this one."""
+        """Return False for every row: action modes replace the wrappers of single envs."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:

@@ -1,4 +1,4 @@
-"""The vectorised environment: many episodes at a time."""
+"""The vectorised environment."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from pinnobs_gym.simulation.system import System
 
 
 class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many episodes at a time of what `EstimationEnv` plays one at a time.
+    """A vectorised `EstimationEnv`: many episodes at a time.
 
-    Row i of an env seeded s is the single env seeded s + i. A row whose episode is over is reset by
-    the next step, whose action it ignores (Gymnasium's ``NEXT_STEP``). The arguments are those of
-    `EstimationEnv`; reset options ``x0`` and ``xhat0`` are (nx,) or (num_envs, nx), and
-    ``reset_mask`` (num_envs,) names the rows to reset.
+    Row i of an env with seed s equals the single env with seed s + i. A row whose episode is over
+    is reset by the next step, which ignores its action (Gymnasium's ``NEXT_STEP``). The arguments
+    are those of `EstimationEnv`. Reset options ``x0`` and ``xhat0`` are (nx,) or (num_envs, nx),
+    and ``reset_mask`` (num_envs,) selects the rows to reset.
     """
 
     metadata = {
@@ -131,7 +131,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._k += 1
         begun = None
         if self._any_over:
-            over = over.copy()  # beginning anew clears the original
+            over = over.copy()  # starting new episodes clears the original
             begun = np.flatnonzero(over)
             default = Prior.of(self.source.system, self.source.setup, len(begun))
             self._begin(begun, default.mean)
@@ -150,12 +150,12 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         return observations, rewards, terminated, truncated, infos
 
     def record(self) -> Record:
-        """What an estimator may see of the episodes now playing, from their first sample to that
-        of the last action."""
+        """Return the record of the current episodes, which estimators are given: the samples up to
+        that of the last action."""
         return self.source.record(self._playing, self._prior.mean)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """An image (height, width, 3) per row."""
+        """Return an image (height, width, 3) per row."""
         if self.render_mode is None:
             gym.logger.warn("render() draws nothing: make the env with render_mode='rgb_array'")
             return None
@@ -174,7 +174,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         return self._episodes
 
     def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
-        """Give these rows their streams, if there is a seed or no stream yet."""
+        """Create the streams of these rows if a seed is given or there are none yet."""
         seeds: list[int | None]
         if isinstance(seed, int | np.integer):
             super().reset(seed=int(seed))
@@ -193,18 +193,18 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
                 self._streams[row] = Stream(np.random.SeedSequence(seeds[row]))
 
     def _prior_infos(self, rows: np.ndarray) -> dict[str, Any]:
-        """The infos of rows whose episode has just begun: their prior."""
+        """Return the infos of rows whose episode has just started: their prior."""
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[rows] = True
         mean, cov = self._prior.mean.copy(), self._prior.cov.copy()
         return {"xhat0": mean, "_xhat0": mask, "P0": cov, "_P0": mask.copy()}
 
     def _begin(self, rows: np.ndarray, xhat0: np.ndarray, x0: np.ndarray | None = None) -> None:
-        """Begin the next episode of these rows, from prior means (len(rows), nx)."""
+        """Start the next episode of these rows, with prior means (len(rows), nx)."""
         self._prior.mean[rows] = xhat0
         chosen = rows.tolist()
         if len(rows) == self.num_envs and not self._buffer.any(chosen):
-            # Arrays of this size are slow to allocate: those of episodes that are over serve again.
+            # Large arrays are slow to allocate: reuse those of the finished episodes.
             draws = self.source.draw(self._streams, self._noise)
             self._noise = draws.noise
             self._episodes = self.source.play(draws, x0, self._episodes)
@@ -225,7 +225,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
                 self._pictures[row].begin(self.source.times, x, observations)
 
     def _observe(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """The observations and infos of each row's present sample."""
+        """Return the observations and infos of the current sample of each row."""
         episodes, k = self._playing, self._k
         if self._together:
             self._state, observations = episodes.x[k[0]], episodes.observations[k[0]].copy()

@@ -1,1 +1,1 @@
-"""What many stored scores say together: standings, ranks, suites of jobs, and the page."""
+"""Comparison of estimators from stored scores: standings, ranks, suites of jobs, and the page."""

@@ -28,11 +28,11 @@ class Board:
 def board(stored: Stored) -> Board:
     """Compute all tables from stored scores."""
     runs = runs_of(stored.rows)
-    found = contenders(runs)
+    compared = contenders(runs)
     return Board(
         tables=tuple(standings_table.tables(runs, stored.failures)),
-        lines=tuple(ranks.lines(found)),
-        ranks=ranks.ranks(ranks.log_ratios(found)),
+        lines=tuple(ranks.lines(compared)),
+        ranks=ranks.ranks(ranks.log_ratios(compared)),
     )
 
 

@@ -69,13 +69,13 @@ def contenders(runs: Iterable[Run]) -> list[Contender]:
 def among(contenders: Iterable[Contender], wanted: Callable[[Run], bool]) -> list[Contender]:
     """Return the contenders restricted to games whose runs are wanted, those with the most rows
     first. Contenders without such a game are left out."""
-    found = []
+    restricted = []
     for contender in contenders:
         games = {game: runs for game, runs in contender.games.items() if wanted(runs[0])}
         ratios = {game: ratio for game, ratio in contender.ratios.items() if game in games}
         if games:
-            found.append(replace(contender, games=games, ratios=ratios))
-    return sorted(found, key=lambda contender: _order(contender.games))
+            restricted.append(replace(contender, games=games, ratios=ratios))
+    return sorted(restricted, key=lambda contender: _order(contender.games))
 
 
 def label(game: GameName) -> str:
@@ -104,7 +104,7 @@ def _ratios(
     games: Mapping[GameName, Sequence[Run]], peer: Mapping[GameName, Sequence[Run]]
 ) -> dict[GameName, np.ndarray]:
     """Compute `Contender.ratios` of a contender's games."""
-    found = {}
+    ratios = {}
     for game in games:
         theirs = {row["episode_seed"]: _score(row) for row in rows_of(peer.get(game, ()))}
         own: dict[object, dict[int, float]] = defaultdict(dict)
@@ -113,8 +113,8 @@ def _ratios(
         common = sorted(set(theirs).intersection(*own.values()))
         if common:
             mine = np.array([[scores[seed] for seed in common] for scores in own.values()])
-            found[game] = log_ratio(mine, np.array([theirs[seed] for seed in common]))
-    return found
+            ratios[game] = log_ratio(mine, np.array([theirs[seed] for seed in common]))
+    return ratios
 
 
 def _score(row: Row) -> float:

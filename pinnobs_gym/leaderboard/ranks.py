@@ -44,8 +44,8 @@ class Line:
 def lines(contenders: Iterable[Contender]) -> list[Line]:
     """Return a line per contender over the systems' ranked conditions: online before offline, then
     those with the most games, then those with the smallest ratio."""
-    found = [_line(contender) for contender in among(contenders, lambda run: run.ranked)]
-    return sorted(found, key=lambda x: (x.track != "online", -len(x.games), x.known_ratio))
+    unsorted = [_line(contender) for contender in among(contenders, lambda run: run.ranked)]
+    return sorted(unsorted, key=lambda x: (x.track != "online", -len(x.games), x.known_ratio))
 
 
 def _line(contender: Contender) -> Line:
@@ -70,17 +70,19 @@ def log_ratios(contenders: Sequence[Contender]) -> dict[str, dict[str, float]]:
     included. Conditions are in the order of `CONDITIONS`.
     """
     online = [contender for contender in contenders if contender.track == "online"]
-    found = {}
-    for condition in sorted({run.game.condition for each in online for run in each.runs}, key=_at):
+    ratios = {}
+    for condition in sorted(
+        {run.game.condition for each in online for run in each.runs}, key=_condition_order
+    ):
         players = among(online, lambda run, played=condition: run.game.condition == played)
         needed = sum(len(player.games) for player in players if player.name == PEER)
         whole = [player for player in players if 0 < needed == len(player.ratios)]
         if whole:
-            found[condition] = {player.name: _mean_ratio(player) for player in whole}
-    return found
+            ratios[condition] = {player.name: _mean_ratio(player) for player in whole}
+    return ratios
 
 
-def _at(condition: str) -> tuple[int, str]:
+def _condition_order(condition: str) -> tuple[int, str]:
     """Return the sort key of a condition: its place in `CONDITIONS`, with others last."""
     listed = list(CONDITIONS)
     return listed.index(condition) if condition in listed else len(listed), condition

@@ -50,13 +50,13 @@ class Run:
 
 def runs_of(rows: Iterable[Row]) -> list[Run]:
     """Group scored episodes into runs, in the order of their first rows."""
-    found: dict[tuple[GameName, str, str], Run] = {}
+    runs: dict[tuple[GameName, str, str], Run] = {}
     for position, row in enumerate(rows):
         key = (game_of(row), row["estimator"], row["config_hash"])
-        if key not in found:
-            found[key] = Run(key[0], [], position)
-        found[key].rows.append(row)
-    return list(found.values())
+        if key not in runs:
+            runs[key] = Run(key[0], [], position)
+        runs[key].rows.append(row)
+    return list(runs.values())
 
 
 def rows_of(runs: Iterable[Run]) -> list[Row]:

@@ -74,12 +74,12 @@ def standing(rows: Sequence[Row]) -> Standing:
         tail=median(values("nrmse_tail")),
         tail_modulo=_modulo(rows),
         tail_90=float(np.quantile(values("nrmse_tail"), 0.9, method="higher")),
-        reference_ratio=_of(np.median, rows, "reference_ratio"),
-        reference_ratio_tail=_of(np.median, rows, "reference_ratio_tail"),
+        reference_ratio=_statistic(np.median, rows, "reference_ratio"),
+        reference_ratio_tail=_statistic(np.median, rows, "reference_ratio_tail"),
         anees=_anees(rows),
-        coverage=_of(np.mean, rows, "coverage"),
-        nis=_of(np.mean, rows, "nis"),
-        innovation_correlation=_of(np.mean, rows, "innovation_correlation"),
+        coverage=_statistic(np.mean, rows, "coverage"),
+        nis=_statistic(np.mean, rows, "nis"),
+        innovation_correlation=_statistic(np.mean, rows, "innovation_correlation"),
         us_per_step=float(np.median([row["us_per_step"] for row in rows])),
         knows=", ".join(first["knows"]),
         budget=first["training"].get("config", {}).get("budget"),
@@ -95,14 +95,14 @@ def _modulo(rows: Sequence[Row]) -> float | None:
     return float(np.median(np.where(modulo <= DIVERGED, modulo, np.inf)))
 
 
-def _of(statistic: Callable[..., Any], rows: Sequence[Row], name: str) -> float | None:
+def _statistic(statistic: Callable[..., Any], rows: Sequence[Row], name: str) -> float | None:
     """Return a statistic of an optional score over the episodes that have it."""
     values = [row[name] for row in rows if row[name] is not None]
     return float(statistic(values)) if values else None
 
 
 def _anees(rows: Sequence[Row]) -> Interval | None:
-    mean = _of(np.mean, rows, "anees")
+    mean = _statistic(np.mean, rows, "anees")
     return None if mean is None else Interval(mean, *band(len(rows), rows[0]["nx"]))
 
 

@@ -1,1 +1,1 @@
-"""How an estimator is played and scored, episode by episode, and how scores are stored."""
+"""Running and scoring estimators episode by episode, and storing the scores."""

@@ -1,4 +1,5 @@
-"""How well an episode can be estimated at all: the Cramér–Rao reference, and exact Bayes."""
+"""Limits of estimation accuracy in an episode: the Cramér–Rao reference, and the exact
+posterior."""
 
 from __future__ import annotations
 
@@ -24,13 +25,13 @@ def cramer_rao(
     Q: np.ndarray | None = None,
     missing: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The Cramér–Rao reference of each episode: covariances that no locally unbiased estimate
-    x̂(k|k) of this trajectory goes below.
+    """Return the Cramér–Rao reference of each episode: the lower bound on the covariance of any
+    locally unbiased estimate x̂(k|k) of this trajectory.
 
     With Φ the product of the Jacobians F of the steps from t₀ to t_k at the true states, and no
-    process noise, it is Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ, here by the recursion P⁻ = FPFᵀ + Q,
-    P = P⁻ − P⁻Hᵀ(HP⁻Hᵀ + R)⁻¹HP⁻ (Taylor 1979; Tichavský, Muravchik & Nehorai 1998 for Q > 0).
-    Estimates that know the prior are not unbiased and may fall below it: compare medians over many
+    process noise, it is Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ. It is computed by the recursion P⁻ = FPFᵀ + Q, P
+    = P⁻ − P⁻Hᵀ(HP⁻Hᵀ + R)⁻¹HP⁻ (Taylor 1979; Tichavský, Muravchik & Nehorai 1998 for Q > 0).
+    Estimates that use the prior are not unbiased and may be below it: compare medians over many
     episodes, not single ones.
 
     Args:
@@ -53,11 +54,14 @@ def cramer_rao(
     for k in range(num_samples):
         now = x[:, k]
         if k:
+            # Time update, linearised at the true state.
             times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
             _, P, _ = predict(system, times, x[:, k - 1], P, noise[..., None], inputs)
         H = system.h_jacobian(t[k], now, u[k]).transpose(1, 2, 0)
         if missing is not None:
+            # A zero row of H carries no information.
             H = np.where(missing[:, k].T[:, None], 0.0, H)
+        # Measurement update; the covariance does not depend on the innovation.
         innovation = np.zeros((batch, system.ny))
         _, P, _ = joseph_update(now, P, innovation, H, R[..., None])
         bound[k] = P
@@ -67,12 +71,12 @@ def cramer_rao(
 def expected_scores(
     P: np.ndarray, scale: Sequence[float], scored: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """The root mean squares over scale, (batch,) each, that errors of covariances P have:
-    ``nrmse``, ``nrmse_75`` and ``nrmse_tail``, to compare with those of `metrics.error_scores`.
+    """Return ``nrmse``, ``nrmse_75`` and ``nrmse_tail``, (batch,) each, expected of errors with
+    covariances P, for comparison with `metrics.error_scores`.
 
     Args:
         P: covariances, shape (batch, num_samples, nx, nx).
-        scale: what errors are divided by, one number per state.
+        scale: scale of the errors, one number per state.
         scored: which errors count, bool, shape (batch, num_samples, nx); all if None.
     """
     variance = np.einsum("bkii->bki", P) / np.square(scale)
@@ -83,11 +87,11 @@ def expected_scores(
 
 
 def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """What one step of the model from the true state errs by, shape (batch, num_samples, nx), zero
-    at the first sample.
+    """Return the error of one step of the model from the true state, shape (batch, num_samples,
+    nx), zero at the first sample.
 
-    `cramer_rao` supposes that steps are exact. Without process noise the reference of a plant that
-    forgets its past falls without end; below this error it says nothing of any estimate.
+    `cramer_rao` assumes exact steps. Without process noise the reference of a contracting plant
+    decreases without limit; below this error it is no bound for any estimate.
 
     Args:
         system: the plant.
@@ -103,14 +107,15 @@ def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Posterior:
-    """What the outputs up to each sample say of the state then."""
+    """Moments of the state at each sample given the outputs up to it."""
 
     mean: np.ndarray
-    """Means, shape (batch, num_samples, nx): no estimate has a smaller mean squared error."""
+    """Posterior means, shape (batch, num_samples, nx): the estimates of least mean squared
+    error."""
     cov: np.ndarray
-    """Covariances, shape (batch, num_samples, nx, nx)."""
+    """Posterior covariances, shape (batch, num_samples, nx, nx)."""
     ess: np.ndarray
-    """Effective number of weighted draws behind them, shape (batch, num_samples)."""
+    """Effective sample size of the weighted draws, shape (batch, num_samples)."""
 
 
 def exact_bayes(
@@ -121,20 +126,21 @@ def exact_bayes(
     draws: int = 2000,
     seed: int = 0,
 ) -> Posterior:
-    """The posterior of the state from outputs of a plant without process noise, by importance
-    sampling of x₀, which is uniform in the setup's set.
+    """Compute the posterior of the state of a plant without process noise by importance sampling of
+    x₀, which is uniform in the setup's set.
 
-    Draws from the prior serve the first sample. For samples up to twice as many, new ones come from
-    a Student distribution with 5 degrees of freedom about those before, weighted by the likelihood
-    of all outputs so far over their density (population Monte Carlo, Cappé et al. 2004). Whether
-    there were enough, `Posterior.ess` tells.
+    Draws from the prior serve the first sample. Each time the number of samples doubles, new draws
+    come from a Student distribution with 5 degrees of freedom, fitted to the previous weighted
+    draws. They are weighted by the likelihood of all outputs so far over their proposal density
+    (population Monte Carlo, Cappé et al. 2004). `Posterior.ess` shows whether there are enough
+    draws.
 
     Args:
         system: the plant.
-        setup: where its initial states come from.
+        setup: defines the set of initial states.
         record: the episodes.
         R: variances of the output noise, shape (ny,).
-        draws: how many initial states at a time.
+        draws: number of initial states per proposal.
         seed: of the draws.
     """
     rng = np.random.default_rng(seed)
@@ -145,15 +151,18 @@ def exact_bayes(
     log_weight = np.zeros((draws, batch))
     start, stop = 0, 1
     while start < n:
-        weight = _run(system, record, R, x0, log_weight, (start, min(stop, n)), result)
+        # Importance weights of the initial states given all outputs up to the last sample.
+        weight = _reweighted(system, record, R, x0, log_weight, (start, min(stop, n)), result)
         mean, cov = _moments(weight, x0)
+        # Student proposal at their mean, wider than their covariance.
         spread = np.linalg.cholesky(2.0 * cov + 1e-18 * np.diag((high - low) ** 2))
-        normal = rng.standard_normal((draws, 1, nx, 1))
-        normal = normal / np.sqrt(rng.chisquare(5.0, (draws, 1, 1, 1)) / 5.0)
-        x0 = mean + (spread @ normal)[..., 0]
+        student = rng.standard_normal((draws, 1, nx, 1))
+        student = student / np.sqrt(rng.chisquare(5.0, (draws, 1, 1, 1)) / 5.0)
+        x0 = mean + (spread @ student)[..., 0]
+        # Prior over proposal density, up to constants: the prior is uniform in the set.
         inside = ((x0 >= low) & (x0 <= high)).all(axis=-1) & system.admissible(x0)
-        density = -(nx + 5) / 2 * np.log1p((normal**2).sum(axis=(2, 3)) / 5.0)
-        log_weight = np.where(inside, -density, -np.inf)
+        log_density = -(nx + 5) / 2 * np.log1p((student**2).sum(axis=(2, 3)) / 5.0)
+        log_weight = np.where(inside, -log_density, -np.inf)
         start, stop = stop, 2 * stop
     return result
 
@@ -161,7 +170,7 @@ def exact_bayes(
 def _prior_draws(
     system: System, low: np.ndarray, high: np.ndarray, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Initial states (count, nx), uniform in the admissible part of the box."""
+    """Draw initial states (count, nx), uniform in the admissible part of the box, by rejection."""
     kept = np.empty((0, len(low)))
     while len(kept) < count:
         drawn = rng.uniform(low, high, (4 * count, len(low)))
@@ -169,7 +178,7 @@ def _prior_draws(
     return kept[:count]
 
 
-def _run(
+def _reweighted(
     system: System,
     record: Record,
     R: np.ndarray,
@@ -178,17 +187,20 @@ def _run(
     samples: tuple[int, int],
     result: Posterior,
 ) -> np.ndarray:
-    """Write the posterior at some samples, and return the weights (draws, batch) at the last."""
+    """Write the posterior at the samples of a range to ``result``, and return the weights (draws,
+    batch) at its last sample."""
     x, weight = x0, np.exp(log_weight - log_weight.max(axis=0))
     for k in range(samples[1]):
         if k:
             times = float(record.t[k - 1]), float(record.t[k])
             x = model_step(system, *times, x, record.u[:, k - 1], record.u[:, k])
+        # Multiply the weights by the Gaussian likelihood of the outputs, missing ones left out.
         outputs = system.h(record.t[k], x, record.u[:, k])
         misfit = (record.y[:, k] - outputs) ** 2 / R
         log_weight = log_weight - np.nansum(misfit, axis=-1) / 2
         if k >= samples[0]:
             weight = np.exp(log_weight - log_weight.max(axis=0))
+            # Normalise, and store the moments and the effective sample size.
             weight /= weight.sum(axis=0)
             result.mean[:, k], result.cov[:, k] = _moments(weight, x)
             result.ess[:, k] = 1 / (weight**2).sum(axis=0)
@@ -196,7 +208,8 @@ def _run(
 
 
 def _moments(weight: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means (batch, nx) and covariances (batch, nx, nx) of x (draws, batch, nx)."""
+    """Return the weighted means (batch, nx) and covariances (batch, nx, nx) of x (draws, batch,
+    nx)."""
     mean = np.einsum("nb,nbi->bi", weight, x)
     error = x - mean
     return mean, np.einsum("nb,nbi,nbj->bij", weight, error, error, optimize=True)
@@ -204,29 +217,29 @@ def _moments(weight: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Reference:
-    """What errors that are as large as the Cramér-Rao reference score, for a batch of episodes; not
-    a number where it is below what a single step of the model errs by."""
+    """The scores expected of errors as large as the Cramér-Rao reference, for a batch of episodes;
+    NaN where it is below the error of a single step of the model."""
 
     nrmse: np.ndarray
-    """Of the whole episode, shape (batch,)."""
+    """NRMSE of the whole episode, shape (batch,)."""
     nrmse_75: np.ndarray
-    """Of its last 75 %."""
+    """NRMSE of its last 75 %."""
     nrmse_tail: np.ndarray
-    """Of its last 25 %."""
+    """NRMSE of its last 25 %."""
     by_sample: np.ndarray
-    """Of each sample, shape (batch, num_samples)."""
+    """NRMSE of each sample, shape (batch, num_samples)."""
 
 
 def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None:
-    """The Cramér-Rao reference of a game's episodes, in terms of scores.
+    """Return the Cramér-Rao reference of a game's episodes as scores.
 
     Args:
         game: what is played.
-        record: what estimators see of the episodes.
+        record: the record of the episodes that estimators are given.
         truth: true states at its samples, shape (batch, num_samples, nx).
 
     Returns:
-        None where there is none: without noise, from a fixed initial state, or under a condition
+        The reference; None without output noise, from a fixed initial state, or under a condition
         that is not in the model (`Condition.reference`).
     """
     source = game.source
@@ -239,6 +252,7 @@ def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None
     counted = (source.system.scale, source.system.observable(truth))
     expected = expected_scores(P, *counted)
     if Q is None:
+        # Discard scores below the error of the model's own step.
         error = step_error(source.system, record.t, truth)
         floor = expected_scores(error[..., None] * error[..., None, :], *counted)
         expected = {n: np.where(v > floor[n], v, np.nan) for n, v in expected.items()}

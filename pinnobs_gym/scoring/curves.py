@@ -1,4 +1,5 @@
-"""Errors over time: what pictures need and rows do not have, in small files beside the rows."""
+"""Curves of the error over time, which figures need and rows lack, in small files beside the
+rows."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from pinnobs_gym.simulation.system import System
 
 @dataclass(frozen=True)
 class Example:
-    """One episode at times of its own, close enough for oscillations."""
+    """One example episode, sampled densely enough for oscillations."""
 
     seed: int
     t: np.ndarray
@@ -36,38 +37,39 @@ class Example:
     y: np.ndarray
     """Outputs, shape (points, ny)."""
     std: np.ndarray | None
-    """Standard deviations of the estimates, shape (points, nx), of those that give them."""
+    """Standard deviations of the estimates, shape (points, nx); None if the estimator has none."""
 
 
 @dataclass(frozen=True)
 class Curves:
-    """The errors of one estimator in some episodes of one game."""
+    """The errors of one estimator over time in some episodes of one game."""
 
     t: np.ndarray
     """The kept times in s, shape (points,)."""
     seeds: np.ndarray
-    """Of the episodes, shape (episodes,)."""
+    """Seeds of the episodes, shape (episodes,)."""
     error: np.ndarray
     """NRMSE of each kept sample, float32 (episodes, points); infinite where the estimate is not
-    finite, not a number where no state counts."""
+    finite, NaN where no state is scored."""
     reference: np.ndarray | None
-    """What is expected of it at the Cramér-Rao reference, in the same shape; None without one."""
+    """NRMSE expected at the Cramér-Rao reference, in the same shape; None without a reference."""
     example: Example
     states: tuple[str, ...]
-    """Names of the states, with their units in brackets."""
+    """Names of the states, with units in brackets."""
     measured: dict[int, int]
-    """States that an output measures alone, and which."""
+    """Index of each directly measured state, with the index of its output."""
 
 
 def labels(system: System) -> tuple[str, ...]:
-    """Names of the states, with their units in brackets."""
+    """Return the names of the states, with units in brackets."""
     units = (system.units.get(name, "") for name in system.state_names)
     pairs = zip(system.state_names, units, strict=True)
     return tuple(f"{name} ({unit})" if unit else name for name, unit in pairs)
 
 
 def curves_of(played: Played) -> Curves:
-    """The curves of a batch of whole episodes, at the kept times; the first is the example."""
+    """Return the curves of a batch of whole episodes at the kept times; the first is the
+    example."""
     system, t, xhat = played.system, played.record.t, played.estimates.xhat
     error = by_sample(xhat - played.truth, system.scale, system.observable(played.truth))
     reference, std = played.reference, played.std
@@ -91,16 +93,16 @@ def curves_of(played: Played) -> Curves:
 
 
 def folder_of(rows: Path) -> Path:
-    """The folder of the curves of a rows file."""
+    """Return the folder of the curves of a rows file."""
     return rows.parent / "curves"
 
 
 def save(folder: Path, row: Row, curves: Curves) -> None:
-    """Write curves to a file of their own, named after what is played, the estimator and the first
-    episode; the row is one of these episodes'.
+    """Write curves to a separate file, named after the game, the estimator and the first episode.
+    The row is of one of these episodes.
 
     Raises:
-        ValueError: in one line, if it cannot be written.
+        ValueError: in one line, if the file cannot be written.
     """
     about = {
         "estimator": row["estimator"],
@@ -113,33 +115,34 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
     arrays: dict[str, Any] = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
     arrays |= {"x": example.x, "xhat": example.xhat, "y": example.y, "example_t": example.t}
     arrays |= {name: array for name, array in optional.items() if array is not None}
-    name = f"{_plain(row['estimator'])}-{row['config_hash']}-{curves.seeds[0]}.npz"
+    name = f"{_file_safe(row['estimator'])}-{row['config_hash']}-{curves.seeds[0]}.npz"
     path = _folder_of_game(folder, game_of(row)) / name
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
 
 
 def read(folder: Path, game: GameName) -> dict[tuple[str, str], list[Curves]]:
-    """The curves of a game, a list per estimator and config hash, each list in the order of first
-    episodes; none if there is no such folder.
+    """Read the curves of a game: a list per estimator and config hash, in the order of first
+    episodes. The result is empty if there is no such folder.
 
     Raises:
         ValueError: in one line, if a file is damaged.
     """
-    found: dict[tuple[str, str], list[Curves]] = {}
+    by_estimator: dict[tuple[str, str], list[Curves]] = {}
     for path in sorted(_folder_of_game(folder, game).glob("*.npz")):
         try:
             with path.open("rb") as file, np.load(file) as data:
                 about = json.loads(str(data["about"]))
-                curves = _of(about, {name: data[name] for name in data.files})
+                curves = _from_arrays(about, {name: data[name] for name in data.files})
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"cannot read curves from {path}: {error}; delete it") from None
-        found.setdefault((about["estimator"], about["config_hash"]), []).append(curves)
-    return {name: sorted(parts, key=lambda c: c.seeds[0]) for name, parts in found.items()}
+        by_estimator.setdefault((about["estimator"], about["config_hash"]), []).append(curves)
+    return {name: sorted(parts, key=lambda c: c.seeds[0]) for name, parts in by_estimator.items()}
 
 
 def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
-    """One estimator's curves of these episodes alone, each once; None if there are none."""
+    """Merge one estimator's curves, restricted to these episodes, each once; None if there are
+    none. Parts on another number of times than the first are left out."""
     wanted = set(seeds)
     chosen: list[tuple[Curves, np.ndarray]] = []
     for part in parts:
@@ -162,8 +165,8 @@ def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
     )
 
 
-def _of(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves:
-    """The curves that a file holds."""
+def _from_arrays(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves:
+    """Return the curves stored in a file."""
     example = Example(
         seed=about["example_seed"],
         t=arrays["example_t"],
@@ -184,9 +187,9 @@ def _of(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves:
 
 
 def _folder_of_game(folder: Path, game: GameName) -> Path:
-    return folder / _plain(game.system) / _plain(game.setup) / _plain(game.condition)
+    return folder / _file_safe(game.system) / _file_safe(game.setup) / _file_safe(game.condition)
 
 
-def _plain(name: str) -> str:
-    """A name that is safe for a file."""
+def _file_safe(name: str) -> str:
+    """Replace the characters of a name that are unsafe in a file name."""
     return re.sub(r"[^\w.+-]", "_", name)

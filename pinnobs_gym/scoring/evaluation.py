@@ -1,4 +1,4 @@
-"""Scoring an estimator episode by episode."""
+"""Evaluation of an estimator, episode by episode."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import SILENT, Log
 
 BATCH = 256
-"""Episodes that are run at a time."""
+"""Number of episodes run together."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """A rows file that scores are appended to."""
+    """A rows file to which scores are appended."""
 
     path: Path
     known: frozenset[tuple[str, int | None, int]] | None = None
-    """(config_hash, training_seed, episode_seed) of what is there already of the same estimator and
-    game; None if the file is to be read for that."""
+    """(config_hash, training_seed, episode_seed) of the stored rows of the same estimator and game;
+    if None, the file is read."""
 
     def stored(self, wanted: Sequence[Row]) -> dict[tuple[Any, ...], Row]:
-        """Those of the wanted rows that are there already, by what names them; as they are in the
-        file, if it is read."""
+        """Return those of the wanted rows that are stored, by their key. Their scores are included
+        only if the file is read."""
         if self.known is None:
             return {rows_module.key(row): row for row in rows_module.read(self.path)}
         stored = (row for row in wanted if rows_module.key(row)[4:] in self.known)
@@ -57,48 +57,50 @@ def evaluate(
     log: Log = SILENT,
     progress: Callable[[int], None] | None = None,
 ) -> list[Row]:
-    """Score an estimator on an env's episodes.
+    """Score an estimator on the episodes of an env.
 
-    All estimators see the same episodes: that of seed s is the first of the single env reset with
-    seed s. Scored are the estimates x̂(k|k) against the states x_k, as the env's reward does
-    (`pinnobs_gym.scoring.metrics.score`).
+    All estimators get the same episodes: that of seed s is the first episode of the single env
+    reset with seed s. The estimates x̂(k|k) are scored against the states x_k, as in the env's
+    reward (`pinnobs_gym.scoring.metrics.score`).
 
     Args:
-        estimator: an instance, whose own model is then used; or a class, a name or
-            ``module:Class``, which is then made for the env's model and noise.
+        estimator: an instance, which keeps its own model; or a class, a name or ``module:Class``,
+            which is instantiated with the env's model and noise.
         env_id: such as ``pinnobs/ReverseDuffing-v0``; or the name of the system.
-        episodes: how many, of seeds seed, seed + 1, ...
+        episodes: number of episodes, of seeds seed, seed + 1, ...
         seed: of the first episode.
         setup: ``benchmark`` or ``paper``.
-        condition: how episodes depart from the setup, such as ``load_step`` or
+        condition: change of the episodes relative to the setup, such as ``load_step`` or
             ``noise5+dropout10``.
-        options: settings of an estimator that is made here.
-        results: a rows file to append to, in whole batches; episodes already in it are not run
-            again, and their rows are taken from it. Curves for pictures go to a folder beside it.
-        log: where scalars, figures and hyperparameters go for TensorBoard.
-        progress: called with the number of episodes done.
+        options: settings of an estimator that is instantiated here.
+        results: a rows file to append to, in whole batches. Episodes already in it are not run
+            again, and their rows are taken from it. Curves for figures are written to a folder
+            beside it.
+        log: TensorBoard log of scalars, figures and hyperparameters.
+        progress: called after each batch with its number of episodes.
 
     Returns:
         The rows, in the order of seeds.
 
     Raises:
         ValueError: in one line, for an unknown id, setup, condition or option, or an estimator
-            whose model does not fit the env.
+            whose model does not match the env.
     """
     game = Game.of(env_id, setup, condition)
     made = make_estimator(estimator, game, options or {})
     stored = None if results is None else Results(Path(results))
-    found = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
-    log_episodes(log, found.rows, found.first_played)
-    log_summary(log, found.rows)
-    return found.rows
+    evaluated = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
+    log_episodes(log, evaluated.rows, evaluated.first_played)
+    log_summary(log, evaluated.rows)
+    return evaluated.rows
 
 
 def seeds_of(seed: int, episodes: int) -> range:
-    """The seeds of so many episodes, the first one's given.
+    """Return the seeds of a number of episodes, given the first.
 
     Raises:
-        ValueError: in one line, if there are no episodes or a seed is below zero.
+        ValueError: in one line, if the number of episodes is below one or the seed is negative, or
+            one of them is not a whole number.
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0)):
         if value < least:
@@ -110,12 +112,12 @@ def seeds_of(seed: int, episodes: int) -> range:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What came of an evaluation."""
+    """The result of an evaluation."""
 
     rows: list[Row]
-    """In the order of seeds. Rows that are only known to be stored have no scores."""
+    """The rows in the order of seeds. Rows known to be stored but not read have no scores."""
     first_played: Played | None
-    """The first batch that was played; None if all was there already."""
+    """The first batch that was run; None if all episodes were stored."""
 
 
 def run_episodes(
@@ -126,15 +128,15 @@ def run_episodes(
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
 ) -> Evaluated:
-    """Play and score the episodes that are not stored yet, batch by batch.
+    """Run and score the episodes that are not stored yet, batch by batch.
 
     Args:
         game: what is played.
-        estimator: that is scored.
+        estimator: the estimator to score.
         seeds: of the episodes.
-        results: what is stored, and where rows are appended.
-        progress: called with the number of episodes done.
-        label: the estimator's name in rows, if not its own.
+        results: the stored rows, and the file to which new rows are appended.
+        progress: called after each batch with its number of episodes.
+        label: name of the estimator in rows; its own if None.
     """
     common = _common(estimator, game) | {"estimator": label or estimator.label}
     wanted = [{**common, "episode_seed": seed} for seed in seeds]
@@ -147,7 +149,7 @@ def run_episodes(
         first_played = first_played or played
         done = [{**row, **scores} for row, scores in zip(batch, _scored(played), strict=True)]
         if results is not None:
-            # Curves first: episodes that have rows are not run again.
+            # Curves first: if a crash follows, episodes without rows are run again.
             save(folder_of(results.path), done[0], curves_of(played))
             rows_module.append(results.path, done, new=estimator.trains_on_record is not None)
         stored.update({rows_module.key(row): row for row in done})
@@ -157,7 +159,7 @@ def run_episodes(
 
 
 def _scored(played: Played) -> list[Row]:
-    """The scores of each episode by name, and what they cost."""
+    """Return the scores of each episode by name, with the computational cost."""
     cost = {"us_per_step": played.us_per_step, "batch": played.record.batch, "date": now()}
     return [scores | cost for scores in played.scores.rows()]
 
@@ -165,10 +167,10 @@ def _scored(played: Played) -> list[Row]:
 def make_estimator(
     estimator: BaseEstimator | type[BaseEstimator] | str, game: Game, options: Mapping[str, Any]
 ) -> BaseEstimator:
-    """The estimator that a name, a class or an instance means in a game.
+    """Return the estimator that a name, a class or an instance denotes in a game.
 
     Raises:
-        ValueError: in one line, if it is unknown, has to be trained first, does not take the
+        ValueError: in one line, if it is unknown, has to be trained first, does not accept the
             options, or has another model than the game's.
     """
     system, setup = game.source.system, game.source.setup
@@ -198,7 +200,7 @@ def _check_model(model: System, system: System) -> None:
 
 
 def _common(estimator: BaseEstimator, game: Game) -> Row:
-    """What all rows of an evaluation share."""
+    """Return the fields common to all rows of an evaluation."""
     system = game.source.system
     identity = {
         "class": f"{type(estimator).__module__}.{type(estimator).__qualname__}",

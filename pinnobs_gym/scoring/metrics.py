@@ -1,4 +1,4 @@
-"""Scores of an episode: how far the estimates were from the truth."""
+"""Scores of an episode: errors of the estimates relative to the truth."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 
 DIVERGED = 0.2
-"""NRMSE over the last quarter from which on an episode counts as diverged."""
+"""NRMSE over the last quarter above which an episode counts as diverged."""
 SETTLED = 0.05
-"""NRMSE of a sample below which the estimate counts as settled."""
+"""NRMSE of a sample up to which the estimate counts as settled."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a batch of episodes: arrays (batch,), of which those that do not apply are None
-    or, in single episodes, not a number. `error_scores` and `consistency` say what they are."""
+    """The scores of a batch of episodes, as arrays (batch,). Scores that do not apply are None or,
+    for single episodes, NaN. `error_scores` and `consistency` define them."""
 
     mae: np.ndarray
     mse: np.ndarray
@@ -42,12 +42,12 @@ class Scores:
     innovation_correlation: np.ndarray | None = None
     reference_ratio: np.ndarray | None = None
     """NRMSE of the whole episode over that of its Cramér-Rao reference
-    (`pinnobs_gym.scoring.cramer_rao`), the error taken modulo what no output tells apart."""
+    (`pinnobs_gym.scoring.cramer_rao`), with the error taken modulo indistinguishable states."""
     reference_ratio_tail: np.ndarray | None = None
-    """The same of the tail."""
+    """The same over the last 25 % of the episode."""
 
     def rows(self) -> list[dict[str, float | bool | None]]:
-        """The scores of each episode by name."""
+        """Return the scores of each episode by name."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
         return [
             {name: _number(name, column, i) for name, column in columns.items()}
@@ -56,34 +56,34 @@ class Scores:
 
 
 def _number(name: str, column: np.ndarray | None, i: int) -> float | bool | None:
-    """The value of one episode, None if it has none."""
+    """Return the value of one episode, or None if it has none."""
     if column is None or (name in OPTIONAL_SCORES and np.isnan(column[i])):
         return None
     return column[i].item()
 
 
 SCORES = tuple(f.name for f in fields(Scores) if f.default is MISSING and f.name != "diverged")
-"""The numbers that each episode has, besides ``diverged``."""
+"""The scores that every episode has, besides ``diverged``."""
 OPTIONAL_SCORES = tuple(f.name for f in fields(Scores) if f.default is None)
-"""Numbers that episodes have where they apply: those of `pinnobs_gym.scoring.consistency`, and the
-NRMSE of the whole episode and of its tail over their Cramér-Rao reference
+"""The scores that apply to some episodes: those of `pinnobs_gym.scoring.consistency`, and the NRMSE
+of the whole episode and of its tail over their Cramér-Rao reference
 (`pinnobs_gym.scoring.cramer_rao`)."""
 
 
 def score(system: System, record: Record, truth: np.ndarray, estimates: Estimates) -> Scores:
-    """The scores of estimates of a batch of episodes.
+    """Score the estimates of a batch of episodes.
 
     Args:
-        system: the model, which says what errors are divided by and what can be told from outputs.
-        record: what the estimator saw.
+        system: the model, which defines the scales of errors and the observable components.
+        record: the record given to the estimator.
         truth: true states at its samples, shape (batch, num_samples, nx), in state units.
-        estimates: x̂(k|k) at its samples, and what else the estimator gave.
+        estimates: x̂(k|k) at its samples, and any covariances and innovations.
 
     Returns:
-        All scores but those that hold against the Cramér-Rao reference.
+        All scores except those relative to the Cramér-Rao reference.
 
     Raises:
-        ValueError: if truth and estimates are not of one shape.
+        ValueError: if truth and estimates have different shapes.
     """
     errors: dict[str, Any] = error_scores(
         record.t,
@@ -106,29 +106,29 @@ def error_scores(
     scored: np.ndarray | None = None,
     alternatives: Sequence[np.ndarray] = (),
 ) -> dict[str, np.ndarray]:
-    """The scores of a batch of episodes that follow from errors alone.
+    """Compute the scores that depend on errors alone, for a batch of episodes.
 
     Args:
         t: sample times in s, shape (num_samples,).
         x: true states, shape (batch, num_samples, nx).
-        xhat: estimates, same shape; anything not finite makes the episode a diverged one.
-        scale: what errors are divided by, one number per state.
+        xhat: estimates, same shape; an episode with a value that is not finite counts as diverged.
+        scale: scale of the errors, one number per state.
         scored: which errors count in NRMSE, bool, shape of x; all if None.
-        alternatives: arrays of x's shape of states that no output tells from x.
+        alternatives: states indistinguishable from x by any output, arrays of x's shape.
 
     Returns:
         Arrays (batch,) by name; infinite where the estimates are not finite:
 
         - ``mae``, ``mse``, ``rmse`` in state units and ``smape`` in %: over all states and samples,
           transient included (Farkane et al., PINN-Obs, "Neural Network Training and Testing").
-        - ``nrmse``, ``nrmse_75``, ``nrmse_tail``: root of the mean squared (x̂ − x)/scale over the
-          whole episode, its last 75 % and its last 25 %.
+        - ``nrmse``, ``nrmse_75``, ``nrmse_tail``: root mean square of (x̂ − x)/scale over the whole
+          episode, its last 75 % and its last 25 %.
         - ``settling``: the time in s after which the NRMSE of every sample stays below 5 %;
-          infinite if the last one is above.
+          infinite if that of the last sample is above.
         - ``peak``: the largest NRMSE of a sample.
-        - ``nrmse_modulo``, ``nrmse_tail_modulo``: as above, each sample's error taken to the
-          nearest of x and its alternatives.
-        - ``diverged``: bool, whether anything is not finite or ``nrmse_tail`` is over 0.2.
+        - ``nrmse_modulo``, ``nrmse_tail_modulo``: as above, with each sample's error relative to
+          the nearest of x and its alternatives.
+        - ``diverged``: bool, whether an estimate is not finite or ``nrmse_tail`` exceeds 0.2.
     """
     if x.shape != xhat.shape or x.ndim != 3 or len(t) != x.shape[1]:
         raise ValueError(f"xhat has shape {xhat.shape}; expected {x.shape}, that of the states")
@@ -165,16 +165,16 @@ def error_scores(
 def by_sample(
     error: np.ndarray, scale: Sequence[float], scored: np.ndarray | None = None
 ) -> np.ndarray:
-    """The NRMSE of each sample, shape (batch, num_samples), of errors (batch, num_samples, nx);
-    not a number where none of them counts.
+    """Return the NRMSE of each sample, shape (batch, num_samples), of errors (batch, num_samples,
+    nx); NaN where no error counts.
 
     Args:
-        error: x̂ − x, or the standard deviation of that.
-        scale: what it is divided by, one number per state.
-        scored: which of it counts, bool, shape of error; all if None.
+        error: x̂ − x, or its standard deviation.
+        scale: scale of the errors, one number per state.
+        scored: which errors count, bool, shape of error; all if None.
     """
     counts = np.ones(error.shape, dtype=bool) if scored is None else scored
-    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is infinite
+    with np.errstate(over="ignore", invalid="ignore"):  # values too large become infinite
         total, number = _sums(error, scale, counts)
         mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
     return np.sqrt(mean)
@@ -183,13 +183,14 @@ def by_sample(
 def _sums(
     error: np.ndarray, scale: Sequence[float], counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each sample the sum of the squared scaled errors that count, and their number."""
+    """Return, for each sample, the sum of the squared scaled errors that count, and their
+    number."""
     square = np.where(counts, (error / np.asarray(scale)) ** 2, 0.0)
     return square.sum(axis=-1), counts.sum(axis=-1)
 
 
 def window(total: np.ndarray, number: np.ndarray, part: float) -> np.ndarray:
-    """NRMSE over the last part of the samples."""
+    """Return the NRMSE over the last part of the samples."""
     first = round((1 - part) * total.shape[1])
     return np.sqrt(total[:, first:].sum(axis=1) / np.maximum(number[:, first:].sum(axis=1), 1))
 

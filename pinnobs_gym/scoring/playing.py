@@ -1,4 +1,4 @@
-"""Playing a batch of a game's episodes with an estimator."""
+"""Running an estimator on a batch of a game's episodes."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _REFERENCES: dict[tuple[type[System], GameName, tuple[int, ...]], Reference | None] = {}
-"""The references of the last batches: one estimator after the other plays the same episodes."""
+"""Cache of the latest batches' references, since several estimators play the same episodes."""
 _MOST_REFERENCES = 8
 
 
 @dataclass(frozen=True)
 class Played:
-    """A batch of episodes, and what an estimator made of them."""
+    """A batch of episodes with an estimator's results."""
 
     game: Game
     seeds: tuple[int, ...]
-    """Of the episodes."""
+    """Seeds of the episodes."""
     record: Record
-    """What the estimator saw."""
+    """The record given to the estimator."""
     truth: np.ndarray
     """True states at the record's samples, shape (batch, num_samples, nx), in state units."""
     estimates: Estimates
     """x̂(k|k) at the same samples."""
     us_per_step: float
-    """CPU microseconds per step and episode that the estimates took."""
+    """CPU microseconds per step and episode."""
     drawn: bool = True
-    """Whether initial states are those that the game draws."""
+    """Whether the initial states are those drawn by the game."""
 
     @property
     def system(self) -> System:
@@ -51,15 +51,15 @@ class Played:
 
     @property
     def std(self) -> np.ndarray | None:
-        """Standard deviations of the estimates, shape (batch, num_samples, nx), of those that give
-        them."""
+        """Standard deviations of the estimates, shape (batch, num_samples, nx); None without
+        covariances."""
         P = self.estimates.P
         return None if P is None else np.sqrt(np.maximum(np.einsum("bkii->bki", P), 0))
 
     @cached_property
     def reference(self) -> Reference | None:
-        """The Cramér-Rao reference of the episodes; None where there is none, and where anything
-        was changed in the game."""
+        """The Cramér-Rao reference of the episodes; None where it does not apply, or where the
+        initial states or the game's settings are changed."""
         if not self.drawn or self.game.changes:
             return None
         key = (type(self.system), self.game.name, self.seeds)
@@ -71,7 +71,7 @@ class Played:
 
     @cached_property
     def scores(self) -> Scores:
-        """The scores of the episodes, against their reference too where there is one."""
+        """The scores of the episodes, including those relative to the reference if there is one."""
         scores = score(self.system, self.record, self.truth, self.estimates)
         if self.reference is None:
             return scores
@@ -82,7 +82,7 @@ class Played:
         )
 
     def figure(self, title: str, row: int = 0) -> Figure:
-        """A picture of one of the episodes, a panel per state."""
+        """Return a figure of one of the episodes, with a panel per state."""
         estimates, record = self.estimates, self.record
         P = None if estimates.P is None else estimates.P[row]
         shown = {"x": self.truth[row], "y": record.y[row], "P": P, "title": title}
@@ -92,19 +92,19 @@ class Played:
 def play(
     game: Game, estimator: BaseEstimator, seeds: Sequence[int], x0: np.ndarray | None = None
 ) -> Played:
-    """Run an estimator on the episodes of a game.
+    """Run an estimator on episodes of a game.
 
-    The episodes are those that the env reset with these seeds plays; stepping it with x̂(k|k) as the
-    actions scores the same errors.
+    The episodes are those of the env reset with these seeds; stepping it with x̂(k|k) as actions
+    gives the same errors.
 
     Args:
         game: what is played.
-        estimator: what is run.
+        estimator: the estimator to run.
         seeds: of the episodes.
-        x0: initial states (batch, nx) that replace those drawn.
+        x0: initial states (batch, nx) that replace the drawn ones.
 
     Raises:
-        ValueError: if the estimates have not the shape (batch, num_samples, nx).
+        ValueError: if the estimates do not have shape (batch, num_samples, nx).
     """
     source = game.source
     episodes = game.episodes(seeds, x0)

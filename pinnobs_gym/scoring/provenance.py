@@ -1,4 +1,4 @@
-"""What a score depends on besides the episode: settings, versions, the date."""
+"""The provenance of a score: settings, versions and date."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from pinnobs_gym.simulation.system import System
 
 
 def canonical(value: Any) -> Any:
-    """The value in JSON's types, the same for equal values; large things by a hash."""
+    """Convert a value to JSON's types, equal values to equal results. Objects other than data are
+    converted to the name of their class or function."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray):
@@ -36,12 +37,12 @@ def canonical(value: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """Versions of what a score depends on."""
+    """Return the versions of Python and of the packages that a score depends on."""
     packages = ("pinnobs-gym", "numpy", "scipy", "torch", "gymnasium")
-    found = {name: importlib.metadata.version(name) for name in packages}
-    return {"python": platform.python_version(), **found}
+    installed = {name: importlib.metadata.version(name) for name in packages}
+    return {"python": platform.python_version(), **installed}
 
 
 def now() -> str:
-    """The date and time (UTC), as rows have them."""
+    """Return the date and time (UTC) in the format of rows."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,4 +1,4 @@
-"""Stored scores: one JSON object per line and episode, appended whole, read back and resumed."""
+"""Stored scores: one JSON object per line and episode, appended atomically, read and resumed."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ Row: TypeAlias = dict[str, Any]
 
 - ``schema``: version of this format.
 - ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
-- ``ranked``: whether this is the condition that the system is ranked under; ``nx``: how many states
-  it has.
-- ``estimator``, ``track``, ``knows``, ``options``, ``config_hash``: the estimator, its track, what
-  it is told, its settings, and a hash of these and of its model and training.
-- ``training``, ``training_seed``: how it was trained, for learned ones: seconds, config, ...
-- the scores of `pinnobs_gym.scoring.metrics.score` by name, ``null`` standing for infinity.
-- those of `pinnobs_gym.scoring.metrics.OPTIONAL_SCORES` that apply, in the same way; those that do
-  not are None here and absent in the file.
+- ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
+- ``estimator``, ``track``, ``knows``, ``options``, ``config_hash``: the estimator, its track, its
+  prior knowledge, its settings, and a hash of these and of its model and training.
+- ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,
+  ...
+- the scores of `pinnobs_gym.scoring.metrics.score` by name; ``null`` stands for infinity.
+- the scores of `pinnobs_gym.scoring.metrics.OPTIONAL_SCORES` that apply, in the same format; the
+  others are None here and absent from the file.
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
 - ``batch``: the size of that batch.
-- ``versions``, ``date``: of the packages, and when it was run (UTC).
+- ``versions``, ``date``: versions of the packages, and time of the run (UTC).
 
-Or a job of a leaderboard that failed (``kind`` is ``failure``), or one that failed before and then
-went well (``recovery``), of which these are kept:
+Other rows are a job of a leaderboard that failed (``kind`` is ``failure``), or one that failed
+before and then succeeded (``recovery``). Their keys:
 
-- ``schema``, ``env_id``, ``setup``, ``condition``, ``estimator``, ``versions``, ``date`` as above.
-- ``episode_seed``, ``episodes``: the first episode of the job, and how many it has.
-- ``job``: a hash of all that was asked for.
-- ``error``: what went wrong, in one line; of failures alone.
+- ``schema``, ``env_id``, ``setup``, ``condition``, ``estimator``, ``versions``, ``date``: as above.
+- ``episode_seed``, ``episodes``: the first episode of the job, and the number of episodes.
+- ``job``: a hash of the job's full specification.
+- ``error``: the error in one line; for failures only.
 """
 
 KEY = (
@@ -55,52 +55,52 @@ KEY = (
     "training_seed",
     "episode_seed",
 )
-"""The fields that name a row; no two rows of a file share them."""
+"""The fields that identify a scored row; they are unique in a file."""
 JOB = ("env_id", "setup", "condition", "estimator", "episode_seed", "episodes", "job")
-"""The fields that a failure has."""
+"""The fields of a job in failures and recoveries."""
 TOLERANCE = 1e-6
-"""By how much, relatively, scores of the same episode may differ from machine to machine."""
+"""Largest relative difference between scores of the same episode from different machines."""
 
 _BEGINNING = b'{"schema": '
-"""What every line begins with."""
+"""The beginning of every line."""
 
 
 def game_of(row: Row) -> GameName:
-    """What a row, of a scored episode or of a job that failed, was played on."""
+    """Return the game of a row, of a scored episode or of a failed job."""
     return GameName(row["env_id"], row["setup"], row["condition"])
 
 
 class Stored(NamedTuple):
-    """What a rows file holds."""
+    """The content of a rows file."""
 
     rows: list[Row]
     """The scored episodes, in the order of the file."""
     failures: list[Row]
-    """The jobs that failed and have not gone well since."""
+    """The jobs that failed and have not succeeded since."""
     warning: str = ""
-    """What to know about the file, if anything."""
+    """A warning about the file, or an empty string."""
 
 
 class CannotWrite(ValueError):
-    """Rows could not be written; what the file held is untouched."""
+    """Rows could not be written; the content of the file is unchanged."""
 
 
 key: Callable[[Row], tuple[Any, ...]] = itemgetter(*KEY)
-"""What names a row."""
+"""Return the values of `KEY` of a row."""
 
 
 def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
-    """Append rows to a file, all or none of them, under a lock: processes and machines may share
-    it. A half line at its end, of a process that was killed, is cut off first.
+    """Append rows to a file, all or none of them, under a lock: several processes and machines may
+    share the file. An incomplete line at its end, left by a killed process, is cut off first.
 
     Args:
-        path: the file; it is made if it is not there.
-        rows: what is appended.
-        new: leave out scored episodes that are in the file by now, which is read for that: of two
-            runs whose scores need not be the same, the first counts.
+        path: the file; created if it does not exist.
+        rows: the rows to append.
+        new: leave out scored episodes that are already in the file, which is read for this purpose.
+            Of two runs whose scores may differ, the first counts.
 
     Raises:
-        CannotWrite: in one line, if the file cannot be written; what it held is untouched.
+        CannotWrite: in one line, if the file cannot be written; its content is unchanged.
     """
     try:
         with locked(path) as file:
@@ -112,27 +112,28 @@ def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
 
 
 def _keys(file: FileIO) -> set[tuple[Any, ...]]:
-    """What names the scored episodes of an open file."""
+    """Return the keys of the scored episodes in an open file."""
     file.seek(0)
     rows = [_parsed(line) for line in file.readall().splitlines()]
     return {key(row) for row in rows if row is not None and row.get("kind") == "score"}
 
 
 def _write(file: FileIO, data: bytes) -> None:
-    """Append to a locked file, all or nothing, in place of a half line at its end."""
+    """Append to a locked file, all or nothing, replacing an incomplete line at its end."""
     begin, tail = _last_line(file)
     if _is_cut(tail):
         file.truncate(begin)
-    elif tail:  # only the line's end is missing, or the line is not ours to delete
+    elif tail:  # the last line lacks its newline, or is not a row
         data = b"\n" + data
     write_whole(file, data)
 
 
 def _last_line(file: FileIO) -> tuple[int, bytes]:
-    """Where the last line begins and what it holds, if it does not end; else the file's end."""
+    """Return the start and the content of the last line if it lacks a newline; else the end of the
+    file and no content."""
     begin, tail = file.seek(0, os.SEEK_END), b""
     while begin > 0:
-        step = min(begin, 1 << 16 if tail else 1)  # most files end as they should
+        step = min(begin, 1 << 16 if tail else 1)  # most files end in a newline
         file.seek(begin - step)
         block = file.read(step)
         _, newline, rest = block.rpartition(b"\n")
@@ -144,19 +145,19 @@ def _last_line(file: FileIO) -> tuple[int, bytes]:
 
 
 def read(path: Path) -> list[Row]:
-    """The scored episodes of a file; see `load`."""
+    """Return the scored episodes of a file; see `load`."""
     return load(path).rows
 
 
 def load(path: Path) -> Stored:
-    """What a file holds; nothing if there is no such file.
+    """Load the content of a file; empty if it does not exist.
 
-    Files may be joined by concatenation: an episode that is there twice counts once. A half line at
-    the end is what a killed process leaves; it is left out, with a warning.
+    Files may be concatenated: an episode that appears twice counts once. An incomplete line at the
+    end, left by a killed process, is ignored with a warning.
 
     Raises:
-        ValueError: in one line that names the file and the line, if one is not a whole row of this
-            schema, or contradicts an earlier one.
+        ValueError: in one line that names the file and the line, if a line is not a complete row of
+            this schema, or contradicts an earlier one.
     """
     if not path.exists():
         return Stored([], [])
@@ -172,13 +173,13 @@ def load(path: Path) -> Stored:
             f"{path}, line {len(lines) + 1}, is cut off, as a killed process leaves it; it is left "
             f"out, and what it held is run anew"
         )
-    with _uncollected():
+    with _garbage_collection_paused():
         rows, failed = _merged(path, lines)
     return Stored(rows, failed, warning)
 
 
 def _merged(path: Path, lines: list[bytes]) -> tuple[list[Row], list[Row]]:
-    """The scored episodes of lines, each once, and the jobs that failed."""
+    """Return the scored episodes of the lines, each once, and the jobs that failed."""
     rows: dict[tuple[Any, ...], Row] = {}
     numbers: dict[tuple[Any, ...], int] = {}
     failures: dict[str, Row] = {}
@@ -187,7 +188,7 @@ def _merged(path: Path, lines: list[bytes]) -> tuple[list[Row], list[Row]]:
         row = _checked(path, number, line, _parsed(line) if parsed is None else parsed[number - 1])
         if row["kind"] != "score":
             known = failures.get(row["job"])
-            if known is None or known["date"] <= row["date"]:  # joined files are in any order
+            if known is None or known["date"] <= row["date"]:  # concatenated files are in any order
                 failures[row["job"]] = row
             continue
         name = key(row)
@@ -203,8 +204,8 @@ def _merged(path: Path, lines: list[bytes]) -> tuple[list[Row], list[Row]]:
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
-    """Without the search for garbage, which takes as long as reading: nothing is garbage here."""
+def _garbage_collection_paused() -> Iterator[None]:
+    """Disable the garbage collector: it takes as long as reading, and nothing here is garbage."""
     on = gc.isenabled()
     gc.disable()
     try:
@@ -215,7 +216,7 @@ def _uncollected() -> Iterator[None]:
 
 
 def _parsed_together(lines: list[bytes]) -> list[Any] | None:
-    """What the lines hold, faster than one by one; None if one of them is damaged."""
+    """Parse all lines at once, which is faster than one by one; None if a line is damaged."""
     try:
         parsed = json.loads(b"[" + b",".join(lines) + b"]")
     except ValueError:
@@ -225,11 +226,11 @@ def _parsed_together(lines: list[bytes]) -> list[Any] | None:
 
 
 def load_all(paths: Iterable[Path]) -> Stored:
-    """What several files hold together, an episode that is in two of them once; as `load`.
+    """Load several files as one; an episode in two of them counts once.
 
     Raises:
-        ValueError: in one line, as `load`, and if there is no such file, or two give different
-            scores of an episode.
+        ValueError: in one line, as `load` does; also if a file does not exist, or two files give
+            different scores of an episode.
     """
     rows: dict[tuple[Any, ...], tuple[Path, Row]] = {}
     failures: dict[str, Row] = {}
@@ -251,8 +252,8 @@ def load_all(paths: Iterable[Path]) -> Stored:
 
 
 def _same(row: Row, other: Row) -> bool:
-    """Whether two rows of an episode agree, but for rounding; an episode that diverged magnifies
-    that without bound."""
+    """Return whether two rows of an episode agree up to rounding. Diverged episodes amplify
+    rounding without bound, so their scores are not compared."""
     if row["diverged"] or other["diverged"]:
         return row["diverged"] == other["diverged"]
     return all(
@@ -261,19 +262,20 @@ def _same(row: Row, other: Row) -> bool:
 
 
 def _line(row: Row) -> bytes:
-    first = {"schema": row["schema"]}  # the key by which a half line is known
+    first = {"schema": row["schema"]}  # the first key identifies an incomplete line
     absent = {name for name in OPTIONAL_SCORES if row.get(name) is None}
     return json_line({n: v for n, v in (first | row).items() if n not in absent})
 
 
 def _is_cut(tail: bytes) -> bool:
-    """Whether what follows the last line is the beginning of a row, but not all of it."""
+    """Return whether the text after the last newline is the beginning of a row, but not all of
+    it."""
     begins = tail.startswith(_BEGINNING) or (tail and _BEGINNING.startswith(tail))
     return bool(begins) and _parsed(tail) is None
 
 
 def _parsed(line: bytes) -> Row | None:
-    """The object that a line holds, if it holds one."""
+    """Return the object in a line, or None if the line is not a JSON object."""
     try:
         row = json.loads(line)
     except ValueError:  # not JSON, or not text
@@ -287,11 +289,11 @@ _NEEDED = {
     "failure": frozenset((*JOB, "error", "date")),
     "recovery": frozenset((*JOB, "date")),
 }
-"""What a row of each kind must have."""
+"""The required fields of each kind of row."""
 
 
 def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
-    """A row of this schema, with infinity where it is meant."""
+    """Check that a row has this schema and restore its infinities."""
     if row is None:
         shown = line[:40].decode(errors="replace")
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What TensorBoard is shown of scores."""
+"""Logging of scores for TensorBoard."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.training.log import Log
 
 LOGGED = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
-"""The scores that TensorBoard shows."""
+"""The scores that are logged."""
 
 
 def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
-    """Log the scores of each episode over its seed, and a picture of the first that was played."""
+    """Log the scores of each episode against its seed, and a figure of the first episode that was
+    run."""
     for row in rows:
         for name in LOGGED:
             if np.isfinite(row[name]):
@@ -28,8 +29,8 @@ def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
 
 
 def log_summary(log: Log, rows: list[Row]) -> None:
-    """Log an estimator's settings and what came of them for the HPARAMS table: medians, in which
-    diverged episodes count as infinite, where they are finite."""
+    """Log an estimator's settings and median scores for the HPARAMS table. Diverged episodes count
+    as infinite; medians that are not finite are left out."""
     first = rows[0]
     parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
     parameters |= first["options"]
@@ -42,14 +43,14 @@ def log_summary(log: Log, rows: list[Row]) -> None:
 
 
 def log_folder(folder: Path, row: Row) -> Path:
-    """Where TensorBoard's log of a row's estimator lies: other settings of it have their own."""
+    """Return the log folder of a row's estimator; other settings of it have another folder."""
     system = row["env_id"].removeprefix("pinnobs/")
     played = folder / "tensorboard" / system / row["setup"] / row["condition"]
     return played / row["estimator"] / row["config_hash"]
 
 
 def log_summaries(folder: Path, rows: Iterable[Row]) -> None:
-    """Log what came of every estimator in these rows for TensorBoard's HPARAMS table."""
+    """Log a summary of every estimator in these rows for TensorBoard's HPARAMS table."""
     groups: dict[Path, list[Row]] = {}
     for row in rows:
         groups.setdefault(log_folder(folder, row), []).append(row)

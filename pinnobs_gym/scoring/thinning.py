@@ -1,19 +1,21 @@
-"""Which samples of an episode curves keep, and in how many digits."""
+"""Thinning of an episode's samples for stored curves, and rounding of their values."""
 
 from __future__ import annotations
 
 import numpy as np
 
 POINTS = 200
-"""Most sample times at which errors are kept."""
+"""Largest number of sample times at which errors are kept."""
 EARLY, EVEN = 50, 250
-"""Samples kept of the example episode: its first ones, and ones spread evenly."""
+"""Numbers of samples kept of the example episode: at its beginning, and evenly spread."""
 
 
 def kept(num_samples: int, points: int = POINTS) -> np.ndarray:
-    """The indices of the samples that are kept, ascending: all if there are at most ``points``;
-    else half of them evenly and half of them by the logarithm, so that the transient is resolved
-    and the rest is not lost."""
+    """Return the indices of the samples that are kept, ascending.
+
+    These are all samples if there are at most ``points``. Otherwise half of them are spread evenly
+    and half logarithmically, which resolves the transient and covers the rest.
+    """
     if num_samples <= points:
         return np.arange(num_samples)
     half = points // 2
@@ -23,15 +25,15 @@ def kept(num_samples: int, points: int = POINTS) -> np.ndarray:
 
 
 def kept_of_example(num_samples: int) -> np.ndarray:
-    """The indices of the samples of the example episode that are kept, ascending: the first `EARLY`
-    and `EVEN` spread evenly."""
+    """Return the indices of the samples of the example episode that are kept, ascending: the first
+    `EARLY`, and `EVEN` spread evenly."""
     even = np.linspace(0, num_samples - 1, min(EVEN, num_samples)).round().astype(int)
     return np.union1d(np.arange(min(EARLY, num_samples)), even)
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
-    """The values in float32, rounded to 12 binary digits, so that they compress well; what is too
-    large is infinite."""
+    """Return the values in float32, rounded to 12 significant binary digits so that they compress
+    well; values too large are infinite."""
     with np.errstate(over="ignore"):
         bits = np.ascontiguousarray(values, dtype=np.float32).view(np.uint32)
     return ((bits + np.uint32(0x800)) & np.uint32(0xFFFFF000)).view(np.float32)

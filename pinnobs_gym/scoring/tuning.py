@@ -1,4 +1,4 @@
-"""Searching an estimator's settings on episodes that are never scored."""
+"""Search for an estimator's settings on episodes that are never scored."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ if TYPE_CHECKING:
     import optuna
 
 TUNING_SEED = 2 * 10**6
-"""Seed of the first episode that settings are tried on; none of these is scored."""
+"""Seed of the first tuning episode; none of these episodes is scored."""
 WORST = 10.0
-"""What an episode's NRMSE counts as at most, and one that diverged."""
+"""NRMSE of a diverged episode, and the largest NRMSE of the others."""
 
 
 @dataclass(frozen=True)
 class Tried:
-    """Settings of an estimator, and how it did with them."""
+    """Settings of an estimator, with the resulting error."""
 
     settings: Mapping[str, float]
     error: float
-    """Geometric mean of NRMSE over the episodes; see `WORST`."""
+    """Geometric mean of the NRMSE over the episodes; see `WORST`."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """A search for the settings that an estimator class declares in `BaseEstimator.tunable`, by
+    """A search over the settings that an estimator class declares in `BaseEstimator.tunable`, by
     Optuna's tree-structured Parzen estimator (Bergstra et al. 2011)."""
 
     estimator: type[BaseEstimator]
     game: Game
     episodes: int
-    """How many episodes each trial is of, of the seeds from `TUNING_SEED` on."""
+    """Number of episodes per trial, with seeds from `TUNING_SEED` on."""
     storage: Path
-    """File that every trial is written to as it ends; a search goes on with what it holds."""
+    """File to which every trial is written when it ends; a search continues from its content."""
     seed: int = 0
-    """Of the search."""
+    """Seed of the search."""
 
     def __post_init__(self) -> None:
         name = ESTIMATORS.name_of(self.estimator)
@@ -57,10 +57,10 @@ class Search:
             raise ValueError(f"episodes={self.episodes}; expected at least 1")
 
     def error(self, settings: Mapping[str, Any]) -> float:
-        """The geometric mean of NRMSE over the episodes with these settings.
+        """Return the geometric mean of the NRMSE over the episodes with these settings.
 
         Raises:
-            ValueError: in one line, if the estimator does not take them.
+            ValueError: in one line, if the estimator does not accept the settings.
         """
         source = self.game.source
         estimator = self.estimator.for_setup(source.system, source.setup, **settings)
@@ -71,11 +71,11 @@ class Search:
         return float(np.exp(np.mean(np.log(nrmse))))
 
     def run(self, trials: int, progress: Callable[[Tried | None], None]) -> None:
-        """Try settings until the storage holds so many trials; ``progress`` is told of each, and
-        of None for each that the estimator did not take.
+        """Try settings until the storage holds this number of trials. ``progress`` is called with
+        each result, or with None for settings that the estimator rejects.
 
         Raises:
-            ValueError: in one line, without Optuna, or if the storage is not one.
+            ValueError: in one line, if Optuna is missing or the storage cannot be read.
         """
         study = self._study()
         import optuna
@@ -103,12 +103,12 @@ class Search:
                 progress(Tried(settings, error))
 
     def done(self) -> int:
-        """How many trials the storage holds that came to an end."""
+        """Return the number of finished trials in the storage."""
         ended = ("COMPLETE", "PRUNED")
         return sum(trial.state.name in ended for trial in self._study().trials)
 
     def best(self) -> Tried | None:
-        """The best so far, if any settings worked."""
+        """Return the best trial so far; None if no settings worked."""
         tried = [Tried(t.params, t.value) for t in self._study().trials if t.value is not None]
         return min(tried, key=lambda one: one.error, default=None)
 
@@ -130,11 +130,11 @@ class Search:
             )
         except Exception as error:  # whatever a file that is no journal makes it raise
             raise ValueError(f"cannot read trials from {self.storage}: {error}") from None
-        # Another stream of random numbers where a search is taken up again.
+        # A resumed search needs another stream of random numbers.
         study.sampler = optuna.samplers.TPESampler(seed=self.seed + len(study.trials))
         return study
 
     def _name(self) -> str:
-        """What trials of one storage must have in common."""
+        """Return the name of the study, common to all trials in one storage."""
         what = (*self.game.name, ESTIMATORS.name_of(self.estimator))
         return "-".join([*what, f"{self.episodes} episodes", str(dict(self.estimator.tunable))])

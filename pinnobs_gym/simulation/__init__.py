@@ -1,1 +1,1 @@
-"""What a plant is, how it moves, and how episodes depart from its setup."""
+"""The plant, its simulation, and the conditions that change an episode."""

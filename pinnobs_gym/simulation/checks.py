@@ -1,4 +1,4 @@
-"""The checks that every system passes."""
+"""Checks that every system must pass."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from pinnobs_gym.simulation.system import Setup, System, vector
 from pinnobs_gym.simulation.truth import truth
 
 EXACT = 1e-12
-"""Largest difference, over scale, between two ways to evaluate the same equations."""
+"""Largest difference, relative to scale, between two evaluations of the same equations."""
 JACOBIAN_TOLERANCE = 1e-6
-"""Largest error of a Jacobian, over scale; central differences err by less than 1e-9."""
+"""Largest error of a Jacobian, relative to scale; that of central differences is below 1e-9."""
 TRUTH_TOLERANCE = 1e-8
-"""Largest relative error of what must stay the same along the truth."""
+"""Largest relative change of a conserved quantity along the truth."""
 
 SYSTEM_CHECKS: dict[str, Callable[[type[System]], None]] = {}
-"""The checks of a system, by name. Each raises `CheckFailed`."""
+"""The checks of a system by name. Each raises `CheckFailed`."""
 
 
 def check_system(cls: type[System]) -> None:
-    """Run all of `SYSTEM_CHECKS` on a system.
+    """Run all `SYSTEM_CHECKS` on a system.
 
     Raises:
-        CheckFailed: if any fails, with a line for each: its name, what was found and expected.
+        CheckFailed: if any check fails; one line per failure with the check's name, what it found
+            and what it expected.
     """
     run_all(SYSTEM_CHECKS, cls)
 
@@ -45,7 +46,7 @@ def _setups(cls: type[System]) -> Iterator[tuple[str, System, Setup]]:
 
 
 def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
-    """Initial states (count, nx) of a setup."""
+    """Return initial states (count, nx) of a setup."""
     low, high = vector(setup.x0_low, system.nx, "x0_low"), vector(setup.x0_high, system.nx, "")
     if setup.fixed_x0:
         return np.repeat(low[None], count, axis=0)
@@ -56,8 +57,8 @@ def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
 
 
 def _points(system: System, *batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (*batch,), states (*batch, nx) about the benchmark's initial ones, and inputs: those of
-    `System.input` or, where these are zero throughout, others."""
+    """Return times (*batch,), states (*batch, nx) near the benchmark's initial states, and inputs
+    (*batch, nu) from `_inputs`."""
     count = int(np.prod(batch))
     setup = system.setups["benchmark"]
     rng = np.random.default_rng(1)
@@ -68,8 +69,8 @@ def _points(system: System, *batch: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _inputs(system: System, t: np.ndarray) -> np.ndarray:
-    """Inputs (..., nu) at times t (...); any number from 0.1 to 1 for those that `System.input`
-    leaves at zero, which may be measured."""
+    """Return inputs (..., nu) at times t (...). Inputs that `System.input` leaves at zero may be
+    measured ones; they are drawn from 0.1 to 1 instead."""
     u = np.array(system.input(t))
     idle = (u == 0).all(axis=tuple(range(u.ndim - 1)))
     drawn = np.random.default_rng(2).uniform(0.1, 1.0, u.shape)
@@ -77,8 +78,8 @@ def _inputs(system: System, t: np.ndarray) -> np.ndarray:
 
 
 def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The truth (num_samples, batch, nx) and its outputs (num_samples, batch, ny) at no more
-    samples than checks need."""
+    """Return the truth (num_samples, batch, nx) and its outputs (num_samples, batch, ny) at no more
+    than 200 samples."""
     times = setup.times
     t = times[np.unique(np.linspace(0, len(times) - 1, 200).astype(int))]
     x, u = truth(system, x0, t, setup.truth_step), np.asarray(system.input(t))
@@ -87,7 +88,7 @@ def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> tuple[np.ndar
 
 @add_check(SYSTEM_CHECKS, "attributes")
 def _system_attributes(cls: type[System]) -> None:
-    """The class attributes are complete and make sense."""
+    """The class attributes are complete and valid."""
     cls.validate()
     frozen = is_dataclass(cls) and getattr(cls, "__dataclass_params__").frozen  # noqa: B009
     own = "__dataclass_params__" in vars(cls) or not vars(cls).get("__annotations__")
@@ -115,7 +116,7 @@ def _system_attributes(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "shapes")
 def _system_shapes(cls: type[System]) -> None:
-    """All functions act on the last axis and take any leading ones."""
+    """All functions act on the last axis and accept any leading axes."""
     system = cls()
     for batch in ((), (1,), (5,), (2, 3)):
         t, x, u = _points(system, *batch)
@@ -134,8 +135,9 @@ def _system_shapes(cls: type[System]) -> None:
 
 
 def _check_equation_shapes(system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray) -> None:
-    """The equations and their Jacobians with a time per state, with one for all, and with one per
-    leading row; those of the output also with a time that is a plain number."""
+    """Check the shapes of the equations and their Jacobians with one time per state, one time for
+    all states, and one time per leading row; those of the output also with the time as a plain
+    number."""
     now, nx = np.asarray(0.1), system.nx
     u_now = _inputs(system, now)
     times = [(t, u), (now, u_now)]
@@ -158,7 +160,7 @@ def _check_output_shapes(system: System, t: Any, x: np.ndarray, u: np.ndarray, w
 
 @add_check(SYSTEM_CHECKS, "rows_independent")
 def _system_rows_independent(cls: type[System]) -> None:
-    """A row of a batch gives the same as that row alone."""
+    """A row of a batch gives the same result as that row alone."""
     system = cls()
     t, x, u = _points(system, 4)
     for name, function in _functions(system).items():
@@ -170,7 +172,7 @@ def _system_rows_independent(cls: type[System]) -> None:
 
 
 def _functions(system: System) -> dict[str, Callable[[Any, Any, Any], Any]]:
-    """What a system computes, as functions of (t, x, u)."""
+    """Return the functions of a system by name, each as a function of (t, x, u)."""
     return {
         "f": system.f,
         "h": system.h,
@@ -196,7 +198,8 @@ def _system_purity(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "array_api")
 def _system_array_api(cls: type[System]) -> None:
-    """f, h and input give the same in NumPy and in torch, and torch can differentiate them."""
+    """f, h and input give the same result in NumPy and in torch, and torch can differentiate
+    them."""
     import torch
 
     system = cls()
@@ -227,28 +230,29 @@ def _system_array_api(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "f_jacobian")
 def _system_f_jacobian(cls: type[System]) -> None:
-    """f_jacobian is ∂f/∂x, by central differences."""
+    """f_jacobian equals ∂f/∂x by central differences."""
     system = cls()
     t, x, u = _points(system, 20)
-    found = system.f_jacobian(t, x, u)
-    _check_jacobian(system, lambda x: system.f(t, x, u), found, x, "f_jacobian")
+    jacobian = system.f_jacobian(t, x, u)
+    _check_jacobian(system, lambda x: system.f(t, x, u), jacobian, x, "f_jacobian")
 
 
 @add_check(SYSTEM_CHECKS, "h_jacobian")
 def _system_h_jacobian(cls: type[System]) -> None:
-    """h_jacobian is ∂h/∂x, by central differences."""
+    """h_jacobian equals ∂h/∂x by central differences."""
     system = cls()
     t, x, u = _points(system, 20)
-    found = system.h_jacobian(t, x, u)
-    _check_jacobian(system, lambda x: system.h(t, x, u), found, x, "h_jacobian")
+    jacobian = system.h_jacobian(t, x, u)
+    _check_jacobian(system, lambda x: system.h(t, x, u), jacobian, x, "h_jacobian")
 
 
 def _check_jacobian(
-    system: System, function: Callable[[Any], Any], found: Any, x: np.ndarray, name: str
+    system: System, function: Callable[[Any], Any], jacobian: Any, x: np.ndarray, name: str
 ) -> None:
-    """Compare ∂f_i/∂x_j·scale_j, over the largest such number of row i."""
+    """Compare the entries ∂f_i/∂x_j·scale_j with central differences, relative to the size of row
+    i."""
     scale = vector(system.scale, system.nx, "scale")
-    step = 6e-6 * scale  # the cube root of the rounding error, where central differences are best
+    step = 6e-6 * scale  # the cube root of the rounding error minimises the total error
     columns = []
     for j in range(system.nx):
         shift = np.zeros(system.nx)
@@ -256,8 +260,10 @@ def _check_jacobian(
         ahead, behind = np.asarray(function(x + shift)), np.asarray(function(x - shift))
         columns.append((ahead - behind) / (2 * step[j]) * scale[j])
     expected = np.stack(columns, axis=-1)
-    given = np.asarray(found) * scale
+    given = np.asarray(jacobian) * scale
     require_shape(given, expected.shape, name)
+    # Size of a row: its largest entry or the function's value, and at least the largest over the
+    # batch.
     size = np.maximum(abs(expected).max(axis=-1), abs(np.asarray(function(x))))
     size = np.maximum(size, size.max(axis=0))[..., None]
     with np.errstate(all="ignore"):
@@ -272,7 +278,7 @@ def _check_jacobian(
 
 @add_check(SYSTEM_CHECKS, "initial_states")
 def _system_initial_states(cls: type[System]) -> None:
-    """Every setup has admissible initial states, from which the plant stays finite."""
+    """Every setup has admissible initial states from which the plant stays finite."""
     for name, system, setup in _setups(cls):
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
         require(np.isfinite(x0).all(), f"setup {name!r} starts from {x0}; expected finite states")
@@ -283,7 +289,7 @@ def _system_initial_states(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "invariants")
 def _system_invariants(cls: type[System]) -> None:
-    """What `System.invariants` names stays the same along the truth."""
+    """The quantities of `System.invariants` are constant along the truth."""
     for name, system, setup in _setups(cls):
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
         values = system.invariants(x0)
@@ -297,7 +303,7 @@ def _system_invariants(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "indistinguishable")
 def _system_indistinguishable(cls: type[System]) -> None:
-    """What `System.indistinguishable` names gives the same output for ever."""
+    """The states of `System.indistinguishable` give the same outputs at all times."""
     for name, system, setup in _setups(cls):
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
         for other in system.indistinguishable(x0):

@@ -1,4 +1,4 @@
-"""What the checks of systems and of estimators share: how a fault is found and told."""
+"""Helpers shared by the checks of systems and of estimators."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ T = TypeVar("T")
 
 
 class CheckFailed(AssertionError):
-    """Something does not behave as its interface says; a line per check that found it."""
+    """A subject violates its interface; the message has one line per failed check."""
 
 
 def run_all(checks: Mapping[str, Callable[[T], None]], subject: T) -> None:
-    """Run all checks of a table; raise `CheckFailed` with a line for each that fails."""
+    """Run all checks of a table on a subject.
+
+    Raises:
+        CheckFailed: if any check fails, with one line per failure.
+    """
     failures = []
     for check in checks.values():
         try:
@@ -30,7 +34,8 @@ def run_all(checks: Mapping[str, Callable[[T], None]], subject: T) -> None:
 def add_check(
     table: dict[str, Callable[[T], None]], name: str
 ) -> Callable[[Callable[[T], None]], Callable[[T], None]]:
-    """Put a check into a table; whatever it raises becomes one line with its name."""
+    """Return a decorator that adds a check to a table. Any exception of the check becomes a
+    `CheckFailed` of one line that begins with the check's name."""
 
     def register(function: Callable[[T], None]) -> Callable[[T], None]:
         @functools.wraps(function)
@@ -49,7 +54,7 @@ def add_check(
 
 
 class Found(Exception):
-    """What a check has found, in one line."""
+    """A fault found by a check, described in one line."""
 
 
 def require(condition: object, message: str) -> None:
@@ -65,7 +70,8 @@ def require_shape(array: Any, shape: tuple[int, ...], what: str) -> None:
 
 
 def require_close(a: Any, b: Any, tolerance: float, size: Any, what: str) -> None:
-    """Both must agree, infinities and missing values included, to a tolerance times the size."""
+    """Raise `Found` unless two arrays agree within a tolerance times the larger of ``abs(b)`` and
+    the size. Equal infinities agree, and so do NaN in both."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     require_shape(a, b.shape, what)
     with np.errstate(all="ignore"):

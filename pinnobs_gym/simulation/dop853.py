@@ -1,8 +1,8 @@
-"""The coefficients of Dormand and Prince's explicit Runge-Kutta method of order 8.
+"""Coefficients of Dormand and Prince's explicit Runge-Kutta method of order 8.
 
 Source: Hairer, Nørsett & Wanner, "Solving Ordinary Differential Equations I", second edition, 1993,
-section II.5 and the authors' program DOP853, whose decimals these are. SciPy has the same numbers;
-they stand here because importing its integrators takes longer than simulating an episode.
+section II.5, and the authors' program DOP853, from which the decimals are taken. SciPy has the same
+numbers, but importing its integrators takes longer than simulating an episode.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _ROWS: tuple[dict[int, float], ...] = (
         10: 0.6433927460157636,
     },
 )
-"""The weights of earlier slopes in each stage, those that are not zero."""
+"""Nonzero weights of the earlier slopes in each stage."""
 A = np.zeros((12, 12))
 """Weight of the slope of stage j in the state of stage i, shape (12, 12), lower triangular."""
 for _i, _row in enumerate(_ROWS):
@@ -101,4 +101,4 @@ C = np.array(
         1.0,
     ]
 )
-"""Where in the step each stage is, shape (12,)."""
+"""Position of each stage within the step, from 0 to 1, shape (12,)."""

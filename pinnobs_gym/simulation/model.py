@@ -1,4 +1,4 @@
-"""The discrete step of the model that model-based estimators share, and its Jacobian."""
+"""The discrete-time step of the model, shared by model-based estimators, and its Jacobian."""
 
 from __future__ import annotations
 
@@ -13,20 +13,23 @@ from pinnobs_gym.simulation.matrices import identity, product
 from pinnobs_gym.simulation.system import Array, System
 
 _STAGES = np.array([0, 1, 1, 2])
-"""Which of a step's start, middle and end each of the four Runge-Kutta stages looks at."""
+"""Index into (start, middle, end) of the step for each of the four Runge-Kutta stages."""
 
 _PARTS = np.array([0.0, 0.5, 1.0])
 """A step's start, middle and end, in steps."""
 
 
 def runge_kutta(rate: Callable[[int, Array], Array], x: Array, h: Array | float) -> Array:
-    """Where one step of the classical Runge-Kutta method (Kutta 1901) ends, of order 4.
+    """Take one step of the classical Runge-Kutta method of order 4 (Kutta 1901).
 
     Args:
-        rate: dx/dt at a stage, 0 to 3, and the point there; the stages are at the start, twice at
-            the middle and at the end of the step.
-        x: where the step begins.
-        h: the step.
+        rate: dx/dt as a function of the stage, 0 to 3, and the point of that stage. The stages are
+            at the start, twice at the middle, and at the end of the step.
+        x: the point at the start of the step.
+        h: length of the step.
+
+    Returns:
+        The point at the end of the step.
     """
     k1 = rate(0, x)
     point = h / 2 * k1
@@ -38,7 +41,7 @@ def runge_kutta(rate: Callable[[int, Array], Array], x: Array, h: Array | float)
     point = h * k3
     point += x
     k4 = rate(3, point)
-    # x + h(k1 + 2k2 + 2k3 + k4)/6, in one array
+    # x + h(k1 + 2k2 + 2k3 + k4)/6, accumulated in place
     end = k2 + k3
     end *= 2
     end += k1
@@ -51,12 +54,12 @@ def runge_kutta(rate: Callable[[int, Array], Array], x: Array, h: Array | float)
 def model_step(
     system: System, t0: Array, t1: Array, x: Array, u0: Array | None = None, u1: Array | None = None
 ) -> Array:
-    """The state (..., nx) at t1 of the model that is in x at t0 (s), by the classical Runge-Kutta
-    method in equal steps of at most the system's `System.model_step`. Rows (batch, nx) of x may
-    each have times of their own, t0 and t1 then being (batch,); all take as many steps.
+    """Propagate the model's state x (..., nx) from t0 to t1 (s) by the classical Runge-Kutta
+    method, in equal steps of at most the system's `System.model_step`. Rows (batch, nx) of x may
+    have their own times, t0 and t1 of shape (batch,); all rows take the same number of steps.
 
-    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1; they are used, joined by a
-    straight line, only if the system's input is a measured one.
+    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used, with linear
+    interpolation between them, only if the system's input is measured.
     """
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
         x = runge_kutta(partial(_rate, system, t, u), x, step)
@@ -64,7 +67,7 @@ def model_step(
 
 
 def _rate(system: System, t: Array, u: Array, stage: int, x: Array) -> Array:
-    """F at a stage of a step with times t (3, ...) and inputs u (3, ..., nu)."""
+    """Return f at a stage of a step with times t (3, ...) and inputs u (3, ..., nu)."""
     k = _STAGES[stage]
     return system.f(t[k], x, u[k])
 
@@ -77,11 +80,11 @@ def model_step_jacobian(
     u0: np.ndarray | None = None,
     u1: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `model_step` returns for x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape
-    (batch, nx, nx), with the batch innermost in memory."""
+    """Return `model_step` of x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape (batch, nx,
+    nx), with the batch innermost in memory."""
     F = None
     batch, nx = x.shape
-    x = np.ascontiguousarray(x.T)  # the batch comes last here; the system is shown transposed views
+    x = np.ascontiguousarray(x.T)  # the batch is last here; the system gets transposed views
     start = identity(nx, batch)
     points = np.empty((4, nx, batch))
     shown = points.transpose(0, 2, 1)
@@ -97,22 +100,25 @@ def model_step_jacobian(
             return system.f(times[stage], shown[stage], inputs[stage]).T
 
         x = runge_kutta(rate, x, h)
-        # The variational equation Φ' = A(t)Φ, Φ = I, by the same method along the same points.
+        # Jacobians A of f at the four stages.
         A = system.f_jacobian(
             times if by_row else times[:, None],
             shown,
             inputs[:, None] if u.ndim == 2 else inputs,
         )
         A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
+        # Integrate the variational equation Φ' = A(t)Φ by the same method at the same stages.
         flow = runge_kutta(partial(_variation, A), start, h)
+        # Chain rule over the substeps.
         F = flow if F is None else product(flow, F)
     assert F is not None  # there is at least one substep
     return x.T, F.transpose(2, 0, 1)
 
 
 def _variation(A: np.ndarray, stage: int, flow: np.ndarray) -> np.ndarray:
-    """Φ' = AΦ, (nx, nx, batch), of the flow Φ since the step began, A (4, nx, nx, batch)."""
-    return A[stage] if stage == 0 else product(A[stage], flow)  # Φ = I at the first
+    """Return Φ' = AΦ, (nx, nx, batch), given the flow Φ since the start of the step and A (4, nx,
+    nx, batch)."""
+    return A[stage] if stage == 0 else product(A[stage], flow)  # Φ = I at the start
 
 
 def substeps(
@@ -124,17 +130,18 @@ def substeps(
     u1: Array | None,
     longest: float = np.inf,
 ) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield, for each Runge-Kutta step of `model_step` from t0 to t1, the three times (s) at which
-    f is evaluated, the step, and the inputs at these times, (3, ..., nu). No step is over
-    ``longest`` (s).
+    """Yield the Runge-Kutta steps of `model_step` from t0 to t1, none longer than ``longest`` (s).
 
-    The times are (3,) or, where t0 and t1 are arrays (batch,), (3, batch), and the step (batch, 1).
+    Each item holds the three times (s) at which f is evaluated, the length of the step, and the
+    inputs at these times, (3, ..., nu). The times are (3,) or, where t0 and t1 are arrays (batch,),
+    (3, batch), and the length is (batch, 1).
     """
     xp = np if isinstance(x, np.ndarray) else array_namespace(x)
     longest = min(longest, system.model_step or system.setups["benchmark"].dt)
     by_row = getattr(t0, "ndim", 0) > 0
     whole = t1 - t0
     count = max(1, math.ceil(float(whole.max() if by_row else whole) / longest - 1e-6))
+    # All rows take the number of steps that the longest interval needs.
     step = whole[:, None] / count if by_row else float(whole) / count
     parts = _PARTS if xp is np else xp.asarray(_PARTS, dtype=x.dtype)
     for k in range(count):
@@ -144,6 +151,7 @@ def substeps(
         if system.measured_input:
             if u0 is None or u1 is None:
                 raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
+            # Interpolate measured inputs linearly.
             weight = (part / count).reshape(3, *([1] * u0.ndim))
             u = (1 - weight) * u0 + weight * u1
         else:

@@ -1,4 +1,4 @@
-"""What an estimator may see of an episode: the sampled outputs and inputs, and the prior."""
+"""The data available to an estimator in an episode: sampled outputs and inputs, and the prior."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from pinnobs_gym.simulation.system import Setup, System, vector
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the state before the first output, for a batch of episodes."""
+    """The prior of the initial state of a batch of episodes."""
 
     mean: np.ndarray
-    """Initial estimates x̂₀, shape (batch, nx), in state units."""
+    """Prior means x̂₀, shape (batch, nx), in state units."""
     cov: np.ndarray
-    """Their covariances P₀, shape (batch, nx, nx)."""
+    """Prior covariances P₀, shape (batch, nx, nx)."""
 
     @staticmethod
     def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
-        """The prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
+        """Return the prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
         own = vector(setup.xhat0, system.nx, "xhat0")
         mean = own if xhat0 is None else np.asarray(xhat0, dtype=float)
         if mean.shape not in ((system.nx,), (batch, system.nx)):
@@ -37,16 +37,16 @@ class Prior:
 
 @dataclass(frozen=True)
 class Record:
-    """The samples of a batch of episodes on common sample times."""
+    """The samples of a batch of episodes with common sample times."""
 
     t: np.ndarray
     """Sample times in s, ascending, shape (num_samples,)."""
     y: np.ndarray
-    """Outputs, shape (batch, num_samples, ny); NaN is a missing sample."""
+    """Outputs, shape (batch, num_samples, ny); NaN marks a missing output."""
     u: np.ndarray
     """Inputs at the samples, shape (batch, num_samples, nu)."""
     prior: Prior
-    """What is known before the first sample."""
+    """The prior of the initial state."""
 
     def __post_init__(self) -> None:
         steps = np.diff(self.t)
@@ -79,18 +79,18 @@ class Record:
         return len(self.t)
 
     def rows(self, rows: np.ndarray | slice) -> Record:
-        """The same of some of the episodes only."""
+        """Return the record of some of the episodes."""
         prior = Prior(self.prior.mean[rows], self.prior.cov[rows])
         return Record(self.t, self.y[rows], self.u[rows], prior)
 
 
 def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:
-    """The record in a CSV file with columns t (s), y1, y2, ... and, if its system has inputs,
-    u1, u2, ...; sample times may be irregular, and an empty cell or ``nan`` is a missing output.
-    Columns of other names are ignored.
+    """Read a record from a CSV file with columns t (s), y1, y2, ... and, if the system has inputs,
+    u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output. Other
+    columns are ignored.
 
-    Also returns the system, which takes its input from the record if that has columns u. A record
-    without them is of the input that the system's own class defines, if it does.
+    Also returns the system, with `System.measured_input` set if the file has columns u. A file
+    without them uses the input that the system's class defines, if it defines one.
 
     Raises:
         ValueError: in one line that names the file, the row and what was expected.

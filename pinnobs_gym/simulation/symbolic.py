@@ -1,7 +1,7 @@
-"""A system's equations as SymPy expressions, made by running its own `f`, `h` and `input`.
+"""A system's equations as SymPy expressions, made by calling its own `f`, `h` and `input`.
 
-What is shown or differentiated is then what is simulated. Needs SymPy, of the extra docs (torch
-brings it, too).
+The displayed or differentiated equations are thus the simulated ones. Needs SymPy, from the extra
+docs (torch also installs it).
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from pinnobs_gym.simulation.system import System
 
 @dataclass(frozen=True)
 class Equations:
-    """ẋ = f(t, x, u), y = h(t, x, u) and u(t) of a system, its parameters being symbols."""
+    """The equations ẋ = f(t, x, u), y = h(t, x, u) and u(t) of a system, with symbols as
+    parameters."""
 
     t: sympy.Symbol
     x: tuple[sympy.Symbol, ...]
     u: tuple[sympy.Symbol, ...]
     parameters: Mapping[str, sympy.Symbol]
-    """The physical parameters that are numbers, by name."""
+    """Symbols of the numeric physical parameters, by name."""
     definitions: Mapping[sympy.Symbol, sympy.Expr]
-    """What the class computes of them in properties that are numbers; later ones may use
-    earlier ones, and earlier ones later ones."""
+    """Numeric properties of the class as expressions of the parameters. They may refer to each
+    other in any order."""
     f: sympy.Matrix
     """Shape (nx, 1)."""
     h: sympy.Matrix
@@ -46,19 +47,19 @@ class Equations:
         return self.h.jacobian(self.x)
 
     def expanded(self, expression: Any) -> Any:
-        """An expression or matrix with the definitions put in, so that t, x, u and parameters are
-        all that is left."""
+        """Substitute the definitions in an expression or matrix, which leaves only t, x, u and
+        parameters."""
         for _ in self.definitions:
             expression = expression.subs(self.definitions)
         return expression
 
 
 def trace(system: System) -> Equations:
-    """The equations of a system.
+    """Return the equations of a system.
 
     Raises:
-        ValueError: in one line, if its functions do what cannot be written down: take decisions on
-            numbers, or call what `FUNCTIONS` does not know.
+        ValueError: in one line, if its functions cannot be traced: they branch on numbers, or call
+            a function that is not in `FUNCTIONS`.
     """
     names = [n for n, v in system.parameters.items() if _is_number(v)]
     try:
@@ -111,7 +112,7 @@ def _column(values: Any, size: int) -> sympy.Matrix:
 
 
 def _tidy(value: Any) -> sympy.Expr:
-    """The expression, with whole numbers as such."""
+    """Return the expression with whole floating-point numbers as integers."""
     expression = sympy.sympify(_number(value))
     whole = {
         n: sympy.Integer(int(n)) for n in expression.atoms(sympy.Float) if float(n).is_integer()
@@ -133,13 +134,13 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{"logical_and": sympy.And, "logical_or": sympy.Or, "logical_not": sympy.Not},
     **{"bitwise_and": sympy.And, "bitwise_or": sympy.Or, "invert": sympy.Not},
 }
-"""What NumPy's functions, by name, are in SymPy, beside arithmetic."""
+"""SymPy's counterparts of NumPy's functions, by NumPy's name; arithmetic needs none."""
 
 
 class _Expressions(np.ndarray):
-    """An array of expressions that NumPy's functions, and so the array API, can be used on."""
+    """An array of expressions that supports NumPy's functions, and thus the array API."""
 
-    _op_priority = 100  # with an expression on its left, the array's own operators are asked
+    _op_priority = 100  # so that expression * array calls the array's operator
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         plain = [np.asarray(part, dtype=object) for part in inputs]
@@ -174,36 +175,36 @@ _TRUTHS = (sympy.core.relational.Relational, BooleanFunction, BooleanAtom)
 
 
 def _number(value: Any) -> Any:
-    """One or zero for what is true or false, as in arithmetic; anything else as it is."""
+    """Convert a truth value to one or zero, as arithmetic does; return anything else unchanged."""
     if isinstance(value, _TRUTHS):
         return sympy.Piecewise((1, value), (0, True))
     return value
 
 
 def latex(expression: Any) -> str:
-    """An expression or matrix in LaTeX, words in its symbols' names upright."""
+    """Return an expression or matrix in LaTeX, with words in symbol names upright."""
     names = {symbol: name_in_latex(symbol.name) for symbol in expression.free_symbols}
     return sympy.latex(expression, symbol_names=names, mat_delim="(")
 
 
 def aligned(equations: Sequence[tuple[str, Any]]) -> str:
-    """Equations, each a left side in LaTeX and an expression, one below the other in LaTeX."""
+    """Return equations, each a left side in LaTeX and an expression, as aligned lines of LaTeX."""
     return " \\\\\n".join(f"{left} &= {latex(right)}" for left, right in equations)
 
 
 def rates(equations: Equations) -> list[str]:
-    """The left sides of ẋ = f in LaTeX."""
+    """Return the left sides of ẋ = f in LaTeX."""
     return [rf"\dot{{{base}}}{marks}" for base, marks in (_parts(s.name) for s in equations.x)]
 
 
 def name_in_latex(name: str) -> str:
-    """A state's, output's or parameter's name in LaTeX: ``phi1`` is a Greek letter with an index,
-    ``velocity`` an upright word."""
+    """Return the name of a state, output or parameter in LaTeX: ``phi1`` becomes a Greek letter
+    with an index, ``velocity`` an upright word."""
     return "".join(_parts(name))
 
 
 def _parts(name: str) -> tuple[str, str]:
-    """A name in LaTeX, and its indices."""
+    """Split a name into its base and its indices, both in LaTeX."""
     base, above, below = split_super_sub(name)
     parts = {"^": above, "_": below}
     marks = [f"{m}{{{','.join(map(_part, indices))}}}" for m, indices in parts.items() if indices]

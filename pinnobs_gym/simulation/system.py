@@ -1,4 +1,4 @@
-"""What a plant is: its equations, its sizes and names, and the setups it is played under."""
+"""The plant: its equations, dimensions, names and setups."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from array_api_compat import array_namespace
 
 Array: TypeAlias = Any
-"""An array of any library of the array API standard: numpy.ndarray, torch.Tensor, ..."""
+"""An array of any library of the array API standard, such as numpy.ndarray or torch.Tensor."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """How episodes of a system are played: where they start, how long, how often and how noisily
-    they are measured.
+    """The settings of a system's episodes: initial states, prior, duration, sample time and output
+    noise.
 
-    Vectors are given as sequences (one number per state or output) or as one number for all.
-    Initial states are uniform in the box ``x0_low`` to ``x0_high``, redrawn until the system's
-    `System.admissible` accepts them; a box of no width means one fixed initial state.
+    Vectors are sequences (one number per state or output) or one number for all components. Initial
+    states are uniform in the box ``x0_low`` to ``x0_high``, redrawn until `System.admissible`
+    accepts them. A box of zero width means one fixed initial state.
     """
 
     x0_low: Sequence[float]
@@ -40,10 +40,10 @@ class Setup:
     noise_std: Sequence[float] | float = 0.0
     """Standard deviation of the white Gaussian output noise, in output units."""
     truth_step: float | None = None
-    """Where the truth solver starts its search for a step, in s; it halves it as accuracy asks.
-    A hundredth of the duration if None."""
+    """Initial step of the truth solver in s, halved until the error tolerance is met. A hundredth
+    of the duration if None."""
     parameters: Mapping[str, float] = field(default_factory=dict)
-    """Physical parameters that this setup changes from the system's defaults."""
+    """Physical parameters that replace the system's defaults."""
 
     def __post_init__(self) -> None:
         for name in ("dt", "duration"):
@@ -66,12 +66,12 @@ class Setup:
 
     @property
     def num_steps(self) -> int:
-        """Number of actions in an episode; it has one sample more than that."""
+        """Number of actions in an episode; an episode has one sample more."""
         return int(np.floor(self.duration / self.dt + 1e-6))
 
     @property
     def times(self) -> np.ndarray:
-        """Sample times in s, shape (num_steps + 1,), beginning at 0."""
+        """Sample times in s, shape (num_steps + 1,), starting at 0."""
         return np.arange(self.num_steps + 1) * self.dt
 
     @property
@@ -82,38 +82,39 @@ class Setup:
 
 @dataclass(frozen=True)
 class System(ABC):
-    """A plant ẋ = f(t, x, u), y = h(t, x, u), written once and used by everything else.
+    """A plant ẋ = f(t, x, u), y = h(t, x, u), the single source of its equations.
 
-    To add one, subclass it in one file: the dataclass fields are the physical parameters, the class
-    attributes below say the names, sizes and setups, and `f` and `h` are the equations. Both act on
-    the last axis and take any leading ones, and are written in the array API
-    (``xp = array_namespace(x)``), so that the same lines serve simulation in NumPy, filters, and
-    automatic differentiation in torch. Neither contains noise.
+    To add a system, subclass it in one file. The dataclass fields are the physical parameters, the
+    class attributes below define names, dimensions and setups, and `f` and `h` are the equations.
+    Both act on the last axis and accept any leading axes. They are written in the array API (``xp =
+    array_namespace(x)``), so that the same code serves simulation in NumPy, filters, and automatic
+    differentiation in torch. Neither contains noise.
     """
 
     measured_input: bool = field(default=False, kw_only=True)
-    """True if u is only known at the samples (a log's columns) and joined by straight lines between
-    them; False if `input` gives it at any time."""
+    """True if u is known only at the samples (a log's columns) and interpolated linearly between
+    them; False if `input` defines it at any time."""
 
     state_names: ClassVar[tuple[str, ...]]
     output_names: ClassVar[tuple[str, ...]]
     input_names: ClassVar[tuple[str, ...]] = ()
     units: ClassVar[Mapping[str, str]] = {}
-    """Unit of each named state, output, input and parameter; unnamed ones have none."""
+    """Unit of each state, output, input and parameter by name; names not listed have none."""
     scale: ClassVar[tuple[float, ...]]
-    """One number per state, in its unit, that errors are divided by; frozen with the version."""
+    """Scale of each state, in its unit, by which errors are divided; frozen with the version."""
     state_bound: ClassVar[tuple[float, ...] | None] = None
-    """Largest absolute states to expect, for the action space; ten times the scale if None."""
+    """Largest expected absolute value of each state, for the action space; ten times the scale if
+    None."""
     setups: ClassVar[Mapping[str, Setup]]
-    """The setups by name; ``benchmark`` must be among them."""
+    """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
     """Version of the env id ``pinnobs/<class name>-v<version>``."""
     ranked_condition: ClassVar[str] = "nominal"
-    """The condition under which the leaderboard ranks estimators on this system."""
+    """The condition under which the leaderboard ranks estimators of this system."""
     uncertain: ClassVar[tuple[str, ...] | None] = None
-    """Parameters that may be off under the conditions of mismatch; all that are numbers if None."""
+    """Parameters that the mismatch conditions change; all numeric ones if None."""
     model_step: ClassVar[float | None] = None
-    """Longest Runge-Kutta step in s of model-based estimators; the benchmark's dt if None."""
+    """Longest Runge-Kutta step of model-based estimators in s; the benchmark's dt if None."""
 
     @property
     def nx(self) -> int:
@@ -132,50 +133,57 @@ class System(ABC):
 
     @abstractmethod
     def f(self, t: Array, x: Array, u: Array) -> Array:
-        """The state's rate of change, (..., nx), at time t (s), state x (..., nx), input u."""
+        """Return the rate of change of the state, (..., nx), at time t (s), state x (..., nx) and
+        input u."""
 
     @abstractmethod
     def h(self, t: Array, x: Array, u: Array) -> Array:
-        """The noise-free output, (..., ny), at time t (s), state x (..., nx), input u (..., nu).
+        """Return the noise-free output, (..., ny), at time t (s), state x (..., nx), input u (...,
+        nu).
 
-        The time is a number or an array (...), and t and u broadcast against the batch of x as in
-        `f`. At a sample they are the sample's own time and input.
+        The time is a number or an array (...); t and u broadcast against the batch of x as in `f`.
+        At a sample, t and u are the time and input of that sample.
         """
 
     def input(self, t: Array) -> Array:
-        """The known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
+        """Return the known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
         xp = np if isinstance(t, np.ndarray) else array_namespace(t)
         return xp.zeros((*t.shape, self.nu), dtype=t.dtype)
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
-        """∂f/∂x, (..., nx, nx); by forward-mode automatic differentiation unless overridden."""
+        """Return ∂f/∂x, (..., nx, nx), by forward-mode automatic differentiation unless
+        overridden."""
         return _jacobian(lambda x, t, u: self.f(t, x, u), x, t, u)
 
     def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
-        """∂h/∂x, (..., ny, nx); by forward-mode automatic differentiation unless overridden."""
+        """Return ∂h/∂x, (..., ny, nx), by forward-mode automatic differentiation unless
+        overridden."""
         return _jacobian(lambda x, t, u: self.h(t, x, u), x, t, u)
 
     def admissible(self, x0: Array) -> Array:
-        """Which initial states (..., nx) of the benchmark's box belong to its set: bool (...)."""
+        """Return which states (..., nx) of a setup's box are valid initial states: bool (...)."""
         xp = array_namespace(x0)
         return xp.all(xp.isfinite(x0), axis=-1)
 
     def invariants(self, x: Array) -> Array | None:
-        """Quantities (..., k) that the undisturbed plant conserves, or None. Tests use them."""
+        """Return quantities (..., k) that the undisturbed plant conserves, or None. Tests use
+        them."""
         return None
 
     def observable(self, x: Array) -> Array:
-        """Which components can be told from the output near x: bool (..., nx). Errors of the others
-        are not scored."""
+        """Return which components can be determined from the output near x: bool (..., nx). Errors
+        of the others are not scored."""
         xp = array_namespace(x)
         return xp.ones_like(x, dtype=xp.bool)
 
     def indistinguishable(self, x: Array) -> tuple[Array, ...]:
-        """Other states (..., nx) that give the same output for ever as x; none by default."""
+        """Return other states (..., nx) that give the same output as x at all times; none by
+        default."""
         return ()
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Times in s at which f or the input jumps; the truth solver stops and restarts there."""
+        """Return the times in s at which f or the input jumps; the truth solver restarts at
+        each."""
         return ()
 
     @property
@@ -193,7 +201,7 @@ class System(ABC):
         noise_std: Sequence[float] | float | None = None,
         parameters: Mapping[str, float] | None = None,
     ) -> tuple[Self, Setup]:
-        """The system and setup that a name and overrides mean.
+        """Return the system and the setup of that name, with some values replaced.
 
         Raises:
             ValueError: naming the value, if the setup or a parameter is unknown, or a value is out
@@ -220,7 +228,7 @@ class System(ABC):
         """Check the class attributes of a new system.
 
         Raises:
-            TypeError: in one line, naming the class and what is missing or of the wrong size.
+            TypeError: in one line, naming the class and what is missing or has the wrong size.
         """
         for name in ("state_names", "output_names", "scale", "setups"):
             if getattr(cls, name, None) is None:
@@ -248,10 +256,10 @@ class System(ABC):
 
 
 def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:
-    """The value as a float array (size,); one number stands for all components.
+    """Return the value as a float array (size,); a single number is repeated.
 
     Raises:
-        ValueError: naming the value and the size expected.
+        ValueError: naming the value and the expected size.
     """
     array = np.asarray(value, dtype=float)
     if array.ndim == 0:
@@ -262,9 +270,9 @@ def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:
 
 
 def stack(like: Array, *components: Array | float) -> Array:
-    """The array (..., n) of n components, each a number or an array that broadcasts to the batch
-    (...) of ``like`` (..., nx). In NumPy its axes lie in memory in the order of those of ``like``,
-    so that arithmetic on the two is contiguous."""
+    """Return the array (..., n) of n components, each a number or an array that broadcasts to the
+    batch (...) of ``like`` (..., nx). In NumPy the result has the memory order of ``like``, so that
+    arithmetic on the two is contiguous."""
     if isinstance(like, np.ndarray):  # several times faster than np.stack on small batches
         out = np.empty_like(like, shape=(*like.shape[:-1], len(components)))
         for i, component in enumerate(components):
@@ -282,10 +290,10 @@ def stack(like: Array, *components: Array | float) -> Array:
 
 
 def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
-    """The (..., n, m) matrix of the given entries, each a number or an array (...) like the batch
-    of ``like`` (..., nx).
+    """Return the matrix (..., n, m) of the given entries, each a number or an array (...) like the
+    batch of ``like`` (..., nx).
 
-    The last axis of the batch lies innermost in memory, so that arithmetic on one entry over it is
+    The last axis of the batch is innermost in memory, so that arithmetic on one entry is
     contiguous.
     """
     *outer, inner = like.shape[:-1] if like.ndim > 1 else (1,)
@@ -310,7 +318,8 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
 
 
 def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array:
-    """∂function/∂x, (..., m, nx), by forward-mode differentiation in torch, in x's own library."""
+    """Return ∂function/∂x, (..., m, nx), by forward-mode differentiation in torch, as an array of
+    the library of x."""
     import torch
 
     given = torch.as_tensor(x)
@@ -321,6 +330,7 @@ def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array
         for other in others
     ]
     nx = given.shape[-1]
+    # One forward derivative per unit vector, all in one batch.
     directions = torch.eye(nx, dtype=given.dtype, device=given.device)
     directions = directions.reshape(nx, *([1] * (given.ndim - 1)), nx)
     repeated = given.expand(nx, *given.shape).clone()
@@ -331,17 +341,20 @@ def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array
 
 
 NOISE_FLOOR = 1e-3
-"""Least standard deviation of output noise in R, over the output's scale."""
+"""Smallest standard deviation of output noise in R, relative to the output's scale."""
 
 
 _TIMES = 9
-"""Times of an episode, evenly spread from the first sample on, at which `output_scale` looks."""
+"""Number of times, evenly spread over an episode, at which `output_scale` evaluates the output."""
 
 
 def output_scale(system: System) -> np.ndarray:
-    """The scale of each output, (ny,), in its unit: that of the state with the largest influence on
-    it at the benchmark's x̂₀, at some times of its episode and the inputs then, or one if none has
-    any there."""
+    """Return the scale of each output, (ny,), in its unit.
+
+    It is the largest change of the output, to first order, when one state at the benchmark's x̂₀
+    changes by its scale, over `_TIMES` times of the episode and their inputs; one if no state
+    changes the output.
+    """
     setup, scale = system.setups["benchmark"], vector(system.scale, system.nx, "scale")
     t = np.linspace(0.0, setup.duration, _TIMES)
     x = np.tile(vector(setup.xhat0, system.nx, "xhat0"), (_TIMES, 1))

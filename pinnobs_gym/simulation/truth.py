@@ -1,4 +1,4 @@
-"""The truth of an episode, from a high-order solver."""
+"""Simulation of an episode's truth by a high-order solver."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.system import System, vector
 
 TOLERANCE = 3e-11
-"""Largest local error accepted in the truth, over the larger of a state and its scale."""
+"""Largest accepted local error of the truth, relative to the larger of a state and its scale."""
 
 _Weights = Callable[[np.ndarray], np.ndarray]
 _NODES = 6
-"""Solver steps that one interpolating polynomial passes through, with value and slope."""
+"""Number of nodes of an interpolating polynomial, which has the state and its slope at each."""
 _HALVINGS = 7
-"""How often the step is halved before an episode is given to an adaptive solver."""
-_FAR = 1e9
-"""Size of a state, over its scale, from which on it is taken to have run away."""
+"""Number of steps tried, each half the one before, before an episode is passed to an adaptive
+solver."""
+_DIVERGED = 1e9
+"""Size of a state, relative to its scale, at which it counts as diverged."""
 
 
 def truth(
@@ -31,37 +32,41 @@ def truth(
     max_step: float | None = None,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The trajectories x(t) of the plant from given initial states.
+    """Return the trajectories x(t) of the plant from given initial states.
 
-    Dormand and Prince's method of order 8 with a step common to all episodes (Hairer, Nørsett &
-    Wanner, "Solving Ordinary Differential Equations I", II.5), and between its steps the Hermite
-    polynomial of degree 11 through the nearest six. The defect x' − f(t, x) of that polynomial,
-    taken midway between steps, controls the error: episodes whose local error is over `TOLERANCE`
-    are redone with half the step, and those that no step satisfies (stiff, or not smooth) by an
-    adaptive implicit method. An episode's result does not depend on those simulated with it.
+    The solver is Dormand and Prince's method of order 8 with a step common to all episodes (Hairer,
+    Nørsett & Wanner, "Solving Ordinary Differential Equations I", II.5). Between its nodes the
+    state is the Hermite polynomial of degree 11 through the nearest six. The defect x' − f(t, x) of
+    that polynomial, midway between nodes, controls the error: episodes whose local error exceeds
+    `TOLERANCE` are simulated again with half the step. Episodes that no step satisfies (stiff or
+    not smooth) are solved by an adaptive method, LSODA. The result of an episode does not depend on
+    the others in its batch.
 
     Args:
         system: the plant; its parameters may be arrays (batch,), one value per episode.
         x0: initial states, shape (batch, nx), in state units.
         times: sample times in s, ascending, shape (num_samples,); x0 is the state at the first.
-        max_step: the solver's step in s to begin with; a hundredth of the time if None.
-        out: an array to write the result into.
+        max_step: the initial step in s; a hundredth of the time span if None.
+        out: array for the result.
 
     Returns:
         States, shape (num_samples, batch, nx).
 
     Raises:
-        FloatingPointError: if a state leaves the finite numbers.
+        FloatingPointError: if a state is not finite.
     """
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
+    # Integrate each interval between breakpoints separately, since f is smooth only within it.
     ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
     start, state = float(times[0]), np.asarray(x0, dtype=float)
     longest = max_step or float(times[-1] - times[0]) / 100
     done = 1
     for end in ends:
         stop = int(np.searchsorted(times, end, side="right"))
-        last = _smooth(system, state, start, float(end), times[done:stop], longest, x[done:stop])
+        last = _solve_interval(
+            system, state, start, float(end), times[done:stop], longest, x[done:stop]
+        )
         done, start, state = stop, float(end), last
     _check_finite(system, x0, x)
     return x
@@ -75,25 +80,25 @@ def disturbed_truth(
     max_step: float | None = None,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The trajectories of a plant that is disturbed at every sample: x(t) solves its equations
-    between samples, and to the state at each but the first the noise is added.
+    """Return the trajectories of a plant with process noise at the samples: x(t) solves the
+    equations between samples, and noise is added to the state at every sample after the first.
 
-    By `truth`'s method in equal steps of at most ``max_step`` between samples, without control of
-    its error, which is far below any noise worth the name.
+    The solver is that of `truth` with equal steps of at most ``max_step`` between samples. Its
+    error is not controlled, as it is far below any relevant noise.
 
     Args:
-        system: as in `truth`, and so are ``x0``, ``times`` and ``max_step``.
-        x0: initial states, shape (batch, nx).
-        times: sample times in s, ascending.
-        noise: what is added, in state units, shape (num_samples - 1, batch, nx).
-        max_step: the solver's longest step in s; a hundredth of the time if None.
-        out: an array to write the result into.
+        system: as in `truth`.
+        x0: initial states, shape (batch, nx), in state units.
+        times: sample times in s, ascending, shape (num_samples,).
+        noise: noise in state units, shape (num_samples - 1, batch, nx).
+        max_step: longest step of the solver in s; a hundredth of the time span if None.
+        out: array for the result.
 
     Returns:
         States, shape (num_samples, batch, nx).
 
     Raises:
-        FloatingPointError: if a state leaves the finite numbers.
+        FloatingPointError: if a state is not finite.
     """
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
@@ -103,11 +108,12 @@ def disturbed_truth(
         for k in range(len(times) - 1):
             start, end = float(times[k]), float(times[k + 1])
             stages[0] = x[k]
+            # Restart the steps at each breakpoint inside the sample interval.
             ends = [b for b in system.breakpoints() if start < b < end] + [end]
             for part in ends:
                 steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
                 step = round((part - start) / steps, 15)
-                last = np.nextafter(part, start)
+                last = np.nextafter(part, start)  # f may jump at the end: use its left limit
                 for i in range(steps):
                     _take_step(system, start + i * step, step, last, stages)
                 start = part
@@ -117,13 +123,17 @@ def disturbed_truth(
 
 
 def _take_step(system: System, start: float, step: float, last: float, stages: np.ndarray) -> None:
-    """One step of Dormand and Prince's method of order 8, which evaluates f no later than at
-    ``last``; ``stages`` holds the state (batch, nx), and then room for the slopes of the stages.
-    The state in it becomes the next one; the first slope stays that of the state before."""
+    """Take one step of Dormand and Prince's method of order 8, in place.
+
+    f is evaluated no later than at ``last``. ``stages`` (13, batch, nx) holds the state, followed
+    by space for the slopes of the stages. The new state replaces the old one; the first slope
+    remains that of the old state.
+    """
     flat = stages.reshape(len(stages), -1)
     t = np.minimum(start + step * dop853.C, last)
     u = system.input(t)
     weights = _tableau(step)
+    # Each stage evaluates f at the state plus a combination of the earlier slopes.
     for i, row in enumerate(weights[:-1]):
         stage = np.dot(row, flat[: i + 1]).reshape(stages.shape[1:])
         stages[i + 1] = system.f(t[i], stage, u[i])
@@ -138,7 +148,7 @@ def _check_finite(system: System, x0: np.ndarray, x: np.ndarray) -> None:
         )
 
 
-def _smooth(
+def _solve_interval(
     system: System,
     x0: np.ndarray,
     start: float,
@@ -147,11 +157,13 @@ def _smooth(
     max_step: float,
     out: np.ndarray,
 ) -> np.ndarray:
-    """`truth` over an interval on which f is smooth, written to ``out``; returns the last state."""
+    """Simulate the truth over an interval on which f is smooth, write it to ``out`` and return the
+    state at the end."""
     steps = max(_NODES, int(np.ceil((end - start) / max_step - 1e-9)))
     last = np.empty_like(x0)
     rows = np.arange(len(x0))
     with np.errstate(all="ignore"):
+        # Simulate the remaining episodes; those over the tolerance continue with half the step.
         for _ in range(_HALVINGS):
             plant = rows_of(system, rows)
             everything = len(rows) == len(x0)
@@ -163,9 +175,10 @@ def _smooth(
             if not len(rows):
                 return last
             steps *= 2
+        # Adaptive solver for episodes that no fixed step satisfies, one at a time.
         for row in rows:
             plant = rows_of(system, np.array([row]))
-            x = _adaptive(plant, x0[row], start, end, np.unique(np.append(times, end)))
+            x = _solve_adaptively(plant, x0[row], start, end, np.unique(np.append(times, end)))
             out[:, row], last[row] = x[: len(times)], x[-1]
     return last
 
@@ -179,14 +192,15 @@ def _fixed_step(
     times: np.ndarray,
     out: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Write the states at the times to ``out`` (num_samples, batch, nx); return those at the end,
-    and each episode's local error (batch,)."""
+    """Simulate with a fixed mesh and write the states at the times to ``out`` (num_samples, batch,
+    nx). Return the states at the end, and the local error of each episode (batch,)."""
     mesh = _mesh(start, end, steps, times.tobytes())
-    last = np.nextafter(end, start)  # f may jump at the end; it is wanted from the left
+    last = np.nextafter(end, start)  # f may jump at the end: use its left limit
     batch, nx = x0.shape
     path = np.empty((len(mesh.nodes), 2, batch, nx))  # the states and their slopes at the nodes
     stages = np.empty((1 + len(dop853.B), batch, nx))  # the state, then the slopes of the stages
     stages[0] = x0
+    # Integrate, keeping the state and slope at each node.
     for k, step in enumerate(mesh.steps):
         path[k, 0] = stages[0]
         _take_step(system, mesh.nodes[k], step, last, stages)
@@ -194,6 +208,7 @@ def _fixed_step(
     path[-1, 0] = stages[0]
     path[-1, 1] = system.f(last, stages[0], system.input(last))
     flat = path.reshape(2 * len(path), -1)
+    # Interpolate the states at the samples of each interval.
     for k, (window, weights) in enumerate(mesh.intervals):
         if len(weights):
             inside = slice(mesh.bounds[k], mesh.bounds[k + 1])
@@ -204,13 +219,15 @@ def _fixed_step(
 def _local_error(
     system: System, mesh: _Mesh, flat: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """The defect of the polynomials midway between nodes, times the step, over the larger of state
-    and scale: the largest of each episode, (batch,)."""
+    """Return the largest local error of each episode, (batch,): the defect of the polynomials
+    midway between nodes times the step, relative to the larger of state and scale."""
     middle, rate = np.empty((2, len(mesh.checked), *shape))
+    # State and slope of the polynomials midway between nodes.
     for i, (window, weights) in enumerate(mesh.checks):
         middle[i], rate[i] = np.dot(weights, flat[window]).reshape(2, *shape)
     k = mesh.checked
     t = (mesh.nodes[k] + mesh.steps[k] / 2)[:, None]
+    # Defect x' − f(t, x).
     rate -= system.f(t, middle, system.input(t))
     size = np.maximum(abs(middle), vector(system.scale, system.nx, "scale"))
     return (abs(rate) / size * mesh.steps[k, None, None]).max(axis=0).max(axis=-1)
@@ -218,47 +235,50 @@ def _local_error(
 
 @lru_cache(maxsize=64)
 def _tableau(step: float) -> list[np.ndarray]:
-    """Weights of (state, slopes of the stages so far) in each stage, and last in the next state."""
+    """Return the weights of (state, slopes of the earlier stages) in each stage, followed by those
+    in the next state."""
     rows = [np.append(1.0, step * row[:i]) for i, row in enumerate(dop853.A)]
     return [*rows, np.append(1.0, step * dop853.B)]
 
 
 @dataclass(frozen=True)
 class _Mesh:
-    """The solver's nodes over an interval, and the polynomials between them."""
+    """The solver's nodes over an interval, and the interpolating polynomials between them."""
 
     nodes: np.ndarray
     steps: np.ndarray
     bounds: np.ndarray
-    """Where the samples of each interval begin."""
+    """Index of the first sample of each interval between nodes."""
     intervals: list[tuple[slice, np.ndarray]]
-    """For each interval the rows of (state, slope, state, slope, ...) at the nodes that its
-    polynomial passes through, and their weights in the state at the interval's samples."""
+    """For each interval, the rows of (state, slope, state, slope, ...) at the nodes of its
+    polynomial, and their weights in the states at the interval's samples."""
     checked: np.ndarray
-    """The intervals whose defect is looked at: the outermost, and every third."""
+    """The intervals whose defect is checked: every third, and the last."""
     checks: list[tuple[slice, np.ndarray]]
-    """For each of these the same rows, and their weights in the state and the slope midway."""
+    """For each checked interval, the same rows, and their weights in the state and slope midway."""
 
 
 @lru_cache(maxsize=64)
 def _mesh(start: float, end: float, steps: int, times: bytes) -> _Mesh:
     samples = np.frombuffer(times)
     step = (end - start) / steps
-    # The polynomials of the outermost intervals are one-sided: shorter steps make up for it.
+    # Half steps at both ends, where the polynomials are one-sided and thus less accurate.
     short = np.arange(6) / 2
     nodes = start + step * np.concatenate([short, np.arange(3, steps - 2), steps - short[::-1]])
     nodes[-1] = end
+    # Assign each sample to the interval between nodes that contains it.
     interval = np.clip(np.searchsorted(nodes, samples, side="right") - 1, 0, len(nodes) - 2)
     bounds = np.searchsorted(interval, np.arange(len(nodes)))
     checked = np.unique(np.append(np.arange(0, len(nodes) - 1, 3), len(nodes) - 2))
     intervals, checks = [], []
     for k in range(len(nodes) - 1):
+        # The nearest nodes, shifted inwards at the ends; time is in steps from the first of them.
         first = min(max(k - _NODES // 2 + 1, 0), len(nodes) - _NODES)
         rows = slice(2 * first, 2 * (first + _NODES))
         window = (nodes[first : first + _NODES] - nodes[first]) / step
         inside = (samples[bounds[k] : bounds[k + 1]] - nodes[first]) / step
         value, slope = _hermite(tuple(np.round(window, 6)))
-        units = np.tile([1.0, step], _NODES)  # the polynomials' time is in steps
+        units = np.tile([1.0, step], _NODES)  # slopes per s to slopes per step
         intervals.append((rows, value(inside) * units))
         if k in checked:
             middle = window[k - first : k - first + 2].mean(keepdims=True)
@@ -268,10 +288,11 @@ def _mesh(start: float, end: float, steps: int, times: bytes) -> _Mesh:
 
 @lru_cache(maxsize=64)
 def _hermite(nodes: tuple[float, ...]) -> tuple[_Weights, _Weights]:
-    """Functions of times (num_times,) that return the weights (num_times, 2·num_nodes) of
-    (value, slope, value, slope, ...) at the nodes in the value, and in the slope, of the polynomial
-    of least degree through them."""
+    """Return two functions of times (num_times,) that give weights (num_times, 2·num_nodes): those
+    of (value, slope, value, slope, ...) at the nodes in the value, and in the slope, of the Hermite
+    interpolating polynomial."""
     size = 2 * len(nodes)
+    # Chebyshev basis on the span of the nodes, for a well-conditioned system.
     centre, half = (nodes[0] + nodes[-1]) / 2, (nodes[-1] - nodes[0]) / 2
     derivative = chebyshev.chebder(np.eye(size)) / half
 
@@ -281,18 +302,21 @@ def _hermite(nodes: tuple[float, ...]) -> tuple[_Weights, _Weights]:
     def slopes(t: np.ndarray) -> np.ndarray:
         return chebyshev.chebvander((t - centre) / half, size - 2) @ derivative
 
+    # Solve the interpolation conditions for the coefficients.
     at = np.asarray(nodes)
     conditions = np.stack([values(at), slopes(at)], axis=1).reshape(size, size)
     inverse = np.linalg.inv(conditions)
     return lambda t: values(t) @ inverse, lambda t: slopes(t) @ inverse
 
 
-def _adaptive(
+def _solve_adaptively(
     system: System, x0: np.ndarray, start: float, end: float, times: np.ndarray
 ) -> np.ndarray:
-    """One episode by an adaptive method that also takes stiff and kinked plants; not a number if
-    the state runs away, before whose singularity such a method would stand still for ever."""
-    from scipy.integrate import solve_ivp  # takes longer to import than an episode takes
+    """Simulate one episode by LSODA, which handles stiff and non-smooth plants.
+
+    Returns NaN if the state diverges; near a singularity such a method would never finish.
+    """
+    from scipy.integrate import solve_ivp  # importing it takes longer than simulating an episode
 
     last = np.nextafter(end, start)
     scale = vector(system.scale, system.nx, "scale")
@@ -301,12 +325,12 @@ def _adaptive(
         now = np.asarray(min(t, last))
         return system.f(now, x[None], system.input(now))[0]
 
-    def far(t: float, x: np.ndarray) -> float:
-        return _FAR - float((abs(x) / scale).max())
+    def margin(t: float, x: np.ndarray) -> float:
+        return _DIVERGED - float((abs(x) / scale).max())
 
-    far.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
+    margin.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
     solution = solve_ivp(
-        rate, (start, end), x0, "LSODA", times, events=far, rtol=1e-11, atol=1e-12 * scale
+        rate, (start, end), x0, "LSODA", times, events=margin, rtol=1e-11, atol=1e-12 * scale
     )
     x = np.full((len(times), len(x0)), np.nan)
     if solution.status == 0:
@@ -315,13 +339,10 @@ def _adaptive(
 
 
 def rows_of(system: System, rows: np.ndarray) -> System:
-    """The system with those of its parameters that are arrays (batch,) reduced to some rows."""
+    """Return the system with its array parameters (batch,) restricted to some rows."""
     changes = {
         f.name: getattr(system, f.name)[rows]
         for f in fields(system)
         if getattr(getattr(system, f.name), "ndim", 0)
     }
     return replace(system, **changes) if changes else system
-
-
-# The two below work in place where they can: small arrays cost by the call, not by the number.

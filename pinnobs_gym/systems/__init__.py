@@ -1,4 +1,4 @@
-"""The plants, one file each. A file put here is found, registered as an env, checked and ranked."""
+"""The systems, one file each. A file added here is registered as an env, checked and ranked."""
 
 from __future__ import annotations
 

@@ -11,15 +11,15 @@ from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 @dataclass(frozen=True)
 class Academic(System):
-    """A double integrator seen through a nonlinear change of coordinates.
+    """A double integrator in nonlinear coordinates.
 
-    Equations (Farkane et al., PINN-Obs, "Applications"; Sanfelice & Praly 2012):
-    ẋ₁ = x₂√(1 + x₁²), ẋ₂ = −x₁x₂²/√(1 + x₁²), y = x₁.
+    Equations (Farkane et al., PINN-Obs, "Applications"; Sanfelice & Praly 2012): ẋ₁ = x₂√(1 + x₁²),
+    ẋ₂ = −x₁x₂²/√(1 + x₁²), y = x₁.
 
-    Invariant: c = x₂√(1 + x₁²), hence x₁(t) = x₁(0) + c·t, without bound.
+    Invariant: c = x₂√(1 + x₁²), hence x₁(t) = x₁(0) + c·t, which is unbounded.
 
-    Observability: no two states give the same output. As x₁ grows, x₂ decays like c/x₁: its errors
-    are scored over its spread at the start, not relatively.
+    Observability: no two states give the same output. As x₁ grows, x₂ decays like c/x₁. Its errors
+    are therefore scored relative to its initial spread, not to its value.
     """
 
     state_names = ("x1", "x2")
@@ -66,7 +66,7 @@ class Academic(System):
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:
-        """Neither nearly at rest nor faster than was checked: 0.3 ≤ abs c ≤ 2.5."""
+        """States neither nearly at rest nor faster than tested: 0.3 ≤ abs c ≤ 2.5."""
         speed = abs(self.invariants(x0)[..., 0])
         return (speed >= 0.3) & (speed <= 2.5)
 

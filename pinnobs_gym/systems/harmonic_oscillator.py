@@ -9,17 +9,17 @@ from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 @dataclass(frozen=True)
 class HarmonicOscillator(System):
-    """A harmonic oscillator whose squared angular frequency is the third state, to be estimated.
+    """A harmonic oscillator whose unknown squared angular frequency is the third state.
 
-    Equations (Farkane et al., PINN-Obs, "Applications"; Praly, Isidori & Marconi 2006):
-    ẋ₁ = x₂, ẋ₂ = −x₃x₁, ẋ₃ = 0, y = x₁.
+    Equations (Farkane et al., PINN-Obs, "Applications"; Praly, Isidori & Marconi 2006): ẋ₁ = x₂, ẋ₂
+    = −x₃x₁, ẋ₃ = 0, y = x₁.
 
     Invariants: x₃ and x₂² + x₃x₁².
 
-    Observability: at rest, x₁ = x₂ = 0, any x₃ gives the same output; the map from the state to
-    (y, ẏ, ÿ) loses rank on x₁ = 0.
+    Observability: at rest, x₁ = x₂ = 0, any x₃ gives the same output. The map from the state to (y,
+    ẏ, ÿ) loses rank on x₁ = 0.
 
-    The ``paper`` setup starts from x̂₃ = −1, from where an uncorrected copy of the plant explodes.
+    The ``paper`` setup starts from x̂₃ = −1, from which an uncorrected copy of the plant diverges.
     """
 
     state_names = ("x1", "x2", "x3")

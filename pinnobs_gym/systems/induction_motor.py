@@ -28,13 +28,14 @@ class InductionMotor(System):
     as 0.03k at a step of 1e-4 s). From rest: peak current 367 A, 95 % of the speed at 0.38 s,
     steady ω = 298.6 rad/s, flux 1.05 Wb.
 
-    Observability: any ω while u = 0 and i = φ = 0; the speed is scored only where abs φ > 0.05 Wb.
-    Driven with a known load the plant contracts, and an uncorrected copy of it has the best tail.
-    So the leaderboard ranks under ``load_step``: at 0.6 s the torque steps to a value that no
-    estimator is told.
+    Observability: ω is unobservable while u = 0 and i = φ = 0, and is scored only where abs φ >
+    0.05 Wb. With inputs and a known load the plant contracts, so that an uncorrected copy of it has
+    the smallest tail error. The leaderboard therefore ranks under ``load_step``: at 0.6 s the
+    torque steps to a value unknown to the estimators.
 
-    The ``paper`` setup is u = 0, T_L = 0: the paper gives no u, the authors' public code takes
-    u = 0 and drops T_L, and with u = 0 and T_L = 10 N·m the speed runs to −3102 rad/s in 20 s.
+    The ``paper`` setup is u = 0, T_L = 0: the paper does not specify u, and the authors' public
+    code uses u = 0 without T_L. With u = 0 and T_L = 10 N·m the speed would reach −3102 rad/s in 20
+    s.
     """
 
     R_s: float = 0.18
@@ -60,7 +61,7 @@ class InductionMotor(System):
     u_frequency: float = 300.0
     """Angular frequency of the voltages (rad/s)."""
     load_step_time: float = field(default=math.inf, kw_only=True)
-    """When the load torque steps (s); never by default."""
+    """Time of the step of the load torque (s); no step by default."""
     load_step_torque: float = field(default=0.0, kw_only=True)
     """Load torque after the step (N·m)."""
 
@@ -74,7 +75,8 @@ class InductionMotor(System):
     scale = (100.0, 87.0, 0.65, 0.65, 270.0)
     state_bound = (470.0, 470.0, 1.1, 1.1, 310.0)
     ranked_condition = "load_step"
-    uncertain = ("R_s", "R_r", "J", "T_L")  # with M 10 % up the leakage factor would be negative
+    # M is excluded: 10 % more makes the leakage factor negative.
+    uncertain = ("R_s", "R_r", "J", "T_L")
     model_step = 5e-4
     setups = {
         "benchmark": Setup(
@@ -167,7 +169,7 @@ class InductionMotor(System):
         return matrix(x, [[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def observable(self, x: Array) -> Array:
-        """All states, but for the speed where abs φ ≤ 0.05 Wb."""
+        """All states, except the speed where abs φ ≤ 0.05 Wb."""
         xp = array_namespace(x)
         all_states = xp.ones_like(x, dtype=xp.bool)
         fluxed = x[..., 2] ** 2 + x[..., 3] ** 2 > 0.05**2

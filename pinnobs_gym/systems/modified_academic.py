@@ -1,4 +1,4 @@
-"""The academic system with its nonlinearity moved to the unmeasured state."""
+"""The academic system with its nonlinearity in the unmeasured state."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 @dataclass(frozen=True)
 class ModifiedAcademic(System):
-    """A second-order plant whose nonlinearity acts on the unmeasured state.
+    """A second-order plant with a nonlinearity in the unmeasured state.
 
-    Equations (Farkane et al., PINN-Obs, "Applications"):
-    ẋ₁ = x₂√(1 + x₂²), ẋ₂ = −x₁x₂²/√(1 + x₂²), y = x₁.
+    Equations (Farkane et al., PINN-Obs, "Applications"): ẋ₁ = x₂√(1 + x₂²), ẋ₂ = −x₁x₂²/√(1 + x₂²),
+    y = x₁.
 
     Invariants: ln abs(x₂) + (x₁² + x₂²)/2, and the sign of x₂.
 
-    Observability: no two states give the same output, since ∂ẏ/∂x₂ ≥ 1. x₂ decays, so that late
-    relative errors in it would mean nothing; they are scored over the scale.
+    Observability: no two states give the same output, since ∂ẏ/∂x₂ ≥ 1. As x₂ decays, late relative
+    errors would be meaningless; errors are scored relative to the scale.
     """
 
     state_names = ("x1", "x2")
@@ -67,7 +67,7 @@ class ModifiedAcademic(System):
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:
-        """Away from the equilibria x₂ = 0: abs x₂ ≥ 0.1."""
+        """States away from the equilibria x₂ = 0: abs x₂ ≥ 0.1."""
         return abs(x0[..., 1]) >= 0.1
 
     def invariants(self, x: Array) -> Array:

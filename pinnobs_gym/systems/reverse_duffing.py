@@ -9,14 +9,15 @@ from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 @dataclass(frozen=True)
 class ReverseDuffing(System):
-    """A conservative oscillator whose velocity enters the position cubed.
+    """A conservative oscillator whose position changes at the cube of its second state.
 
     Equations (Farkane et al., PINN-Obs, "Ablation studies"): ẋ₁ = x₂³, ẋ₂ = −x₁, y = x₁.
 
     Invariant: H = x₁²/2 + x₂⁴/4; every orbit is periodic, with period 5.2441·H^(−1/4) s.
 
-    Observability: no two states give the same output, but the map from the state to (y, ẏ, ÿ)
-    loses rank on x₂ = 0, twice in every period: differentiating the output does not give x₂ there.
+    Observability: no two states give the same output, but the map from the state to (y, ẏ, ÿ) loses
+    rank on x₂ = 0, twice in every period, where x₂ cannot be computed by differentiating the
+    output.
     """
 
     state_names = ("x1", "x2")
@@ -60,7 +61,7 @@ class ReverseDuffing(System):
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:
-        """Neither at rest nor of more energy than was checked: 0.25 ≤ H ≤ 2.5."""
+        """States neither at rest nor of more energy than tested: 0.25 ≤ H ≤ 2.5."""
         energy = self.invariants(x0)[..., 0]
         return (energy >= 0.25) & (energy <= 2.5)
 

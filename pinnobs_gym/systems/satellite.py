@@ -1,4 +1,4 @@
-"""A satellite's free rotation."""
+"""The free rotation of a satellite."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
 
 @dataclass(frozen=True)
 class Satellite(System):
-    """Euler's equations of a rigid body without torque, one angular velocity measured.
+    """Euler's equations of a torque-free rigid body with one measured angular velocity.
 
-    Equations (Farkane et al., PINN-Obs, "Applications"): ẋ₁ = a₁x₂x₃, ẋ₂ = a₂x₁x₃, ẋ₃ = a₃x₁x₂,
-    y = x₁, where for principal moments of inertia I: a₁ = (I₂ − I₃)/I₁, a₂ = (I₃ − I₁)/I₂,
-    a₃ = (I₁ − I₂)/I₃. The defaults are those of I = (1, 0.8, 0.3) kg·m²; see `from_inertia`.
+    Equations (Farkane et al., PINN-Obs, "Applications"): ẋ₁ = a₁x₂x₃, ẋ₂ = a₂x₁x₃, ẋ₃ = a₃x₁x₂, y =
+    x₁, where for principal moments of inertia I: a₁ = (I₂ − I₃)/I₁, a₂ = (I₃ − I₁)/I₂, a₃ = (I₁ −
+    I₂)/I₃. The defaults are those of I = (1, 0.8, 0.3) kg·m²; see `from_inertia`.
 
     Invariants: a₂x₁² − a₁x₂² and a₃x₁² − a₁x₃².
 
-    Observability: (x₂, x₃) and −(x₂, x₃) give the same output for ever. The benchmark samples only
-    x₃ > 0, on polhodes about the minor axis where x₃ keeps its sign, so that the prior decides it;
-    scores are also reported modulo that sign. With x₁ = 0 and x₂x₃ = 0 the output stays zero.
+    Observability: (x₂, x₃) and −(x₂, x₃) give the same output at all times. The benchmark samples
+    only x₃ > 0, on polhodes about the minor axis where x₃ keeps its sign, so that the prior
+    determines it; scores are also reported modulo that sign. With x₁ = 0 and x₂x₃ = 0 the output
+    stays zero.
 
-    The ``paper`` setup takes the a = (1, −1, 1) of the authors' public code, which no rigid body
-    has. ``measure_x3=True`` adds the second output that the code uses and the paper does not.
+    The ``paper`` setup uses a = (1, −1, 1) from the authors' public code, which no rigid body has.
+    ``measure_x3=True`` adds the second output of that code, which the paper does not mention.
     """
 
     a1: float = 0.5
@@ -68,7 +69,7 @@ class Satellite(System):
 
     @classmethod
     def from_inertia(cls, I1: float, I2: float, I3: float) -> Satellite:
-        """The body of principal moments of inertia I1, I2, I3 in kg·m²."""
+        """Return the body with principal moments of inertia I1, I2, I3 in kg·m²."""
         return cls(a1=(I2 - I3) / I1, a2=(I3 - I1) / I2, a3=(I1 - I2) / I3)
 
     def f(self, t: Array, x: Array, u: Array) -> Array:

@@ -1,5 +1,5 @@
 """The commands of `pinnobs`, one module each.
 
-A module is named like its command, its docstring's first line is "`NAME ARGUMENTS`: what it does",
-and its ``run(arguments)`` returns the exit status.
+A module has the name of its command. The first line of its docstring is "`NAME ARGUMENTS`:
+purpose", and ``run(arguments)`` returns the exit status.
 """

@@ -21,7 +21,7 @@ from pinnobs_gym.systems import SYSTEMS
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate the states behind a sensor log: a CSV file with columns t, y1, ... and u1, ..."""
+    """Estimate the states from a sensor log: a CSV file with columns t, y1, ... and u1, ..."""
 
     system: str
     """Name or module:Class of the model."""
@@ -38,11 +38,11 @@ class Estimate:
     noise_std: tuple[float, ...] | None = None
     """Standard deviations of the output noise; the benchmark's if not given."""
     out: Path = Path("estimates.csv")
-    """Where the estimates go; a picture of the same name and the ending .png lies beside it."""
+    """File of the estimates; a figure is written beside it, with the suffix .png."""
 
     def run(self) -> int:
-        """Estimate and write."""
-        env_id(self.system)  # checks and registers a system of the user's
+        """Estimate, and write the results."""
+        env_id(self.system)  # checks and registers the user's own system
         cls = SYSTEMS.resolve(self.system)
         system, setup = cls.configured(noise_std=self.noise_std)
         given = {"xhat0": self.xhat0, "P0_std": self.P0_std}
@@ -78,5 +78,5 @@ class Estimate:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Estimate, "estimate", arguments).run()

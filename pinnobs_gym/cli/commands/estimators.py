@@ -1,4 +1,4 @@
-"""`estimators [NAME]`: list the estimators, or print what one is."""
+"""`estimators [NAME]`: list the estimators, or print the description of one."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from pinnobs_gym.estimators import ESTIMATORS
 
 @dataclass(frozen=True)
 class Estimators:
-    """List the estimators, or print what one is."""
+    """List the estimators, or print the description of one."""
 
     name: Annotated[str | None, tyro.conf.Positional] = None
     """Name or module:Class of an estimator."""
 
     def run(self) -> int:
-        """Print."""
+        """Print the list or the description."""
         if self.name is not None:
             console.print(inspect.getdoc(ESTIMATORS.resolve(self.name)), markup=False)
             return 0
@@ -36,5 +36,5 @@ class Estimators:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Estimators, "estimators", arguments).run()

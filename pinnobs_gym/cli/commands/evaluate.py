@@ -35,13 +35,13 @@ class Evaluate:
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as process_noise=1e-3."""
     setup: str = "benchmark"
-    """Setup that is played."""
+    """Setup to play."""
     condition: str = "nominal"
     """Condition, such as load_step, or noise5+dropout10."""
     episodes: int = 100
     """Number of episodes."""
     seed: int = 0
-    """Seed of the first."""
+    """Seed of the first episode."""
     out: Path = Path("runs/evaluate")
     """Folder of rows and TensorBoard log."""
     video: Path | None = None
@@ -74,7 +74,7 @@ class Evaluate:
         return self.out / "rows.jsonl"
 
     def _score(self, game: Game, estimator: BaseEstimator, episodes: int) -> list[Row]:
-        """The rows of that many episodes, which are logged."""
+        """Score and log this number of episodes, and return their rows."""
         seeds = seeds_of(self.seed, episodes)
         with progress() as bar:
             task = bar.add_task("episodes", total=episodes)
@@ -82,14 +82,14 @@ class Evaluate:
             def count(done: int) -> None:
                 bar.advance(task, done)
 
-            found = run_episodes(game, estimator, seeds, Results(self._rows), count)
+            evaluated = run_episodes(game, estimator, seeds, Results(self._rows), count)
             bar.update(task, completed=episodes)
-        with Log(log_folder(self.out, found.rows[0])) as log:
-            log_episodes(log, found.rows, found.first_played)
-            log_summary(log, found.rows)
-        return found.rows
+        with Log(log_folder(self.out, evaluated.rows[0])) as log:
+            log_episodes(log, evaluated.rows, evaluated.first_played)
+            log_summary(log, evaluated.rows)
+        return evaluated.rows
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Evaluate, "evaluate", arguments).run()

@@ -17,48 +17,49 @@ from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.scoring import rows, tensorboard
 
 PROCESSES = 2
-"""At a time, if none are asked for."""
+"""Default number of processes."""
 
 
 @dataclass(frozen=True)
 class Leaderboard:
-    """Run every estimator on every system and print the tables; what is already there is kept."""
+    """Run every estimator on every system and print the tables; stored results are kept."""
 
     suite: str = "leaderboard"
-    """What is played: full, leaderboard, paper, quick, or the path of a TOML file of your own. The
-    options from systems to seed change it."""
+    """Suite to play: full, leaderboard, paper, quick, or the path of your own TOML file. The
+    options from systems to seed override it."""
     systems: tuple[str, ...] = ()
     """Names or module:Class of systems."""
     estimators: tuple[str, ...] = ()
     """Names or module:Class of estimators."""
     setup: str | None = None
-    """Setup that is played."""
+    """Setup to play."""
     condition: tuple[str, ...] = ()
-    """Conditions; nominal, and the one that a system is ranked under, if neither this nor the suite
-    names any. With "all", those that need no training play every condition that fits the system."""
+    """Conditions; by default those of the suite or, if it names none, nominal and the system's
+    ranked condition. With "all", estimators that need no training play every condition that applies
+    to the system."""
     episodes: int | None = None
     """Episodes of each estimator and system."""
     trained_episodes: int | None = None
-    """Episodes of those that train on every record."""
+    """Episodes of estimators that train on every record."""
     budget: tuple[float, ...] = ()
-    """CPU seconds of each training; of several, one after the other."""
+    """CPU seconds of each training; each of several is a separate training."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of each training."""
     seed: int | None = None
     """Seed of the first episode."""
     jobs: int | None = None
-    """Processes at a time on this machine, one thread each; 2 if not given."""
+    """Number of processes on this machine, one thread each; 2 if not given."""
     backend: Literal["loky", "dask"] = "loky"
-    """Where jobs are run: processes of this machine, or the workers of a Dask scheduler."""
+    """Where jobs run: processes of this machine, or the workers of a Dask scheduler."""
     scheduler: str | None = None
     """Address of the Dask scheduler, such as tcp://host:8786."""
     retry_failed: bool = False
-    """Run the jobs again that failed before; they are left out otherwise."""
+    """Run jobs again that failed before; otherwise they are left out."""
     out: Path = Path("runs/leaderboard")
     """Folder of rows, tables, TensorBoard log and trained files."""
 
     def run(self) -> int:
-        """Run what is missing, then print and write the tables."""
+        """Run the missing jobs, then print and write the tables."""
         workers = self._workers()
         played = suites.load(self.suite).changed(
             systems=self.systems,
@@ -73,7 +74,7 @@ class Leaderboard:
         )
         check_writable(self.out)
         path = self.out / "rows.jsonl"
-        stored = rows.load(path)  # a damaged file is refused before anything is run
+        stored = rows.load(path)  # reject a damaged file before anything is run
         if stored.warning:
             console.print(stored.warning, style="yellow", soft_wrap=True)
         jobs = plan.jobs_of(played, self.out.absolute())
@@ -109,20 +110,20 @@ class Leaderboard:
         return Workers(self.jobs or PROCESSES)
 
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
-        """Print and write what came of it."""
-        found = board(stored)
-        shown = [table for table in found.tables if table.game.condition in conditions]
+        """Print and write the results."""
+        results = board(stored)
+        shown = [table for table in results.tables if table.game.condition in conditions]
         for table in shown if len(conditions) <= 2 else ():
             print_table(table)
         console.print(standings_table.NOTE if len(conditions) <= 2 else "")
-        print_grid("Across systems", *ranks_table.cells(found.lines))
+        print_grid("Across systems", *ranks_table.cells(results.lines))
         console.print(ranks_table.NOTE)
-        if len(found.ranks) > 1:
-            print_grid("Ranks", *ranks_table.rank_cells(found.ranks))
+        if len(results.ranks) > 1:
+            print_grid("Ranks", *ranks_table.rank_cells(results.ranks))
             console.print(ranks_table.RANK_NOTE)
         path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
-            temporary.write_text(markdown(found), encoding="utf-8")
+            temporary.write_text(markdown(results), encoding="utf-8")
         for what, where in (
             ("tables", path),
             ("rows", self.out / "rows.jsonl"),
@@ -138,5 +139,5 @@ class Leaderboard:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Leaderboard, "leaderboard", arguments).run()

@@ -17,11 +17,11 @@ from pinnobs_gym.scoring import curves, rows
 
 @dataclass(frozen=True)
 class Report:
-    """Make one static page of scores, which needs no server and no network."""
+    """Make a static page of scores that needs no server and no network."""
 
     rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Rows files, such as runs/leaderboard/rows.jsonl; what a folder "curves" beside each holds is
-    drawn too."""
+    """Rows files, such as runs/leaderboard/rows.jsonl; the curves in a folder "curves" beside each
+    are drawn too."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("site")
     """Folder of the page, index.html."""
 
@@ -52,5 +52,5 @@ class Report:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Report, "report", arguments).run()

@@ -25,7 +25,7 @@ class Systems:
     """Name or module:Class of a system."""
 
     def run(self) -> int:
-        """Print."""
+        """Print the list or the page."""
         if self.name is not None:
             name = env_id(self.name)
             text = page(SYSTEMS.resolve(self.name), name)
@@ -45,5 +45,5 @@ class Systems:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Systems, "systems", arguments).run()

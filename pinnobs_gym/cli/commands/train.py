@@ -30,28 +30,28 @@ ConfigType = TypeVar("ConfigType")
 
 @dataclass(frozen=True)
 class Train(Generic[ConfigType]):
-    """Train an estimator on episodes of a system, as many as its recipe says."""
+    """Train an estimator on episodes of a system; the trainer's settings determine how many."""
 
     system: str
     """Name or module:Class of the system."""
     config: ConfigType
     """The trainer's settings."""
     preset: str
-    """Whose settings are taken where none are given."""
+    """Preset that defines the settings not given."""
     setup: str = "benchmark"
-    """Setup that is played."""
+    """Setup to play."""
     condition: str = "nominal"
     """Condition, such as load_step."""
     episode: int = TRAINING_SEED
-    """Seed of the episode that is learned from, or of the first of several."""
+    """Seed of the training episode, or of the first of several."""
     out: Path = Path("runs/train")
-    """Folder of checkpoints, trained files, pictures and TensorBoard log."""
+    """Folder of checkpoints, trained files, figures and TensorBoard log."""
     resume: bool = False
-    """Go on from the checkpoint that is there."""
+    """Continue from an existing checkpoint."""
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Train with the trainer named first; returns the command's exit status."""
+    """Train with the trainer named first, and return the command's exit status."""
     if not arguments or arguments[0].startswith("-"):
         raise ValueError(f"name a trainer first: pinnobs train {' | '.join(TRAINERS.sources)}")
     name = arguments[0]
@@ -97,7 +97,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> Train[Any]:
-    """The command line of a training; what a preset says is its default."""
+    """Parse the command line of a training, with the preset's values as defaults."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default=next(iter(cls.presets)))
     preset: str = first.parse_known_args(arguments)[0].preset
@@ -116,18 +116,18 @@ def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> 
 def _report_training(
     label: str, estimator: BaseEstimator, game: Game, episode: int, loss: float
 ) -> Played:
-    """Print how a trained estimator does; returns what it makes of its own record."""
+    """Print the scores of a trained estimator's replays, and return that of its own record."""
     if estimator.track == "online":
-        found = acceptance.replays(estimator, game, episode)
+        replays = acceptance.replays(estimator, game, episode)
     else:
-        found = [acceptance.Replay("own record", play(game, estimator, [episode]))]
-    for replay in found:
+        replays = [acceptance.Replay("own record", play(game, estimator, [episode]))]
+    for replay in replays:
         row = replay.scores
         console.print(
             f"{label} on {replay.name}: RMSE {row['rmse']:.4g}, NRMSE {row['nrmse']:.4g}, "
             f"last 25 % {row['nrmse_tail']:.4g}",
             highlight=False,
         )
-    if estimator.track == "online" and (message := acceptance.warning(loss, found[0].scores)):
+    if estimator.track == "online" and (message := acceptance.warning(loss, replays[0].scores)):
         console.print(f"warning: {message}", style="yellow")
-    return found[0].played
+    return replays[0].played

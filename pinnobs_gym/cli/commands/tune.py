@@ -19,19 +19,19 @@ from pinnobs_gym.scoring.tuning import Search, Tried
 
 @dataclass(frozen=True)
 class Tune:
-    """Search an estimator's settings on episodes that the leaderboard never uses; what is tried is
-    kept, and a search that was stopped goes on."""
+    """Search an estimator's settings on episodes that the leaderboard never uses. Trials are
+    stored, and an interrupted search continues."""
 
     name: Annotated[str, tyro.conf.Positional]
     """Name or module:Class of the estimator."""
     system: str
     """Name or module:Class of the system."""
     setup: str = "benchmark"
-    """Setup that is played."""
+    """Setup to play."""
     condition: str = "nominal"
     """Condition, such as load_step, or noise5+dropout10."""
     trials: int = 50
-    """Settings to try, those of earlier runs among them."""
+    """Number of settings to try, including those of earlier runs."""
     episodes: int = 32
     """Episodes of each trial."""
     seed: int = 0
@@ -77,11 +77,11 @@ class Tune:
 
 
 def arguments(settings: Mapping[str, Any]) -> str:
-    """Settings as the command line takes them."""
+    """Format settings as command line arguments."""
     shown = (f"{n}={v:.4g}" if isinstance(v, float) else f"{n}={v}" for n, v in settings.items())
     return "--set " + " ".join(shown)
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command; returns its exit status."""
+    """Run the command and return its exit status."""
     return parse(Tune, "tune", arguments).run()

@@ -87,7 +87,7 @@ class DaskPool(Pool):
         try:
             future = self._client.submit(attempt, number, job, origin, pure=False)
         except Exception as error:
-            raise _gone(error) from None
+            raise _connection_lost(error) from None
         self._futures.add(future)
         return future
 
@@ -100,7 +100,7 @@ class DaskPool(Pool):
         except KilledWorker:
             return Outcome("Dask gave it up", died=True)
         except (CancelledError, OSError, TimeoutError) as error:
-            raise _gone(error) from None
+            raise _connection_lost(error) from None
 
     def __exit__(
         self,
@@ -113,7 +113,7 @@ class DaskPool(Pool):
                 self._client.cancel(list(self._futures), asynchronous=False)
 
 
-def _gone(error: BaseException) -> WorkersLost:
+def _connection_lost(error: BaseException) -> WorkersLost:
     return WorkersLost(
         f"the Dask scheduler is gone ({type(error).__name__}); what was finished is kept, and the "
         "same command does the rest"

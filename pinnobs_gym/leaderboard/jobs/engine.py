@@ -65,7 +65,7 @@ class Engine:
         self._workers = workers
         self._under_way: dict[int, PicklableJob] = {}
         self.processes = workers.processes
-        """How many jobs are run at a time."""
+        """Number of jobs run at a time."""
 
     @property
     def running(self) -> list[PicklableJob]:

@@ -28,7 +28,7 @@ class Job:
     """One evaluation, which any process can run."""
 
     game: Game
-    """What is played."""
+    """The game to play."""
     estimator: str
     """Name or ``module:Class`` of the estimator."""
     episodes: int
@@ -115,11 +115,11 @@ def run_job(job: Job) -> None:
     estimator = make_estimator(chosen, job.game, options)
     seeds = range(job.seed, job.seed + job.episodes)
     results = Results(job.rows, job.known)
-    found = run_episodes(job.game, estimator, seeds, results, label=job.label)
-    scored = [row for row in found.rows if "nrmse" in row]
-    if found.first_played is not None:  # some episodes were not stored
+    evaluated = run_episodes(job.game, estimator, seeds, results, label=job.label)
+    scored = [row for row in evaluated.rows if "nrmse" in row]
+    if evaluated.first_played is not None:  # some episodes were not stored
         with Log(log_folder(job.folder, scored[0])) as log:
-            log_episodes(log, scored, found.first_played)
+            log_episodes(log, scored, evaluated.first_played)
 
 
 def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:

@@ -115,9 +115,9 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
         cls = ESTIMATORS.resolve(job.estimator)
         if job.label is not None or cls.label is BaseEstimator.label:
             name = job.label or ESTIMATORS.name_of(cls)
-            found = known_rows[job.game.name, name]
+            keys = known_rows[job.game.name, name]
             seeds = range(job.seed, job.seed + job.episodes)
-            known = frozenset(entry for entry in found if entry[2] in seeds)
+            known = frozenset(entry for entry in keys if entry[2] in seeds)
         to_run.append(replace(job, known=known, failed=again))
     return to_run, left_out
 

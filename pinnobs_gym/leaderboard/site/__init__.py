@@ -1,7 +1,7 @@
-"""The leaderboard's page: one file that needs no server and no network, made from stored rows.
+"""The leaderboard's page: one file without server or network, made from stored rows.
 
-`model` computes once all that is shown: `games` from runs and curves by means of `over_episodes`
-and `over_samples`, `across` over systems and conditions, `method` how scores were made. From that
-model alone `page` draws by the template and `drawings` the charts; `over_time` and `comparisons`
-say how these look, `palette` in which colours.
+`model` computes the content of the page: `games` from runs and curves by `over_episodes` and
+`over_samples`, `across` over systems and conditions, and `method` the provenance of scores. `page`
+renders that model with the template, and `drawings` its charts. `over_time` and `comparisons`
+define the charts, and `palette` their colours.
 """

@@ -1,4 +1,4 @@
-"""The numbers that the page shows across systems and conditions."""
+"""The page's results across systems and conditions."""
 
 from __future__ import annotations
 
@@ -16,51 +16,55 @@ from pinnobs_gym.leaderboard.site.columns import Columns, extend, number
 
 @dataclass(frozen=True)
 class Factors:
-    """How online estimators compare with the peer under several conditions."""
+    """Factors of online estimators to the peer under several conditions."""
 
     of: str
     """A system, or "all systems"."""
     estimators: tuple[str, ...]
-    """Those that were played under more conditions first, then those with the better worst rank."""
+    """Estimators, those played under more conditions first, then those with the better worst
+    rank."""
     worst: tuple[int, ...]
-    """The worst rank of each."""
+    """Worst rank of each estimator."""
     values: Mapping[str, Mapping[str, float]]
-    """`ranks.log_ratios`, by condition and estimator; absent where it played less than the peer."""
+    """`ranks.log_ratios`, by condition and estimator; absent where the estimator lacks a game of
+    the peer."""
 
 
 def factors(contenders: Sequence[Contender]) -> list[Factors]:
-    """The factors over all systems together and, if there are several, those of each; of those that
-    were played under several conditions."""
+    """Return the factors over all systems and, if there are several systems, of each system; only
+    those with several conditions."""
     online = [contender for contender in contenders if contender.track == "online"]
     systems = sorted({game.system for contender in online for game in contender.games})
     groups = {"all systems": online}
     for system in systems if len(systems) > 1 else ():
         groups[system] = among(online, lambda run, wanted=system: run.game.system == wanted)
-    found = {of: ranks.log_ratios(group) for of, group in groups.items()}
-    return [_factors(of, values) for of, values in found.items() if len(values) > 1]
+    ratios = {of: ranks.log_ratios(group) for of, group in groups.items()}
+    return [_factors(of, values) for of, values in ratios.items() if len(values) > 1]
 
 
 def _factors(of: str, values: Mapping[str, Mapping[str, float]]) -> Factors:
-    found: dict[str, list[int]] = {}
-    for placed in ranks.ranks(values).values():
-        for estimator, rank in placed.items():
-            found.setdefault(estimator, []).append(rank)
-    names = sorted(found, key=lambda n: (-len(found[n]), max(found[n]), sum(found[n])))
-    return Factors(of, tuple(names), tuple(max(found[name]) for name in names), values)
+    placed: dict[str, list[int]] = {}
+    for by_estimator in ranks.ranks(values).values():
+        for estimator, rank in by_estimator.items():
+            placed.setdefault(estimator, []).append(rank)
+    names = sorted(placed, key=lambda n: (-len(placed[n]), max(placed[n]), sum(placed[n])))
+    return Factors(of, tuple(names), tuple(max(placed[name]) for name in names), values)
 
 
 def training_seconds(contender: Contender) -> float | None:
-    """Median CPU seconds of its trainings; None if it is not trained."""
+    """Return the median CPU seconds of its trainings; None if it is not trained."""
     spent = [row["training"].get("seconds") for row in rows_of(contender.runs)]
     known = [seconds for seconds in spent if seconds is not None]
     return float(np.median(known)) if known else None
 
 
 def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns:
-    """Each line of the overview: its factor to the peer with the interval, its µs per step, and the
-    CPU seconds that training took, a gap for those that are not trained. ``front`` is true of
-    those that no other of their track beats in both accuracy and speed. Lines whose factor is not
-    finite are left out."""
+    """Return a row per line of the overview: its factor to the peer with the interval, its µs per
+    step, and the CPU seconds of its training, with a gap for estimators that are not trained.
+
+    ``front`` is true for the Pareto front: lines that no other of their track beats in both
+    accuracy and speed. Lines without a finite factor are left out.
+    """
     table: Columns = {name: [] for name in ("estimator", "track", "ratio", "low", "high", "us")}
     table |= {"seconds": [], "front": []}
     for line in lines:
@@ -82,7 +86,7 @@ def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns
 
 
 def _beats(other: Line, line: Line) -> bool:
-    """Whether the other is both faster and more accurate."""
+    """Return whether the other line is both faster and more accurate."""
     if other.ratio is None or line.ratio is None or other.track != line.track:
         return False
     faster = other.us_per_step < line.us_per_step

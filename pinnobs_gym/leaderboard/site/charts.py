@@ -1,5 +1,6 @@
-"""What the page's charts share. They are Vega-Lite made with Altair; their data are named and come
-with the page, and the theme has the colours: of estimators, of the ground, and of each `style`."""
+"""Common parts of the page's charts. They are Vega-Lite made with Altair; their data are named and
+embedded in the page, and the page's theme sets the colours of estimators, background and each
+`style`."""
 
 from __future__ import annotations
 
@@ -14,15 +15,15 @@ from pinnobs_gym.leaderboard.site.palette import Style
 Spec = dict[str, Any]
 """A chart in Vega-Lite."""
 SHOWN = "indexof(shown, datum.estimator) >= 0"
-"""Whether the reader has chosen the estimator."""
+"""Expression for whether the reader has selected the estimator."""
 PLAIN = ".3~r"
-"""How ticks are written: without exponents."""
+"""Number format of ticks, without exponents."""
 HUGE = 1e9
-"""Stands for infinity, beyond every axis."""
+"""Replaces infinity, beyond every axis."""
 
 
 class Styled:
-    """Encodings that draw each estimator as its style says."""
+    """Encodings that draw each estimator in its style."""
 
     def __init__(self, styles: Mapping[str, Style]) -> None:
         names = list(styles)
@@ -35,12 +36,12 @@ class Styled:
 
 
 def named(data: str) -> alt.Chart:
-    """A chart of data that the page has under that name."""
+    """Return a chart of the page's data of that name."""
     return alt.Chart(alt.NamedData(name=data))
 
 
 def finished(*layers: Any, height: int, **params: Any) -> Spec:
-    """Layers as one chart as wide as its place; ``params`` can be set by the page."""
+    """Combine layers into one chart as wide as its container; ``params`` can be set by the page."""
     spec = alt.layer(*layers).to_dict(validate=False)  # the tests do that; it takes long
     spec.pop("config", None)
     own = [{"name": name, "value": value} for name, value in params.items()]
@@ -49,12 +50,13 @@ def finished(*layers: Any, height: int, **params: Any) -> Spec:
 
 
 def log_scale(low: float, high: float) -> alt.Scale:
-    """A logarithmic scale; what is beyond it is drawn at its end."""
+    """Return a logarithmic scale; values beyond it are drawn at its end."""
     return alt.Scale(type="log", domain=[low, high], clamp=True, nice=False)
 
 
 def log_axis(low: float, high: float) -> alt.Axis:
-    """Ticks at 1, 2, 5, 10, ...; more within less than a decade, powers of ten over many."""
+    """Return an axis with ticks at 1, 2, 5, 10, ...; with more below a decade, and powers of ten
+    over many decades."""
     decades = np.log10(high / low)
     parts: tuple[float, ...] = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if decades < 0.8 else (1, 2, 5)
     if decades >= 1.6:
@@ -66,8 +68,8 @@ def log_axis(low: float, high: float) -> alt.Axis:
 
 
 def time_of(end: float) -> alt.X:
-    """The time axis up to ``end`` (s): linear at first, then logarithmic, so that the transient is
-    seen. It ends at a tick if one is near."""
+    """Return the time axis up to ``end`` (s): linear at first, then logarithmic, to resolve the
+    transient. It ends at a tick if one is near."""
     powers = range(int(np.floor(np.log10(end / 200))), int(np.ceil(np.log10(end))) + 1)
     ticks = [float(f"{part}e{power}") for power in powers for part in (1, 2, 5)]
     values = [0.0, *(tick for tick in ticks if end / 200 <= tick <= 1.02 * end)]
@@ -78,17 +80,17 @@ def time_of(end: float) -> alt.X:
 
 
 def exact(field: str, title: str = "") -> alt.Tooltip:
-    """A number in the box that the pointer opens."""
+    """Return a number of the tooltip."""
     return alt.Tooltip(f"{field}:Q", format=".3~g", title=title or field)
 
 
 def finite(field: str) -> str:
-    """An expression that is beyond every axis where the field has a gap."""
+    """Return an expression with a value beyond every axis where the field has a gap."""
     return f"isValid(datum.{field}) ? datum.{field} : {HUGE}"
 
 
 def nice_range(values: Sequence[float | None], low: float, high: float) -> tuple[float, float]:
-    """What a logarithmic axis of these values shows, a margin around them, within low and high."""
+    """Return the range of a logarithmic axis of these values with a margin, within low and high."""
     known = [value for value in values if value is not None and value > 0]
     if not known:
         return low, high

@@ -1,4 +1,4 @@
-"""Charts that compare estimators: with the EKF, with the reference, with what they cost."""
+"""Charts that compare estimators with the EKF, with the reference, and by cost."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from pinnobs_gym.leaderboard.site.charts import (
 )
 
 STEP = 21
-"""Height of a line of a chart that has one per estimator."""
+"""Height of a line, in pixels, in charts with one line per estimator."""
 PLAIN_NAMES = alt.Axis(
     domain=False, ticks=False, grid=False, labelLimit=150, labelPadding=8, minExtent=0
 )
-"""The axis of a chart that has a line per estimator."""
+"""The estimator axis of charts with one line per estimator."""
 
 
 def level(scale: alt.Scale, vertical: bool) -> alt.Chart:
-    """A line where the ratio is 1."""
+    """Return a line at ratio 1."""
     rule = named("one").mark_rule(style="level")
     if vertical:
         return rule.encode(x=alt.XDatum(1, scale=scale))
@@ -34,7 +34,7 @@ def level(scale: alt.Scale, vertical: bool) -> alt.Chart:
 
 
 def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Spec:
-    """The factor to the peer with its interval, a line per estimator, on an axis from low to
+    """Chart the factor to the peer with its interval, a line per estimator, on an axis from low to
     high."""
     scale = log_scale(low, high)
     tips = ["estimator:N", "track:N", exact("ratio", "/ ekf"), exact("low"), exact("high")]
@@ -58,8 +58,8 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
 
 
 def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spec:
-    """Quantiles of the error over the Cramér-Rao reference, a line per estimator, on an axis from
-    low to high."""
+    """Chart quantiles of the error over the Cramér-Rao reference, a line per estimator, on an axis
+    from low to high."""
     scale, axis = log_scale(low, high), log_axis(low, high)
     title = "NRMSE / reference, same episode"
     base = (
@@ -93,8 +93,8 @@ def cost(
     across: tuple[float, float],
     up: tuple[float, float],
 ) -> Spec:
-    """The factor to the peer against a cost, both axes with their ranges; those for which
-    ``named_<field>`` is true have their name beside them."""
+    """Chart the factor to the peer against a cost, with the ranges of both axes. Points with a true
+    ``named_<field>`` are labelled."""
     scale = log_scale(*up)
     x = alt.X(f"{field}:Q", scale=log_scale(*across), title=title, axis=log_axis(*across))
     y = alt.Y("ratio:Q", scale=scale, title="NRMSE / EKF's", axis=log_axis(*up))

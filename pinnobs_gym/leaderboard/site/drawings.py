@@ -1,4 +1,4 @@
-"""The charts of a page, and the data that they draw."""
+"""The charts of a page, and their data."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from pinnobs_gym.leaderboard.site.model import Page
 from pinnobs_gym.leaderboard.site.palette import Style
 
 COSTS = {"us": "CPU time per step and episode (µs)", "seconds": "CPU time of training (s)"}
-"""Titles of the axes of what estimators cost, by column."""
+"""Axis titles of the costs, by column."""
 
 
 @dataclass(frozen=True)
 class Charts:
-    """Charts by name, and the data that they draw by key."""
+    """Charts by name, and their data by key."""
 
     charts: dict[str, dict[str, Any]]
-    """Each with its ``spec``, the key of its ``data``, and its ``height``."""
+    """The charts, each with its ``spec``, the key of its ``data``, and its ``height``."""
     data: dict[str, dict[str, Any]]
-    """Tables by name, as the page's script takes them."""
+    """Tables by name, in the format of the page's script."""
 
 
 def charts_of(page: Page, styles: Mapping[str, Style]) -> Charts:
-    """All charts of a page: those across systems, and those of each game, whose names end in its
-    number."""
+    """Return all charts of a page: those across systems, and those of each game, whose names
+    contain its number."""
     styled = Styled(styles)
     parts = [_across(styled, page.costs)] if page.costs["estimator"] else []
     parts += [_game(styled, game) for section in page.sections for game in section.games]
@@ -41,7 +41,8 @@ def charts_of(page: Page, styles: Mapping[str, Style]) -> Charts:
 
 
 def embedded(charts: Charts, styles: Mapping[str, Style], chosen: Sequence[str]) -> str:
-    """All of it as JSON, to stand in a script element, with the estimators chosen at first."""
+    """Return charts, data, styles and initially selected estimators as JSON for a script
+    element."""
     everything = {
         "light": [style.light for style in styles.values()],
         "dark": [style.dark for style in styles.values()],
@@ -54,12 +55,12 @@ def embedded(charts: Charts, styles: Mapping[str, Style], chosen: Sequence[str])
 
 
 def _across(styled: Styled, costs: Columns) -> Charts:
-    """The charts across systems, of at least one estimator."""
+    """Return the charts across systems, for at least one estimator."""
     names, ratio = costs["estimator"], costs["ratio"]
     trained = [seconds is not None for seconds in costs["seconds"]]
     named = {
-        "named_us": _apart(costs["us"], ratio, costs["front"]),
-        "named_seconds": _apart(costs["seconds"], ratio, trained),
+        "named_us": _labelled(costs["us"], ratio, costs["front"]),
+        "named_seconds": _labelled(costs["seconds"], ratio, trained),
     }
     specs = {"factors": comparisons.factors(styled, names, *_range_of(costs, [True] * len(names)))}
     for field, title in COSTS.items():
@@ -72,7 +73,7 @@ def _across(styled: Styled, costs: Columns) -> Charts:
 
 
 def _game(styled: Styled, game: GameResults) -> Charts:
-    """The charts of one game."""
+    """Return the charts of one game."""
     tables = {name: getattr(game, name) for name in ("settling", "ratios", "errors", "reference")}
     end = max([*game.errors["t"], *game.settling["t"], 1e-9])
     specs = {}
@@ -95,8 +96,8 @@ def _game(styled: Styled, game: GameResults) -> Charts:
 
 
 def _charts(key: str, specs: Mapping[str, Spec], tables: Mapping[str, Columns]) -> Charts:
-    """Charts of the same data, each with how high it will be, so that nothing moves when it is
-    drawn."""
+    """Return charts of the same data with their final heights, so that the layout does not move
+    when they are drawn."""
     charts = {
         name: {"spec": spec, "data": key, "height": spec["height"] + 48}
         for name, spec in specs.items()
@@ -106,15 +107,15 @@ def _charts(key: str, specs: Mapping[str, Spec], tables: Mapping[str, Columns]) 
 
 
 def _range_of(costs: Columns, wanted: Sequence[bool]) -> tuple[float, float]:
-    """What an axis of factors shows of those wanted: their intervals, and 1."""
+    """Return the range of an axis of factors: the intervals of the wanted ones, and 1."""
     parts = [costs[part] for part in ("ratio", "low", "high")]
     seen = [value for part in parts for value, want in zip(part, wanted, strict=True) if want]
     return nice_range([1.0, *seen], 0.02, 50.0)
 
 
-def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Iterable[bool]) -> list[bool]:
-    """Which of the points that want it can have a name beside them without one covering another,
-    the lowest first; both axes are logarithmic."""
+def _labelled(x: Sequence[Any], y: Sequence[Any], wanted: Iterable[bool]) -> list[bool]:
+    """Return which of the wanted points can be labelled without overlap, with the lowest points
+    first; both axes are logarithmic."""
     places = {i: (np.log10(x[i] or 1.0), np.log10(y[i])) for i, want in enumerate(wanted) if want}
     spread = np.ptp(list(places.values()), axis=0) + 1e-9 if places else (1.0, 1.0)
     chosen: list[int] = []
@@ -126,7 +127,7 @@ def _apart(x: Sequence[Any], y: Sequence[Any], wanted: Iterable[bool]) -> list[b
 
 
 def _packed(table: Columns) -> dict[str, Any]:
-    """Columns, those of estimators as numbers of a list."""
+    """Return the columns with estimators encoded as indices into a list."""
     packed: dict[str, Any] = dict(table)
     if "estimator" in table:
         levels = list(dict.fromkeys(table["estimator"]))

@@ -1,4 +1,4 @@
-"""What the page shows of each game, from runs and curves."""
+"""The content of the page for each game, from runs and curves."""
 
 from __future__ import annotations
 
@@ -24,30 +24,31 @@ Players = Mapping[str, Sequence[Run]]
 
 @dataclass(frozen=True)
 class GameResults:
-    """How one game went."""
+    """The results of one game."""
 
     number: int
-    """Its place on the page."""
+    """Its index on the page."""
     game: GameName
     table: Table
     settling: Columns
-    """``estimator``, ``t`` in s, and ``share`` of its episodes that have settled by then."""
+    """``estimator``, ``t`` in s, and ``share`` of its episodes settled by then."""
     ratios: Columns
     """Quantiles ``q10`` to ``q90`` of each estimator's NRMSE over the Cramér-Rao reference."""
     errors: Columns
     """``estimator``, ``t``, and ``median``, ``q10``, ``q90`` over episodes of a sample's NRMSE."""
     reference: Columns
-    """``t`` and the ``median`` over episodes of what the Cramér-Rao reference expects."""
+    """``t`` and the ``median`` over episodes of the error expected at the Cramér-Rao reference."""
     states: States | None
     """The example episode; None without curves."""
 
 
 def games_of(contenders: Iterable[Contender], folders: Sequence[Path]) -> list[GameResults]:
-    """The games that systems are ranked under, each system's nominal ones after them.
+    """Return the results of the games in a system's ranked condition, and of nominal games after
+    them.
 
     Args:
-        contenders: in the order in which charts list them.
-        folders: where their curves lie.
+        contenders: in the order of the charts.
+        folders: folders with their curves.
 
     Raises:
         ValueError: in one line, if a file of curves is damaged.
@@ -65,7 +66,7 @@ def games_of(contenders: Iterable[Contender], folders: Sequence[Path]) -> list[G
 
 
 def _results(number: int, game: GameName, players: Players, folders: Sequence[Path]) -> GameResults:
-    found = _curves(game, players, folders)
+    own = _curves(game, players, folders)
     rows = {name: rows_of(runs) for name, runs in players.items()}
     return GameResults(
         number=number,
@@ -73,23 +74,23 @@ def _results(number: int, game: GameName, players: Players, folders: Sequence[Pa
         table=standings_table.table(game, (run for runs in players.values() for run in runs)),
         settling=settling(rows),
         ratios=ratios(rows),
-        errors=errors(found),
-        reference=reference(found.values()),
-        states=states(found),
+        errors=errors(own),
+        reference=reference(own.values()),
+        states=states(own),
     )
 
 
 def _curves(game: GameName, players: Players, folders: Sequence[Path]) -> dict[str, Curves]:
-    """Each contender's curves of the episodes that have rows."""
+    """Return each contender's curves of the episodes that have rows."""
     parts: dict[tuple[str, str], list[Curves]] = defaultdict(list)
     for folder in folders:
         for name, listed in curves.read(folder, game).items():
             parts[name] += listed
-    found = {}
+    by_contender = {}
     for name, runs in players.items():
         names = sorted((run.estimator, run.config_hash) for run in runs)
         own = [part for each in names for part in parts.get(each, [])]
         merged = curves.merged(own, {row["episode_seed"] for row in rows_of(runs)})
         if merged is not None:
-            found[name] = merged
-    return found
+            by_contender[name] = merged
+    return by_contender

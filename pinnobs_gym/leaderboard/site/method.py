@@ -1,4 +1,4 @@
-"""How scores were made: settings, training, versions, and the command that makes them anew."""
+"""Provenance of the scores: settings, training, versions, and the commands that reproduce them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pinnobs_gym.scoring.rows import Row, Stored, game_of
 
 @dataclass(frozen=True)
 class EstimatorMethod:
-    """How one estimator's scores were made."""
+    """Provenance of one estimator's scores."""
 
     estimator: str
     track: str
@@ -23,7 +23,7 @@ class EstimatorMethod:
     settings: str
     training: str
     episodes: int
-    """How many rows."""
+    """Number of rows."""
     dates: str
 
 
@@ -35,27 +35,27 @@ class FailedJob:
     game: GameName
     episodes: int
     error: str
-    """In one line."""
+    """The error in one line."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """How all scores were made."""
+    """Provenance of all scores."""
 
     estimators: tuple[EstimatorMethod, ...]
     failures: tuple[FailedJob, ...]
     versions: Mapping[str, str]
-    """Of each package."""
+    """Versions of each package."""
     commands: tuple[str, ...]
-    """Command lines that make the rows anew."""
+    """Command lines that reproduce the rows."""
     dates: str
-    """The day, or the first and the last."""
+    """The day, or the first and last day."""
     episodes: int
-    """How many rows."""
+    """Number of rows."""
 
 
 def method_of(stored: Stored, runs: Sequence[Run], contenders: Iterable[Contender]) -> Method:
-    """How stored scores were made; of the same rows are the runs, and of these the contenders."""
+    """Return the provenance of stored scores, given their runs and contenders."""
     return Method(
         estimators=tuple(map(estimator_method, contenders)),
         failures=tuple(
@@ -70,7 +70,7 @@ def method_of(stored: Stored, runs: Sequence[Run], contenders: Iterable[Contende
 
 
 def estimator_method(contender: Contender) -> EstimatorMethod:
-    """How one contender's scores were made."""
+    """Return the provenance of one contender's scores."""
     rows = rows_of(contender.runs)
     firsts = [runs[0].rows[0] for runs in contender.games.values()]
     return EstimatorMethod(
@@ -85,7 +85,7 @@ def estimator_method(contender: Contender) -> EstimatorMethod:
 
 
 def _settings(options: Mapping[str, Any]) -> str:
-    """Settings in one line, those of None left out."""
+    """Format settings in one line, without those that are None."""
     parts = []
     for name, value in options.items():
         if isinstance(value, Mapping):
@@ -96,24 +96,24 @@ def _settings(options: Mapping[str, Any]) -> str:
 
 
 def dates(rows: Sequence[Row]) -> str:
-    """The day, or the first and the last, on which the rows were made."""
+    """Return the day, or the first and last day, of the rows."""
     days = {str(row["date"])[:10] for row in rows}
     return " to ".join(sorted({min(days), max(days)}))
 
 
 def versions(rows: Iterable[Row]) -> dict[str, str]:
-    """The versions of each package that rows were made with."""
-    found: dict[str, set[str]] = {}
+    """Return the versions of each package used for the rows."""
+    by_package: dict[str, set[str]] = {}
     for versions in {tuple(row["versions"].items()) for row in rows}:
         for name, version in versions:
-            found.setdefault(name, set()).add(version)
-    return {name: ", ".join(sorted(those)) for name, those in sorted(found.items())}
+            by_package.setdefault(name, set()).add(version)
+    return {name: ", ".join(sorted(those)) for name, those in sorted(by_package.items())}
 
 
 def commands(runs: Iterable[Run]) -> list[str]:
-    """Command lines that make these runs anew: one per setup for the conditions that are played by
-    default, and one for each set of others that some systems were played under. They may make
-    more rows, since every estimator named plays every system named."""
+    """Return command lines that reproduce these runs: one per setup for the default conditions, and
+    one per set of other conditions for the systems played under it. They may produce more rows,
+    since every named estimator plays every named system."""
     usual: dict[str, list[Run]] = {}
     others: dict[tuple[str, str], list[Run]] = {}
     for run in runs:

@@ -1,4 +1,4 @@
-"""The page model: all that the page shows, computed once from stored rows and curves."""
+"""The page model: the content of the page, computed once from stored rows and curves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pinnobs_gym.scoring.rows import Stored
 from pinnobs_gym.systems import SYSTEMS
 
 SHOWN = 3
-"""How many of the best online estimators are chosen at first, besides the peer."""
+"""Number of the best online estimators that are selected initially, besides the peer."""
 
 
 @dataclass(frozen=True)
@@ -27,42 +27,42 @@ class Section:
 
     title: str
     about: str
-    """What the system is, in a sentence."""
+    """One sentence about the system."""
     games: tuple[GameResults, ...]
 
 
 @dataclass(frozen=True)
 class Page:
-    """All that the page shows."""
+    """The content of the page."""
 
     tracks: Mapping[str, str]
-    """Each estimator's track, in the order in which estimators are listed."""
+    """Track of each estimator, in display order."""
     chosen: tuple[str, ...]
-    """The estimators that are drawn over time at first."""
+    """The estimators selected initially in charts over time."""
     lines: tuple[Line, ...]
     """The overview across systems."""
     costs: Columns
-    """The overview's factors, and what estimators cost; see `across.costs`."""
+    """The overview's factors and the estimators' costs; see `across.costs`."""
     sections: tuple[Section, ...]
     factors: tuple[Factors, ...]
-    """Under each condition, of all systems and of each."""
+    """Factors under each condition, over all systems and for each system."""
     method: Method
 
 
 def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
-    """The page of stored scores.
+    """Compute the page model of stored scores.
 
     Args:
-        stored: scored episodes, at least one, and jobs that failed.
-        folders: where the curves of these rows lie.
+        stored: scored episodes, at least one, and failed jobs.
+        folders: folders with the curves of these rows.
 
     Raises:
         ValueError: in one line, if a file of curves is damaged.
     """
     runs = runs_of(stored.rows)
-    found = contenders(runs)
-    lines = ranks.lines(found)
-    listed = _listed(found, lines)
+    compared = contenders(runs)
+    lines = ranks.lines(compared)
+    listed = _listed(compared, lines)
     seconds = {contender.name: training_seconds(contender) for contender in listed}
     return Page(
         tracks={contender.name: contender.track for contender in listed},
@@ -70,32 +70,32 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
         lines=tuple(lines),
         costs=costs(lines, seconds),
         sections=tuple(_sections(games_of(listed, folders))),
-        factors=tuple(factors(found)),
+        factors=tuple(factors(compared)),
         method=method_of(stored, runs, listed),
     )
 
 
 def _listed(found: Iterable[Contender], lines: Iterable[Line]) -> list[Contender]:
-    """Contenders in the order of the overview's lines; those that it does not list come last."""
+    """Return contenders in the order of the overview's lines, with unlisted ones last."""
     by_name = {contender.name: contender for contender in found}
     order = dict.fromkeys([*(line.estimator for line in lines), *sorted(by_name)])
     return [by_name[name] for name in order]
 
 
 def _chosen(lines: Iterable[Line]) -> tuple[str, ...]:
-    """The best online estimators, and the peer."""
+    """Return the best online estimators and the peer."""
     online = [line.estimator for line in lines if line.track == "online"]
     return tuple(dict.fromkeys([*online[:SHOWN], *(name for name in online if name == PEER)]))
 
 
 def _sections(games: Iterable[GameResults]) -> list[Section]:
-    """The games by system and setup."""
+    """Group the games by system and setup."""
     known = {f"{name}-v{cls.version}": cls for name, cls in SYSTEMS.classes().items()}
-    found: dict[tuple[str, str], list[GameResults]] = {}
+    grouped: dict[tuple[str, str], list[GameResults]] = {}
     for each in games:
-        found.setdefault((each.game.system, each.game.setup), []).append(each)
+        grouped.setdefault((each.game.system, each.game.setup), []).append(each)
     sections = []
-    for (system, setup), some in found.items():
+    for (system, setup), some in grouped.items():
         cls = known.get(system)
         about = (cls.__doc__ or "").strip().partition("\n")[0] if cls else ""
         title = system if setup == "benchmark" else f"{system}, {setup}"

@@ -11,7 +11,7 @@ from pinnobs_gym.leaderboard.site.columns import QUANTILES, Columns, extend, num
 from pinnobs_gym.scoring.rows import Row
 
 STEPS = 100
-"""Most steps of a settling curve."""
+"""Largest number of steps of a settling curve."""
 
 Players = Mapping[str, Sequence[Row]]
 """Rows of one game by the contender's name."""
@@ -26,8 +26,8 @@ class _Ratios(NamedTuple):
 
 
 def settling(players: Players) -> Columns:
-    """For every estimator, at ``t`` in s, the ``share`` of its episodes that have settled by then;
-    diverged ones never have. Steps hold until the next."""
+    """Return, for every estimator, the ``share`` of its episodes that have settled by the time
+    ``t`` in s; diverged episodes never settle. Values hold until the next time."""
     times = {name: _settled(rows) for name, rows in players.items()}
     last = max([0.0, *(float(t[-1]) for t in times.values() if len(t))])
     table: Columns = {"estimator": [], "t": [], "share": []}
@@ -43,14 +43,14 @@ def settling(players: Players) -> Columns:
 
 
 def _settled(rows: Sequence[Row]) -> np.ndarray:
-    """When episodes settled, those alone that did, in ascending order."""
+    """Return the settling times of the episodes that settled, in ascending order."""
     times = [row["settling"] for row in rows if not row["diverged"]]
     return np.sort([t for t in times if np.isfinite(t)])
 
 
 def _steps(settled: np.ndarray, episodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times, the first of them 0, and the share of the episodes that have settled by then; at most
-    `STEPS` steps."""
+    """Return times, starting at 0, and the share of the episodes settled by then, in at most
+    `STEPS` steps besides the start."""
     t, first = np.unique(settled, return_index=True)
     shares = np.append(first[1:], len(settled))[: len(t)] / episodes
     if len(t) > STEPS:
@@ -62,17 +62,17 @@ def _steps(settled: np.ndarray, episodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ratios(players: Players) -> Columns:
-    """Median and quantiles ``q10`` to ``q90`` of each estimator's NRMSE over the Cramér-Rao
-    reference of the same episode, the smallest median first."""
-    found = []
+    """Return the median and quantiles ``q10`` to ``q90`` of each estimator's NRMSE over the
+    Cramér-Rao reference of the same episode, the smallest median first."""
+    spreads = []
     for name, rows in players.items():
         values = [row["reference_ratio"] for row in rows if row["reference_ratio"] is not None]
         if values:
             spread = quantiles(np.array(values)[:, None])[:, 0]
-            found.append(_Ratios(name, float(np.median(values)), spread))
-    found.sort(key=lambda each: each.median)
-    table: Columns = {"estimator": [each.estimator for each in found]}
-    table["median"] = [number(each.median) for each in found]
+            spreads.append(_Ratios(name, float(np.median(values)), spread))
+    spreads.sort(key=lambda each: each.median)
+    table: Columns = {"estimator": [each.estimator for each in spreads]}
+    table["median"] = [number(each.median) for each in spreads]
     for i, q in enumerate(QUANTILES):
-        table[f"q{100 * q:.0f}"] = [number(each.quantiles[i]) for each in found]
+        table[f"q{100 * q:.0f}"] = [number(each.quantiles[i]) for each in spreads]
     return table

@@ -12,27 +12,28 @@ from pinnobs_gym.scoring.curves import Curves
 from pinnobs_gym.scoring.thinning import kept
 
 POINTS = 120
-"""Most times that a curve is drawn at."""
+"""Largest number of times at which a curve is drawn."""
 
 
 @dataclass(frozen=True)
 class States:
-    """One episode, and what the estimators make of it."""
+    """One episode with the estimators' results."""
 
     seed: int
     names: tuple[str, ...]
-    """Of the states, with units."""
+    """Names of the states, with units."""
     limits: tuple[tuple[float, float], ...]
-    """What each state's axis shows."""
+    """Limits of each state's axis."""
     truth: Columns
-    """``t``, true states ``x0``, ...; outputs ``y0``, ... under the state that they measure."""
+    """``t``, true states ``x0``, ...; outputs ``y0``, ..., numbered by the state that they
+    measure."""
     estimates: Columns
-    """``estimator``, ``t``, estimates ``m0``, ... and two of their standard deviations ``s0``, ...,
-    gaps where it gives none."""
+    """``estimator``, ``t``, estimates ``m0``, ... and twice their standard deviations ``s0``, ...,
+    with gaps if there are none."""
 
 
 def errors(found: Mapping[str, Curves]) -> Columns:
-    """Median and 10-90 % band over episodes of each estimator's error over time."""
+    """Return the median and 10-90 % band over episodes of each estimator's error over time."""
     table: Columns = {"estimator": [], "t": [], "median": [], "q10": [], "q90": []}
     for name, own in found.items():
         k = kept(len(own.t), POINTS)
@@ -51,7 +52,7 @@ def errors(found: Mapping[str, Curves]) -> Columns:
 
 
 def reference(found: Iterable[Curves]) -> Columns:
-    """Median over all episodes of the error at the Cramér-Rao reference."""
+    """Return the median over all episodes of the error at the Cramér-Rao reference."""
     episodes: dict[int, np.ndarray] = {}
     t = np.empty(0)
     for own in found:
@@ -69,7 +70,8 @@ def reference(found: Iterable[Curves]) -> Columns:
 
 
 def states(found: Mapping[str, Curves]) -> States | None:
-    """The first episode that most estimators have as their example; None without curves."""
+    """Return the example episode that most estimators share, of the lowest seed in a tie; None
+    without curves."""
     seeds = [own.example.seed for own in found.values()]
     if not seeds:
         return None
@@ -86,7 +88,7 @@ def states(found: Mapping[str, Curves]) -> States | None:
 
 
 def _truth(own: Curves) -> Columns:
-    """`States.truth` of an example."""
+    """Return `States.truth` of an example."""
     x, y = own.example.x, own.example.y
     table: Columns = {"t": numbers(own.example.t)}
     table |= {f"x{i}": numbers(x[:, i]) for i in range(x.shape[1])}
@@ -94,7 +96,7 @@ def _truth(own: Curves) -> Columns:
 
 
 def _estimates(shown: Mapping[str, Curves]) -> Columns:
-    """`States.estimates` of everyone's example."""
+    """Return `States.estimates` of all examples."""
     nx = next(iter(shown.values())).example.x.shape[1]
     table: Columns = {"estimator": [], "t": []}
     table |= {f"{part}{i}": [] for i in range(nx) for part in ("m", "s")}
@@ -107,7 +109,7 @@ def _estimates(shown: Mapping[str, Curves]) -> Columns:
 
 
 def _limits(x: np.ndarray) -> tuple[float, float]:
-    """The range of a state with a margin."""
+    """Return the range of a state with a margin."""
     low, high = float(x.min()), float(x.max())
     margin = 0.15 * (high - low) + 1e-9 * max(abs(low), abs(high), 1.0)
     return low - margin, high + margin

@@ -18,12 +18,12 @@ from pinnobs_gym.leaderboard.site.charts import (
 )
 
 HEIGHT = 300
-"""Of a chart over time, in pixels."""
+"""Height of a chart over time, in pixels."""
 
 
 def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
-    """Error over time up to ``end`` (s), on an axis from low to high: medians and bands of the
-    estimators chosen, over the medians of all others, and the Cramér-Rao reference."""
+    """Chart the error over time up to ``end`` (s), on an axis from low to high: medians and bands
+    of the selected estimators, over the medians of all others, and the Cramér-Rao reference."""
     scale, axis = log_scale(low, high), log_axis(low, high)
     y = alt.Y("shown_median:Q", scale=scale, title="NRMSE of a sample", axis=axis)
     base = (
@@ -60,7 +60,7 @@ def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
 
 
 def settling(styled: Styled, end: float) -> Spec:
-    """Share of episodes settled against time up to ``end`` (s)."""
+    """Chart the share of settled episodes against time up to ``end`` (s)."""
     axis = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
     y = alt.Y("share:Q", scale=alt.Scale(domain=[0, 1]), title="episodes settled", axis=axis)
     base = named("settling").encode(x=time_of(end), y=y)
@@ -80,8 +80,9 @@ def settling(styled: Styled, end: float) -> Spec:
 def state(
     styled: Styled, index: int, title: str, end: float, limits: tuple[float, float], measured: bool
 ) -> Spec:
-    """One state of the example episode within its limits, and what the selected estimator makes of
-    it; dots are an output that measures it alone. The page can set until when (s) it is drawn."""
+    """Chart one state of the example episode within its limits, with the selected estimator's
+    estimate. Dots are an output that directly measures the state. The page can set the end (s) of
+    the time axis."""
     scale = alt.Scale(domain=list(limits), nice=False, clamp=True)
     until = alt.Scale(domainMin=0, domainMax=alt.ExprRef(expr="until"), nice=False)
     x = alt.X("t:Q", scale=until, axis=alt.Axis(tickCount=6), title="t (s)")

@@ -1,4 +1,4 @@
-"""The page itself: its model and charts put into the template, all in one file."""
+"""Rendering of the page: its model and charts in the template, in one file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pinnobs_gym.simulation.conditions import CONDITIONS
 
 
 def draw(page: Page) -> str:
-    """The page as HTML; nothing is computed from rows here."""
+    """Render the page as HTML; computes nothing from rows."""
     drawn = styles(list(page.tracks))
     charts = charts_of(page, drawn)
     environment = jinja2.Environment(
@@ -47,13 +47,13 @@ def draw(page: Page) -> str:
 
 @dataclass(frozen=True)
 class HeatCell:
-    """A factor to the peer."""
+    """The factor of one estimator to the peer."""
 
     text: str
     side: str
     """``better`` or ``worse`` than the peer, or ``none`` if there is no factor."""
     depth: float
-    """From 0 to 1 how strongly it is coloured."""
+    """Colour intensity from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -62,20 +62,20 @@ class HeatLine:
 
     condition: str
     about: str
-    """What the condition is."""
+    """Description of the condition."""
     cells: tuple[HeatCell, ...]
 
 
 @dataclass(frozen=True)
 class Heat:
-    """The table of factors of one system, or of all."""
+    """The table of factors of one system, or of all systems."""
 
     name: str
     names: Sequence[str]
-    """Of the estimators."""
+    """Names of the estimators."""
     lines: tuple[HeatLine, ...]
     worst: Sequence[int]
-    """The worst rank of each."""
+    """Worst rank of each estimator."""
 
 
 def _heat(factors: Factors) -> Heat:
@@ -91,7 +91,7 @@ def _line(factors: Factors, condition: str) -> HeatLine:
 
 
 def _cell(value: float | None) -> HeatCell:
-    """The cell of a factor's logarithm, fully coloured from a factor of four on."""
+    """Return the cell of a factor's logarithm; factors of four and more have full colour."""
     if value is None:
         return HeatCell("", "none", 0.0)
     with np.errstate(over="ignore"):
@@ -101,17 +101,17 @@ def _cell(value: float | None) -> HeatCell:
 
 
 def _marked(text: str) -> Markup:
-    """Text whose parts in backticks are code."""
+    """Convert parts in backticks to code elements."""
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _anchor(title: str) -> str:
-    """The id of the section of that title."""
+    """Return the id of the section with that title."""
     return re.sub(r"\W+", "-", title)
 
 
 def _bundle() -> str:
-    """Vega-Lite and all that it needs, to stand in a script element."""
+    """Return Vega-Lite with its dependencies, escaped for a script element."""
     version = alt.SCHEMA_VERSION.removeprefix("v").rpartition(".")[0]
     if version not in vl_convert.get_vegalite_versions():
         version = vl_convert.get_vegalite_versions()[-1]
@@ -120,6 +120,6 @@ def _bundle() -> str:
 
 
 def _text(name: str) -> str:
-    """A file that lies beside this one."""
+    """Read a file from this module's folder."""
     folder = resources.files("pinnobs_gym.leaderboard.site")
     return folder.joinpath(name).read_text(encoding="utf-8")

@@ -46,7 +46,7 @@ class Suite:
     """If empty, nominal and the system's ranked condition. With "all", estimators that need no
     training also play every other condition that applies to the system."""
     setup: str = "benchmark"
-    """Setup that is played."""
+    """Setup to play."""
     episodes: int = 100
     """Episodes of each estimator and system."""
     trained_episodes: int = 5

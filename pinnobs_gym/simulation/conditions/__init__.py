@@ -1,4 +1,4 @@
-"""Conditions: ways in which an episode departs from what its setup says."""
+"""Conditions: changes of an episode relative to its setup."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from pinnobs_gym.simulation.system import Setup, System
 
 @dataclass(frozen=True)
 class Combined(Condition):
-    """Several conditions at once, applied in order."""
+    """Several conditions together, applied in order."""
 
     parts: tuple[Condition, ...]
 
     @property
     def known_to_estimators(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What is told of the parts."""
+        """What estimators know of the parts."""
         known = dict.fromkeys(part.known_to_estimators for part in self.parts)
         return ", ".join(what for what in known if what != "nothing")
 
     @property
     def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """If it is with all parts."""
+        """Whether the Cramér-Rao reference applies under every part."""
         return all(part.reference for part in self.parts)
 
     @property
@@ -83,15 +83,16 @@ CONDITIONS: dict[str, Condition] = {
     **{f"dropout{percent}": Dropouts(percent / 100) for percent in (10, 30, 50)},
     "gap": Gap(),
 }
-"""The conditions by name, in the order in which they act; ``a+b`` is both."""
+"""The conditions by name, in the order in which they are applied; ``a+b`` combines two."""
 
 
 def canonical_name(name: str) -> str:
-    """The one name of a condition: its parts in the order in which they act, whichever order they
-    are named in, and ``nominal`` only alone.
+    """Return the canonical name of a condition: its parts in the order in which they are applied,
+    with ``nominal`` only on its own.
 
     Raises:
-        ValueError: listing the known ones, if one is unknown; naming two of one kind.
+        ValueError: listing the known conditions, if a part is unknown; naming the parts, if two are
+            of the same kind.
     """
     named = name.split("+")
     for part in named:
@@ -107,7 +108,7 @@ def canonical_name(name: str) -> str:
 
 
 def parse_condition(name: str) -> Condition:
-    """The condition of that name, or several joined by ``+``, in whichever order they are named.
+    """Return the condition of that name, or of several names joined by ``+`` in any order.
 
     Raises:
         ValueError: as `canonical_name` does.
@@ -117,7 +118,7 @@ def parse_condition(name: str) -> Condition:
 
 
 def fitting(system: System, setup: Setup) -> list[str]:
-    """The names of all conditions that a system can be played under in a setup."""
+    """Return the names of all conditions that apply to a system in a setup."""
     names = []
     for name, condition in CONDITIONS.items():
         try:

@@ -1,4 +1,4 @@
-"""Conditions of the outputs: other noise, other times, lost or late samples."""
+"""Conditions of the measurement: output noise, sample time, missing or late samples."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pinnobs_gym.simulation.system import Setup, System
 
 @dataclass(frozen=True)
 class Noise(Condition):
-    """Output noise of another strength, times that of `noise_scale`."""
+    """Output noise multiplied by a factor, relative to `noise_scale`."""
 
     factor: float
     known_to_estimators = "its strength"
 
     @property
     def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Not without noise, where it is zero."""
+        """False without output noise."""
         return self.factor > 0
 
     @property
@@ -34,7 +34,7 @@ class Noise(Condition):
 
 @dataclass(frozen=True)
 class SampleTime(Condition):
-    """Another time between samples, in episodes as long as before."""
+    """Time between samples multiplied by a factor, with the duration unchanged."""
 
     factor: float
     known_to_estimators = "the sample times"
@@ -49,7 +49,8 @@ class SampleTime(Condition):
 
 @dataclass(frozen=True)
 class Outliers(Condition):
-    """Some samples off by a Gaussian error many times the noise of `noise_scale`."""
+    """Some outputs disturbed by a Gaussian error many times larger than the noise of
+    `noise_scale`."""
 
     probability: float
     strength: float
@@ -69,8 +70,8 @@ class Outliers(Condition):
 
 @dataclass(frozen=True)
 class Delay(Condition):
-    """Outputs that arrive some samples late: at sample k stands y of k − d, and nothing in the
-    first d. Nothing else is late."""
+    """Outputs delayed by d samples: sample k holds the output of sample k − d, and the first d
+    samples are missing. Inputs are not delayed."""
 
     samples: int
     reference = False
@@ -94,7 +95,7 @@ class Delay(Condition):
 
 @dataclass(frozen=True)
 class Dropouts(Condition):
-    """Samples missing at random, each with the same probability."""
+    """Outputs missing at random, each with the same probability."""
 
     probability: float
     known_to_estimators = "which are missing"
@@ -111,8 +112,8 @@ class Dropouts(Condition):
 
 @dataclass(frozen=True)
 class Gap(Condition):
-    """A time without outputs, anywhere in the episode: 1 s, or a fifth of episodes that are shorter
-    than 5 s."""
+    """An interval without outputs at a random time of the episode: 1 s long, or a fifth of an
+    episode shorter than 5 s."""
 
     seconds: float = 1.0
     largest_part: float = 0.2

@@ -1,4 +1,4 @@
-"""Conditions of the plant: it is not the model."""
+"""Conditions of the plant: it differs from the model."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pinnobs_gym.simulation.system import Array, System, vector
 
 @dataclass(frozen=True)
 class Mismatch(Condition):
-    """A plant that is not the model: each of its parameters off by the same part, its sign drawn
-    per parameter and episode.
+    """A plant whose parameters each differ from the model's by the same fraction, with a random
+    sign per parameter and episode.
 
-    Which parameters, `System.uncertain` says. Of a plant without any the rates of change are off:
-    ẋᵢ = (1 ± part)·fᵢ.
+    `System.uncertain` selects the parameters. If there are none, the rates of change are changed
+    instead: ẋᵢ = (1 ± fraction)·fᵢ.
     """
 
     part: float
@@ -43,21 +43,21 @@ class Mismatch(Condition):
 
 @dataclass(frozen=True)
 class OtherRates(System):
-    """A plant that moves as another one does, each state at a rate of its own."""
+    """A plant with the rate of change of each state multiplied by a factor."""
 
     plant: System
-    """The other."""
+    """The original plant."""
     factors: np.ndarray
-    """What its rates of change are multiplied with, shape (batch, nx)."""
+    """Factor of each rate of change, shape (batch, nx)."""
 
     @property
     def state_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the other's."""
+        """Names of the original plant's states."""
         return self.plant.state_names
 
     @property
     def scale(self) -> tuple[float, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the other's."""
+        """Scale of the original plant's states."""
         return self.plant.scale
 
     def f(self, t: Array, x: Array, u: Array) -> Array:
@@ -75,7 +75,7 @@ class OtherRates(System):
 
 @dataclass(frozen=True)
 class LoadStep(Condition):
-    """The load torque of a motor steps at 0.6 s to a value uniform in 0 to 40 N·m."""
+    """A step of a motor's load torque at 0.6 s to a value uniform in 0 to 40 N·m."""
 
     time: float = 0.6
     highest: float = 40.0
@@ -98,8 +98,8 @@ class LoadStep(Condition):
 
 @dataclass(frozen=True)
 class ProcessNoise(Condition):
-    """White Gaussian noise added to the state at every sample after the first, of the same part of
-    each state's scale."""
+    """White Gaussian noise added to the state at every sample after the first, with a standard
+    deviation that is the same fraction of each state's scale."""
 
     part: float
 

@@ -1,4 +1,4 @@
-"""Conditions of the start: another initial state or another guess of it."""
+"""Conditions of the start: another initial state or another initial estimate."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pinnobs_gym.simulation.system import Setup, System, vector
 
 @dataclass(frozen=True)
 class FarGuess(Condition):
-    """An initial estimate that is further away: each of its components moved by one standard
-    deviation of the prior away from the middle of the initial set. P₀ stays."""
+    """An initial estimate further away: each component is moved by one prior standard deviation
+    away from the middle of the initial set. P₀ is unchanged."""
 
     reference = False
     known_to_estimators = "x̂₀"
@@ -34,8 +34,8 @@ class FarGuess(Condition):
 
 @dataclass(frozen=True)
 class OutsideSet(Condition):
-    """Initial states outside the setup's set: states of the set times a factor, where that leads
-    out of it."""
+    """Initial states outside the setup's set: states of the set times a factor, of which only those
+    outside the set are used."""
 
     factor: float = 1.5
     reference = False
