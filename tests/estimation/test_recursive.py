@@ -1,0 +1,46 @@
+"""An estimator in two steps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from linear import H, Linear, linear_record, runge_kutta_matrix
+
+from pinnobs_gym.estimation.checks import check_estimator
+from pinnobs_gym.estimation.estimator import State
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.simulation.model import model_step
+
+L = np.array([[0.4, 0.1], [-0.2, 0.3]])
+
+
+@dataclass(frozen=True)
+class ConstantGain(RecursiveEstimator):
+    """x̂ = x̂⁻ + L(y − h), of which a missing output is left out."""
+
+    def reset(self, prior):
+        return State(prior.mean)
+
+    def predict(self, state, t, u):
+        xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
+        return State(xhat, state.t, state.u)
+
+    def correct(self, state, t, y, u):
+        innovation = np.where(np.isnan(y), 0.0, y - self.system.h(t, state.xhat, u))
+        return State(state.xhat + innovation @ L.T, t, u)
+
+
+def test_the_first_sample_corrects_the_prior_and_each_other_a_prediction():
+    record = linear_record()
+    record.y[1, 3] = np.nan
+    F, xhat, expected = runge_kutta_matrix(0.1), record.prior.mean, []
+    for k in range(record.num_samples):
+        if k:
+            xhat = xhat @ F.T
+        xhat = xhat + np.nan_to_num(record.y[:, k] - xhat @ H.T) @ L.T
+        expected.append(xhat)
+    found = ConstantGain(Linear()).run(record).xhat
+    np.testing.assert_allclose(found, np.stack(expected, axis=1), rtol=1e-12)
+
+
+def test_it_conforms():
+    check_estimator(ConstantGain(Linear()))
