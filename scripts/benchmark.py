@@ -1,12 +1,12 @@
-"""Measured figures, one JSON line each: group, figure, value, unit, asked, holds, date.
+"""Print measured figures, one JSON line each: group, figure, value, unit, asked, holds, date.
 
     python scripts/benchmark.py [core ...] [--repeats 5] >> runs/benchmark.jsonl
 
-`scripts/readme.py` makes tables of such a file, the last line of a figure counting.
+`scripts/readme.py` makes tables from such a file, with the last line of each figure.
 
-Speeds are ratios to a named peer, taken side by side in one run: one thread, CPU time, the median
-of the repeats. Nothing here is a test: a figure that does not hold is printed as it is. A group is
-a module of the folder ``benchmarks``.
+Speeds are ratios to a named peer, measured alternately in one run: one thread, CPU time, the median
+of the repeats. Figures that miss their bound are printed like the others; this is not a test. A
+group is a module of the folder ``benchmarks``.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ GROUPS = sorted(module.name for module in pkgutil.iter_modules(benchmarks.__path
 
 
 def main(groups: Annotated[tuple[str, ...], tyro.conf.Positional] = (), repeats: int = 5) -> int:
-    """Print the figures of groups.
+    """Print the figures of some groups.
 
     Args:
-        groups: which; all if none is named.
-        repeats: how often each ratio is taken.
+        groups: names of the groups; all if none is named.
+        repeats: number of measurements of each ratio.
     """
     for name in groups:
         if name not in GROUPS:

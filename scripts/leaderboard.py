@@ -1,6 +1,6 @@
-"""The main job: every estimator on every system, with tables at the end.
+"""Score every estimator on every system, and write the tables.
 
-The same as `pinnobs leaderboard`, whose options it takes.
+This is `pinnobs leaderboard`, with the same options.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""What figures were measured on."""
+"""Facts about the machine of the measurements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def processor() -> str:
-    """What the machine calls its processor."""
+    """Return the name of the machine's processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))

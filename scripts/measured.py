@@ -1,4 +1,4 @@
-"""What `benchmark.py` printed, as tables."""
+"""Tables of the figures printed by `benchmark.py`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ HEADER = ("figure", "measured", "asked")
 
 
 def read(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """The figures of a file by group, in the file's order; the last line of each counts."""
+    """Read the figures of a file by group, with the last line of each figure."""
     if not path.exists():
         return {}
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+    figures: dict[tuple[str, str], dict[str, Any]] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         figure = json.loads(line)
-        found[figure["group"], figure["figure"]] = figure
+        figures[figure["group"], figure["figure"]] = figure
     groups: dict[str, list[dict[str, Any]]] = {}
-    for (group, _), figure in found.items():
+    for (group, _), figure in figures.items():
         groups.setdefault(group, []).append(figure)
     return dict(sorted(groups.items()))
 
 
 def cells(figures: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
-    """A line per figure: what it is, its value, and what is asked of it."""
+    """Return the rows of a table: each figure's name, its value and its bound."""
     shown = []
     for figure in figures:
         missed = " **missed**" if figure["holds"] is False else ""
@@ -41,7 +41,7 @@ def cells(figures: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
 
 
 def page(groups: dict[str, list[dict[str, Any]]]) -> str:
-    """All figures as one page of Markdown."""
+    """Return all figures as a page of Markdown."""
     parts = ["# Measured figures", _intro(groups)]
     for group, figures in groups.items():
         what = (_module(group).__doc__ or "").strip()
@@ -50,8 +50,8 @@ def page(groups: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def readme_section(groups: dict[str, list[dict[str, Any]]]) -> str:
-    """How many figures hold and which do not, and the tables that groups have for the README
-    (``readme_table`` of their module)."""
+    """Return the README's section: a summary of the bounds that hold and those that are missed, and
+    the tables of the groups that have a ``readme_table``."""
     lines, tables = [], []
     for group, figures in groups.items():
         asked = [figure for figure in figures if figure["holds"] is not None]

@@ -1,12 +1,12 @@
-"""Make the README's picture and tables from stored scores.
+"""Update the README's picture and tables from stored scores.
 
     python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
         [--conditions-file runs/conditions/rows.jsonl]
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
         [--figures-file runs/benchmark.jsonl]
 
-All measured figures go to docs/benchmarks.md, the README gets a summary of them. What has no stored
-scores stays as it is.
+All measured figures go to docs/benchmarks.md, and a summary of them to the README. Sections without
+stored scores are left unchanged.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ CONDITIONS_HEADING = "### Under every condition"
 COMPARISON_HEADING = "### Beside the learned observers"
 FIGURES_HEADING = "## Measured figures"
 BEFORE = "## Development"
-"""The heading before which a section goes that is not there yet."""
+"""Heading before which new sections are inserted."""
 
 
 def picture(path: Path, seed: int = 3) -> None:
-    """Draw the EKF on one episode of ReverseDuffing."""
+    """Draw the EKF's estimates of one episode of ReverseDuffing."""
     source = EpisodeSource("ReverseDuffing")
     episodes = source.play(source.draw([Stream(np.random.SeedSequence(seed))]))
     record = source.record(episodes)
@@ -65,22 +65,22 @@ def picture(path: Path, seed: int = 3) -> None:
 
 
 def summary(scored: list[rows.Row]) -> str:
-    """A line per estimator across the systems, and the table of ranks if there is one."""
+    """Return the table of estimators across the systems, and the table of ranks if there is one."""
     date = datetime.now(UTC).date().isoformat()
     intro = (
         f"Measured on {date} with Python {platform.python_version()}, one thread a job "
         f"({processor()}), by `make leaderboard`, which writes the details of each system to "
         "`runs/leaderboard/leaderboard.md`."
     )
-    found = board(rows.Stored(scored, []))
-    parts = [intro, ranks_table.NOTE, markdown_table(*ranks_table.cells(found.lines))]
-    if len(found.ranks) > 2:
-        parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(found.ranks))]
+    standings = board(rows.Stored(scored, []))
+    parts = [intro, ranks_table.NOTE, markdown_table(*ranks_table.cells(standings.lines))]
+    if len(standings.ranks) > 2:
+        parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(standings.ranks))]
     return "\n\n".join(parts)
 
 
 def under_conditions(scored: list[rows.Row]) -> str:
-    """The table of ranks under every condition."""
+    """Return the table of ranks under every condition."""
     episodes = len({row["episode_seed"] for row in scored})
     intro = (
         "Estimators that need no training under every condition, by `pinnobs leaderboard "
@@ -92,8 +92,10 @@ def under_conditions(scored: list[rows.Row]) -> str:
 
 
 def replaced(text: str, name: str, content: str, heading: str) -> str:
-    """The text with the content between the marks of that name; under the heading, before that of
-    development, if they are not there yet."""
+    """Replace the content between the marks of a name.
+
+    If the text has no such marks, they are inserted, under the heading, before `BEFORE`.
+    """
     start = f"<!-- {name}: written by scripts/readme.py -->"
     if start not in text:
         text = text.replace(BEFORE, f"{heading}\n\n{start}\n{END}\n\n{BEFORE}", 1)
@@ -116,7 +118,7 @@ def main(
         paper_file: the results of reproduce_paper.py.
         conditions_file: scores under every condition.
         comparison_file: the table that reproduce_paper.py comparison wrote.
-        figures_file: what benchmark.py printed.
+        figures_file: output of benchmark.py.
     """
     scored = rows.read(rows_file)
     section = paper.readme_section(paper.read(paper_file), TABLES.values())

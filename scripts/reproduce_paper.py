@@ -1,11 +1,11 @@
-"""Make the paper's tables and examples anew, its figures beside ours.
+"""Reproduce the paper's tables and examples, with the paper's figures beside ours.
 
     python scripts/reproduce_paper.py depth | activation | weights | examples | comparison
 
-Each case is trained once and kept, whichever table asks for it: what is there is not run again, and
-a training that was stopped, or that is given a larger budget, goes on from its checkpoint. Results
-are lines of ``results.jsonl`` in the folder, beside a Markdown file of each table and a folder of
-each training with its pictures, its TensorBoard log and the trained file.
+Each case is trained once, even if several tables have it. Existing results are reused; a training
+that was stopped, or that gets a larger budget, is resumed from its checkpoint. The output folder
+has the results as lines of ``results.jsonl``, a Markdown file per table, and a folder per training
+with its figures, TensorBoard log and trained file.
 """
 
 from __future__ import annotations
@@ -35,38 +35,37 @@ from pinnobs_gym.files import append_lines, check_writable, replacing
 from pinnobs_gym.scoring.rows import Row
 
 COMPARISON = "comparison"
-"""The table that is none of `TABLES`: its methods are several."""
+"""Name of the table of several methods, which is not in `TABLES`."""
 
 console = Console() if Console().is_terminal else Console(width=150)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Make one of the paper's tables anew, its figures beside ours."""
+    """Reproduce one of the paper's tables, with the paper's figures beside ours."""
 
     table: Annotated[str, tyro.conf.Positional]
-    """depth, activation, weights, examples, which are the six systems, or comparison, of four
-    methods."""
+    """depth, activation, weights, examples (the six systems), or comparison (of four methods)."""
     preset: str = "fast"
-    """Recipe: fast, or the paper's own, paper."""
+    """Recipe: fast, or paper."""
     budget: str = "120"
-    """CPU seconds that each training is given; none trains to the recipe's end."""
+    """CPU seconds of each training; none trains to the recipe's end."""
     seed: int = 0
-    """Seed of the first weights."""
+    """Seed of the initial weights."""
     jobs: int = 2
-    """Trainings at a time, one thread each."""
+    """Number of trainings in parallel, one thread each."""
     records: int = 10
-    """Records that the methods are compared on."""
+    """Number of records of the comparison."""
     only: tuple[str, ...] = ()
     """Names of cases, such as 9x20; all if none is named."""
     out: Path = Path("runs/paper")
-    """Folder of results."""
+    """Folder of the results."""
 
     def chosen(self) -> list[Job]:
-        """The jobs asked for.
+        """Return the jobs of the table.
 
         Raises:
-            ValueError: in one line, for a case or setting that cannot be.
+            ValueError: in one line, if a case is unknown or a setting is not allowed.
         """
         if self.table not in TABLES:
             known = ", ".join([*TABLES, COMPARISON])
@@ -85,10 +84,10 @@ class Options:
         return [Job(case, self.preset, config, self.out) for case, config in chosen]
 
     def compared(self) -> Comparison:
-        """The comparison asked for.
+        """Return the comparison.
 
         Raises:
-            ValueError: in one line, for a setting that cannot be.
+            ValueError: in one line, if a setting is not allowed.
         """
         if self.records < 1:
             raise ValueError(f"records={self.records}; expected at least 1")
@@ -108,17 +107,19 @@ def _number(budget: str) -> float | None:
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Row | str]]:
-    """Run jobs, one thread each, and yield each as it ends with its row or what went wrong. A
-    single one shows its own progress."""
+    """Run jobs, one thread each, and yield each with its row or error message as it ends.
+
+    A single job shows its own progress bar.
+    """
     if len(jobs) == 1 or processes == 1:
         for job in jobs:
             yield _attempt(job, progress=len(jobs) == 1)
         return
-    pool = ProcessPoolExecutor(processes)  # which inherit the environment set above
+    pool = ProcessPoolExecutor(processes)  # workers inherit the environment set above
     try:
         for ended in as_completed([pool.submit(_attempt, job) for job in jobs]):
             yield ended.result()
-    finally:  # after Ctrl-C jobs still run
+    finally:  # after Ctrl-C some jobs are still running
         pool.shutdown(kill_workers=True)
 
 
@@ -130,20 +131,20 @@ def _attempt(job: Job, progress: bool = False) -> tuple[Job, Row | str]:
 
 
 def work(jobs: Sequence[Job], processes: int, results: Path) -> int:
-    """Run jobs, keep the row of each as it ends, and say so; returns how many failed."""
+    """Run jobs, store and report the row of each as it ends; return the number of failures."""
     failed = 0
     columns = (SpinnerColumn(), TextColumn("cases"), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=len(jobs) == 1) as bar:
         task = bar.add_task("", total=len(jobs))
-        for job, found in run_jobs(jobs, processes):
-            if isinstance(found, str):
+        for job, row in run_jobs(jobs, processes):
+            if isinstance(row, str):
                 failed += 1
-                console.print(f"{job.case.name} failed: {found}", style="red", markup=False)
+                console.print(f"{job.case.name} failed: {row}", style="red", markup=False)
             else:
-                append_lines(results, [found])
-                figures = f"RMSE {found['rmse']:.4g}, loss {found['loss']:.3g}"
+                append_lines(results, [row])
+                figures = f"RMSE {row['rmse']:.4g}, loss {row['loss']:.3g}"
                 console.print(
-                    f"{job.case.name}: {figures}, {found['seconds']:.0f} CPU s; {job.folder}"
+                    f"{job.case.name}: {figures}, {row['seconds']:.0f} CPU s; {job.folder}"
                 )
             bar.advance(task)
     return failed
@@ -169,7 +170,7 @@ def show(table: Table, rows: Sequence[Row], path: Path) -> None:
 
 
 def reproduce(options: Options) -> int:
-    """Run what is missing and show the table; returns the exit status."""
+    """Run the missing cases and show the table; return the exit status."""
     jobs, results = options.chosen(), options.out / "results.jsonl"
     check_writable(options.out)
     known = report.read(results)
@@ -187,7 +188,7 @@ def reproduce(options: Options) -> int:
 
 
 def compare(options: Options) -> int:
-    """Run what is missing of the comparison and show its table; returns the exit status."""
+    """Run the missing cases of the comparison and show its table; return the exit status."""
     chosen, results = options.compared(), options.out / "comparison.jsonl"
     check_writable(options.out)
     status = 0
@@ -214,7 +215,8 @@ def compare(options: Options) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status: 0, 1 if a case failed, 2 for bad input."""
+    """Run the command; return its exit status: 0, 1 if a case failed, 2 for invalid input, 130
+    after Ctrl-C."""
     try:
         options = tyro.cli(Options, args=arguments)
         return (compare if options.table == COMPARISON else reproduce)(options)

@@ -1,11 +1,11 @@
-"""Train agents with Stable-Baselines3 on systems, score them beside the EKF and the model alone.
+"""Train agents with Stable-Baselines3, and score them beside the EKF and the open-loop model.
 
     python scripts/train_rl.py --system ReverseDuffing
     python scripts/train_rl.py --system all --seeds 3 --budget 600
 
-Each agent is trained on episodes of seeds from 1,000,000 on and scored on those of 0 to 99. Trained
-files, checkpoints, rows and TensorBoard's log go to one folder. Stop it at any time; run again, it
-goes on.
+Each agent is trained on episodes with seeds from 1,000,000 on, and scored on those with seeds 0 to
+99. Trained files, checkpoints, rows and TensorBoard logs go to one folder. If it is stopped, the
+same command resumes it.
 """
 
 from __future__ import annotations
@@ -43,22 +43,22 @@ class Main:
     system: str = "ReverseDuffing"
     """Name or module:Class of a system, or ``all``."""
     seeds: int = 1
-    """Agents of each system, of the first seed and those after it."""
+    """Number of agents per system, with consecutive seeds."""
     episodes: int = 100
-    """Episodes that each is scored on."""
+    """Number of episodes on which each agent is scored."""
     algorithm: str = "ppo"
     """Preset of the trainer, such as ppo, sac or ppo_normalized."""
     seed: int = 0
     """Seed of the first agent."""
     steps: int = 300_000
-    """Steps of each training."""
+    """Number of steps of each training."""
     budget: float | None = None
     """CPU seconds of each training."""
     out: Path = Path("runs/rl")
-    """Folder of everything that is written."""
+    """Folder of the output."""
 
     def run(self) -> None:
-        """Train and score, printing a line each."""
+        """Train and score all agents, and print a line for each."""
         check_writable(self.out)
         names = list(SYSTEMS.classes()) if self.system == "all" else [self.system]
         print(f"{'system':20} {'estimator':22} {'tail NRMSE':>10} {'NRMSE':>10} {'diverged':>9}")
@@ -69,7 +69,7 @@ class Main:
                 self._score(name, self._trained(name, seed), f"{self.algorithm}, seed {seed}")
 
     def _trained(self, name: str, seed: int) -> BaseEstimator:
-        """The agent, trained unless its file is there."""
+        """Load an agent, after training it if its file does not exist."""
         changes = {"seed": seed, "steps": self.steps, "budget": self.budget}
         config = RLTrainer.configured({"preset": self.algorithm, **changes})
         game = Game.of(name)
@@ -87,9 +87,9 @@ class Main:
                     progress=sys.stdout.isatty(),
                 )
             trained.save(path)
-        made = Sb3.load(path, game.source.system)
-        check_same(path, made.trained.config, plain(asdict(config)))
-        return made
+        estimator = Sb3.load(path, game.source.system)
+        check_same(path, estimator.trained.config, plain(asdict(config)))
+        return estimator
 
     def _score(self, name: str, estimator: BaseEstimator | str, label: str) -> None:
         results = self.out / "rows.jsonl"

@@ -1,5 +1,9 @@
-"""Trainers of learned estimators, a module or package each: a Config, whose ``episodes`` says how
-many episodes the training takes, and `train`. One whose Config says 0 plays its own; see
-`pinnobs_gym.training.by_name.train`. If there is more to see of what `train` returns than its
-estimates, there is ``figures(system, trained, record)``, too: pictures by name. A module without
-both a Config and `train` is no trainer."""
+"""Trainers of learned estimators.
+
+A trainer is a subclass of `pinnobs_gym.training.trainer.Trainer` that assigns ``name``, in a module
+of this package or in the ``__init__`` of a subpackage; the registry finds it by that name. Its
+settings are a Config, a subclass of `pinnobs_gym.training.settings.TrainingConfig`, whose
+``records`` gives the number of recorded episodes to train on; 0 means that the trainer plays
+episodes itself. `pinnobs_gym.training.by_name.train_by_name` runs a training. Modules without such
+a class hold code that trainers share.
+"""

@@ -1,9 +1,9 @@
 """A KKL observer fitted to the equation of T alone (Peralez & Nadri, "Deep learning-based
 Luenberger observer design for discrete-time nonlinear systems", CDC 2021).
 
-T is fitted to T(x_{k+m}) = Φᵐ T(x_k) + what the outputs in between add, over m samples; then T*,
-with T as it is, to T*(z) = x at the z that T says occur online. No z is simulated for x to be
-paired with.
+T is fitted to T(x_{k+m}) = Φᵐ T(x_k) + w, where w is the response of z to the outputs over the m
+samples. Then T* is fitted to T*(z) = x at the z computed from the trained T. No pairs of x and
+simulated z are used.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from trainers.kkl.trainer import KKLTrainer
 
 @dataclass(frozen=True)
 class KKLAutoencoderConfig(KKLConfig):
-    """The recipe of an unsupervised KKL observer."""
+    """Settings of the unsupervised KKL observer."""
 
     horizon: float = 3.0
-    """The time m samples take, over z's slowest time constant; one sample at least."""
+    """Duration of the m samples over z's slowest time constant; m is at least 1."""
     samples: int = 300
-    """Samples of each that are kept."""
+    """Number of samples kept of each episode."""
     share: float = 1.0
-    """Steps for T over those for T*; so for their CPU time if there is a budget."""
+    """Steps for T over steps for T*, and CPU time likewise if there is a budget."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -44,26 +44,26 @@ def faithful() -> KKLAutoencoderConfig:
 
 
 class KKLAutoencoderTrainer(KKLTrainer[KKLAutoencoderConfig]):
-    """Fits T to its own equation over several samples, and T* to T."""
+    """Fit T to its own equation over several samples, and T* to the trained T."""
 
     name = "kkl_autoencoder"
     presets = {"default": KKLAutoencoderConfig, "faithful": faithful}
     labelled = False
 
     def gap(self) -> int:
-        """m, the samples of the residual: at most half of those that there are."""
+        """Return m, the number of samples of the equation; at most half of an episode's."""
         slowest = self.config.dynamics(self.system).slowest
         interval = float(np.diff(self.record.t).mean())
         count = round(self.config.horizon / slowest / interval)
         return min(max(1, count), self.record.num_samples // 2)
 
     def encoding(self, samples: Samples) -> Objective:
-        """T(x_{k+m}) = Φᵐ T(x_k) + what the outputs between the two add to z."""
+        """Return the equations T(x_{k+m}) − Φᵐ T(x_k) = w at random pairs of samples."""
         data, scaling = samples.data, samples.z_scaling
         pairs = samples.pairs()
         root = np.linalg.inv(scaling.root)
         flows, driven = [], []
-        for a, b in pairs:
+        for a, b in pairs:  # Φᵐ and w of each pair, in scaled z
             flow = samples.dynamics.flows(samples.t[samples.kept[a] : samples.kept[b] + 1])[-1]
             forced = data.z[b] - data.z[a] @ flow.T
             flows.append(root @ flow @ scaling.root)
@@ -77,10 +77,10 @@ class KKLAutoencoderTrainer(KKLTrainer[KKLAutoencoderConfig]):
             pair = torch.randint(len(first), (len(i),), generator=generator).to(samples.device)
             before = Term(samples.encoded(first[pair], i), flow[pair])
             after = Term(samples.encoded(second[pair], i))
-            found = [Equations([after, before], added[pair, i])]
-            if start is not None:  # T(t, x) of a driven plant begins at the first sample
+            equations = [Equations([after, before], added[pair, i])]
+            if start is not None:  # initial condition of T(t, x) of a driven plant
                 zero = torch.zeros_like(i)
-                found.append(Equations([Term(samples.encoded(zero, i))], start[zero, i]))
-            return found
+                equations.append(Equations([Term(samples.encoded(zero, i))], start[zero, i]))
+            return equations
 
         return draw

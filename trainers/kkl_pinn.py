@@ -2,8 +2,8 @@
 Johansson, "Learning-based design of Luenberger observers for autonomous nonlinear systems", ACC
 2023).
 
-T is fitted to simulated pairs of x and z, and to (∂T/∂x) f = A_z T + B_z h (of a driven plant, with
-∂T/∂t) at other states; T* to simulated z.
+T is fitted to simulated pairs of x and z, and at other samples to (∂T/∂x) f = A_z T + B_z h, for a
+driven plant with ∂T/∂t on the left. T* is fitted to simulated z.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from trainers.kkl.trainer import KKLTrainer
 
 @dataclass(frozen=True)
 class KKLPinnConfig(KKLConfig):
-    """The recipe of a physics-informed KKL observer."""
+    """Settings of the physics-informed KKL observer."""
 
     equation: float = 0.3
-    """Weight of the equation's residual, taken over z's slowest time constant, beside the
-    labels'."""
+    """Weight of the squared residual of the partial differential equation, times z's slowest time
+    constant, relative to that of the labels."""
     share: float = 0.6
-    """Steps for T over those for T*; so for their CPU time if there is a budget."""
+    """Steps for T over steps for T*, and CPU time likewise if there is a budget."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,7 +42,7 @@ def faithful() -> KKLPinnConfig:
 
 
 class KKLPinnTrainer(KKLTrainer[KKLPinnConfig]):
-    """Fits T to simulated pairs of x and z and to its partial differential equation."""
+    """Fit T to simulated pairs of x and z and to its partial differential equation."""
 
     name = "kkl_pinn"
     presets = {"default": KKLPinnConfig, "faithful": faithful}
@@ -51,11 +51,11 @@ class KKLPinnTrainer(KKLTrainer[KKLPinnConfig]):
         return 0
 
     def encoding(self, samples: Samples) -> Objective:
-        """T(x) = z at samples of simulated episodes, and the equation of T at others."""
+        """Return T(x) = z at samples of simulated episodes, and T's equation at other samples."""
         assert samples.labels is not None
         labels, weight = samples.labels, self.config.equation
         scaling, dynamics = samples.z_scaling, samples.dynamics
-        # (∂T/∂x) f − A_z T = B_z h, in scaled z, times √w over z's slowest rate
+        # (∂T/∂x) f − A_z T = B_z h in scaled z, times √w over z's slowest rate.
         unit = weight**0.5 / dynamics.slowest
         root = np.linalg.inv(scaling.root)
         matrix = samples.tensor(-unit * root @ dynamics.A @ scaling.root)
@@ -65,12 +65,12 @@ class KKLPinnTrainer(KKLTrainer[KKLPinnConfig]):
 
         def draw(generator: torch.Generator) -> Sequence[Equations]:
             k, i = samples.draw(generator, dynamics.size, 0.5)
-            found = [Equations([Term(samples.encoded(k, i))], labels[k, i])]
+            equations = [Equations([Term(samples.encoded(k, i))], labels[k, i])]
             if weight:
                 k, i = samples.draw(generator, dynamics.size, 0.5)
                 a = samples.encoded(k, i)
                 terms = [Term(a, along=rate[k, i]), Term(a, matrix)]
-                found.append(Equations(terms, target[k, i]))
-            return found
+                equations.append(Equations(terms, target[k, i]))
+            return equations
 
         return draw

@@ -1,9 +1,9 @@
 """A KKL observer fitted to simulated states (Ramos, Di Meglio, Morgenthaler, Figueira da Silva &
 Bernard, "Numerical design of Luenberger observers for nonlinear systems", CDC 2020).
 
-The states of simulated episodes are integrated backward until z has forgotten its beginning, then
-jointly with z forward. T is fitted to these pairs, and T* to the z that occur online along the
-episodes, with the noise that the outputs have.
+The initial states of simulated episodes are integrated backward until the initial value of z no
+longer matters, then forward jointly with z. T is fitted to these pairs, and T* to the z that occur
+online along the episodes, with the effect of output noise.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from trainers.kkl.trainer import KKLTrainer
 
 @dataclass(frozen=True)
 class KKLSupervisedConfig(KKLConfig):
-    """The recipe of a supervised KKL observer."""
+    """Settings of the supervised KKL observer."""
 
 
 def faithful() -> KKLSupervisedConfig:
-    """Ramos et al.'s recipe: Bessel poles, SiLU networks of five layers of 50, z from 0, no noise,
-    Adam."""
+    """Ramos et al.'s recipe: Bessel poles, SiLU networks of five layers of 50, z from 0, no
+    noise, Adam."""
     return as_published(KKLSupervisedConfig(), depth=5, activation="silu", share=0.5)
 
 
 class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
-    """Fits T to simulated pairs of x and z."""
+    """Fit T to simulated pairs of x and z."""
 
     name = "kkl_supervised"
     presets = {"default": KKLSupervisedConfig, "faithful": faithful}
@@ -40,7 +40,7 @@ class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
         return 0
 
     def encoding(self, samples: Samples) -> Objective:
-        """T(x) = z at samples of simulated episodes."""
+        """Return the equations T(x) = z at samples of simulated episodes."""
         assert samples.labels is not None
         labels = samples.labels
 

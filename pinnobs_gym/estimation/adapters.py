@@ -1,4 +1,4 @@
-"""The adapter of objects that estimate one episode."""
+"""Adapters for offline estimators, and for objects that estimate a single episode."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from pinnobs_gym.simulation.record import Prior
 
 
 class SingleEpisode(Protocol):
-    """What `PerEpisode` adapts: an object that estimates one episode."""
+    """Protocol of an object that estimates one episode, for `PerEpisode`."""
 
     def reset(self, xhat0: np.ndarray, P0: np.ndarray) -> None:
-        """Begin an episode from a prior, (nx,) and (nx, nx)."""
+        """Begin an episode from the prior's mean (nx,) and covariance (nx, nx)."""
 
     def update(self, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Take the sample y (ny,), u (nu,) at time t (s) and return x̂ (nx,)."""
+        """Process the sample y (ny,), u (nu,) at time t (s), and return x̂ (nx,)."""
         ...
 
 
 @dataclass(frozen=True)
 class PerEpisode(Estimator):
-    """An adapter for objects that estimate one episode: each row of a batch gets its own.
+    """Adapter for objects that estimate one episode; each row of a batch has its own object.
 
-    Such objects keep their state inside, so a state of this estimator can only be used once.
+    The objects are mutable, so each state of this estimator can be updated only once.
     """
 
     make: Callable[[], SingleEpisode] = field(kw_only=True)
-    """Makes the object of one row."""
+    """Creates the object of one row."""
     title: str = field(default="per_episode", kw_only=True)
-    """Its name in tables."""
+    """Name in tables."""
 
     @property
     def label(self) -> str:

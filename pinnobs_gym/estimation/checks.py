@@ -1,7 +1,7 @@
-"""Conformance: the named checks that every estimator passes, yours included.
+"""Conformance checks that every estimator has to pass, user-defined ones included.
 
-``check_estimator(MyObserver(system))`` runs them all; the table `ESTIMATOR_CHECKS` gives them by
-name, for a parametrised test.
+``check_estimator(MyObserver(system))`` runs all of them; `ESTIMATOR_CHECKS` lists them by name, for
+a parametrised test.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import truth
 
 ROUNDING = 1e-10
-"""Largest difference, over scale, between two ways to run the same estimator. Matrix products round
-differently in batches of another size, and a filter of ill-conditioned covariances enlarges that:
-the EKF of the induction motor to 3e-12."""
+"""Largest difference, over scale, between two runs of the same estimator. Matrix products round
+differently in batches of different sizes, and ill-conditioned covariances amplify the difference:
+to 3e-12 for the EKF of the induction motor."""
 NUM_SAMPLES = 40
-"""Length of the records on which estimators are checked."""
+"""Number of samples of the records on which estimators are checked."""
 
 ESTIMATOR_CHECKS: dict[str, Callable[[BaseEstimator], None]] = {}
-"""The checks of an estimator, by name. Each raises `CheckFailed`.
+"""The checks of an estimator, by name; each raises `CheckFailed` if it fails.
 
-An offline estimator is only held to those that make sense for one: ``immutable``,
-``shapes``, ``rows_independent``, ``purity`` and ``save_load``.
+Only ``immutable``, ``shapes``, ``rows_independent``, ``purity`` and ``save_load`` apply to an
+offline estimator.
 """
 
 
@@ -60,8 +60,9 @@ def check_estimator(estimator: BaseEstimator) -> None:
     """Run all of `ESTIMATOR_CHECKS` on an estimator, on short records of its own system.
 
     Raises:
-        CheckFailed: if any fails, with a line for each: its name, what was found and expected.
-        TypeError: in one line, if it is not an instance.
+        CheckFailed: if any check fails, with a line for each: its name, the finding and the
+            expectation.
+        TypeError: in one line, if the argument is not an instance of an Estimator.
     """
     if not isinstance(estimator, BaseEstimator):
         raise TypeError(f"{estimator!r} is not an instance of an Estimator; expected one")
@@ -69,10 +70,10 @@ def check_estimator(estimator: BaseEstimator) -> None:
 
 
 def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False) -> Record:
-    """A short record of the estimator's own system, with the benchmark's initial states and noise.
+    """Simulate a short record of the estimator's system, with the benchmark's initial states and
+    noise.
 
-    It is simulated here, and not taken from an env, which would register a system that is only
-    being checked.
+    An env is not used, because it would register a system that is only being checked.
     """
     system = estimator.system
     setup = system.setups["benchmark"]
@@ -89,7 +90,7 @@ def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False
 
 
 def _updates(estimator: Estimator, record: Record) -> Iterator[State]:
-    """The states after reset and after each sample."""
+    """Yield the states after reset and after each sample."""
     state = estimator.reset(record.prior)
     yield state
     for k, t in enumerate(record.t):
@@ -101,7 +102,7 @@ def _updates(estimator: Estimator, record: Record) -> Iterator[State]:
 def _require_same(
     estimator: BaseEstimator, a: Estimates, b: Estimates, tolerance: float, what: str
 ) -> None:
-    """All that two runs return must agree."""
+    """Require that two runs return the same estimates."""
     for field in fields(Estimates):
         left, right = getattr(a, field.name), getattr(b, field.name)
         both = (left is None) == (right is None)
@@ -149,6 +150,7 @@ def _check_values(
     expected: Mapping[str, tuple[int, ...]],
     when: str,
 ) -> None:
+    """Require the shapes, finite values, and symmetric positive semidefinite covariances."""
     for name, shape in expected.items():
         array = getattr(holder, name)
         if array is not None:
@@ -165,7 +167,7 @@ def _check_values(
 
 @add_check(ESTIMATOR_CHECKS, "rows_independent")
 def _estimator_rows_independent(estimator: BaseEstimator) -> None:
-    """A row of a batch gives the same as that row alone."""
+    """A row of a batch gives the same estimates as that row alone."""
     record = _record(estimator)
     together = estimator.run(record)
     for i in range(record.batch):
@@ -176,9 +178,9 @@ def _estimator_rows_independent(estimator: BaseEstimator) -> None:
 
 
 def _rows(estimates: Estimates, rows: slice) -> Estimates:
-    """Those of some of the episodes only."""
-    given = {f.name: getattr(estimates, f.name) for f in fields(Estimates)}
-    taken: dict[str, Any] = {name: a if a is None else a[rows] for name, a in given.items()}
+    """Return the estimates of some of the rows."""
+    arrays = {f.name: getattr(estimates, f.name) for f in fields(Estimates)}
+    taken: dict[str, Any] = {name: a if a is None else a[rows] for name, a in arrays.items()}
     return Estimates(**taken)
 
 
@@ -203,7 +205,7 @@ def _estimator_purity(estimator: BaseEstimator) -> None:
 
 
 def _check_arguments(estimator: Estimator, record: Record) -> None:
-    """`update` must leave y and u as they are."""
+    """Require that `update` does not modify y and u."""
     state = estimator.reset(record.prior)
     for k in range(3):
         y, u = record.y[:, k].copy(), record.u[:, k].copy()
@@ -222,7 +224,7 @@ def _copy(record: Record) -> Record:
 
 @add_check(ESTIMATOR_CHECKS, "causality")
 def _estimator_causality(estimator: BaseEstimator) -> None:
-    """Changing later outputs changes no earlier estimate."""
+    """A change of later outputs changes no earlier estimate."""
     if not isinstance(estimator, Estimator):
         return
     record = _record(estimator)
@@ -238,7 +240,7 @@ def _estimator_causality(estimator: BaseEstimator) -> None:
 
 @add_check(ESTIMATOR_CHECKS, "missing_samples")
 def _estimator_missing_samples(estimator: BaseEstimator) -> None:
-    """A NaN in y is a missing sample, and none sticks; all may be missing."""
+    """A NaN in y is a missing output and makes no estimate NaN, even if all outputs are missing."""
     if not isinstance(estimator, Estimator):
         return
     record = _record(estimator)
@@ -267,7 +269,7 @@ def _estimator_missing_samples(estimator: BaseEstimator) -> None:
 
 @add_check(ESTIMATOR_CHECKS, "irregular_times")
 def _estimator_irregular_times(estimator: BaseEstimator) -> None:
-    """Samples may come at irregular times."""
+    """Estimates are finite for samples at irregular times."""
     if not isinstance(estimator, Estimator):
         return
     record = _record(estimator, irregular=True)
@@ -278,7 +280,7 @@ def _estimator_irregular_times(estimator: BaseEstimator) -> None:
 
 @add_check(ESTIMATOR_CHECKS, "run_equals_updates")
 def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
-    """`run` gives what looping `update` does."""
+    """`run` gives the same estimates as a loop of `update`."""
     if not isinstance(estimator, Estimator):
         return
     for irregular in (False, True):
@@ -297,26 +299,26 @@ def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
 
 @add_check(ESTIMATOR_CHECKS, "diverging_row")
 def _estimator_diverging_row(estimator: BaseEstimator) -> None:
-    """A row that diverges is marked by what it holds; it neither raises nor touches the others."""
+    """A diverging row neither raises an error nor affects the other rows."""
     if not isinstance(estimator, Estimator):
         return
     record = _record(estimator)
     others = np.array([0, 2])
     benign = estimator.run(record)
     for value in (1e300, -1e300, np.inf):
-        wild = _copy(record)
-        wild.y[1, 5:] = value
-        found = estimator.run(wild)
+        diverging = _copy(record)
+        diverging.y[1, 5:] = value
+        estimates = estimator.run(diverging)
         for name in ("xhat", "P"):
             if getattr(benign, name) is not None:
-                a, b = getattr(found, name)[others], getattr(benign, name)[others]
+                a, b = getattr(estimates, name)[others], getattr(benign, name)[others]
                 what = f"{name} of other rows with and without outputs of {value:g} in one row"
                 require_close(a, b, ROUNDING, abs(b).max(axis=(0, 1)), what)
 
 
 @add_check(ESTIMATOR_CHECKS, "save_load")
 def _estimator_save_load(estimator: BaseEstimator) -> None:
-    """What can be saved is the same when loaded."""
+    """A saved estimator gives the same estimates after loading."""
     if not isinstance(estimator, Saved):
         return
     record = _record(estimator)

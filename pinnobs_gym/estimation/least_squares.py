@@ -1,4 +1,4 @@
-"""How the outputs of a stretch of record depend on the state at its start, to first order."""
+"""Least squares over a window of samples: the outputs linearised in the window's first state."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from pinnobs_gym.simulation.system import System
 
 @dataclass(frozen=True)
 class Fit:
-    """A trajectory of the model beside the outputs, and the normal equations about it.
+    """A trajectory of the model, and the normal equations of its fit to the outputs.
 
-    With parameters θ that move its start by Xθ, the sum of squared errors over R is about
+    If parameters θ move the first state by Xθ, with X the first of the derivatives below, the sum
+    of squared output errors over R is approximately
     ``cost`` − 2·``right``ᵀθ + θᵀ·``information``·θ.
     """
 
     cost: np.ndarray
     """Sum of squared output errors over R, shape (batch,)."""
     information: np.ndarray
-    """ΣGᵀR⁻¹G, shape (n, n, batch), with G the outputs' derivatives by θ."""
+    """ΣGᵀR⁻¹G, shape (n, n, batch), where G are the derivatives of the outputs by θ."""
     right: np.ndarray
-    """ΣGᵀR⁻¹e, shape (n, batch)."""
+    """ΣGᵀR⁻¹e, shape (n, batch), where e are the output errors."""
     x: np.ndarray
     """States along the trajectory, shape (num_samples, batch, nx)."""
     X: np.ndarray
-    """Their derivatives by θ, shape (num_samples, nx, n, batch)."""
+    """Derivatives of the states by θ, shape (num_samples, nx, n, batch)."""
 
 
 def linearised(
@@ -42,15 +43,15 @@ def linearised(
     X: np.ndarray,
     R: np.ndarray,
 ) -> Fit:
-    """The model's trajectory through x, and how the outputs depend on its start.
+    """Simulate the model from x, and form the normal equations of the output errors.
 
     Args:
         system: the model.
         t: sample times in s, num_samples of them.
-        y: outputs (batch, ny) at each; NaN is a missing one.
-        u: inputs (batch, nu) at each.
-        x: states at the first, shape (batch, nx).
-        X: their derivatives by the parameters, shape (nx, n, batch).
+        y: outputs (batch, ny) at each time; NaN marks a missing output.
+        u: inputs (batch, nu) at each time.
+        x: states at the first time, shape (batch, nx).
+        X: derivatives of x by the parameters, shape (nx, n, batch).
         R: variances of the output noise, shape (ny,).
     """
     n, batch = X.shape[1:]
@@ -58,13 +59,14 @@ def linearised(
     information = np.zeros((n, n, batch))
     states, derivatives = np.empty((len(t), *x.shape)), np.empty((len(t), *X.shape))
     for k in range(len(t)):
-        if k:
+        if k:  # propagate the state and its sensitivity
             times = float(t[k - 1]), float(t[k])
             x, F = model_step_jacobian(system, *times, x, u[k - 1], u[k])
             X = product(F.transpose(1, 2, 0), X)
         states[k], derivatives[k] = x, X
-        error, H = observe(system, float(t[k]), x, y[k], u[k])
+        error, H = observe(system, float(t[k]), x, y[k], u[k])  # zero where y is missing
         G = product(H, X)
+        # Accumulate the normal equations.
         weighted = (G / R[:, None, None]).transpose(1, 0, 2)
         cost += (error**2 / R).sum(axis=-1)
         right += np.einsum("ipb,bp->ib", weighted, error)
@@ -73,13 +75,13 @@ def linearised(
 
 
 def root(P: np.ndarray) -> np.ndarray:
-    """L with LLᵀ = P, both (nx, nx, batch), for P symmetric and positive semidefinite."""
-    values, vectors = np.linalg.eigh(P.transpose(2, 0, 1))
+    """Return L with LLᵀ = P, both (nx, nx, batch), for P symmetric and positive semidefinite."""
+    values, vectors = np.linalg.eigh(P.transpose(2, 0, 1))  # Cholesky fails for a singular P
     return (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]).transpose(1, 2, 0)
 
 
 def solved(information: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """θ (n, batch) with information·θ = right; not a number where the information is not finite."""
+    """Solve information·θ = right for θ (n, batch); NaN where the information is not finite."""
     A = information.transpose(2, 0, 1)
     finite = np.isfinite(A).all(axis=(1, 2))
     theta = np.full(right.shape, np.nan)

@@ -1,4 +1,4 @@
-"""Constant observer gains by design, and how an observer applies its gain at a sample."""
+"""Design of constant observer gains, and the correction of an observer at a sample."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from pinnobs_gym.simulation.model import model_step, model_step_jacobian
 from pinnobs_gym.simulation.system import System, vector
 
 TIME_CONSTANTS = 20.0
-"""How many of an observer's time constants pass in a benchmark episode, by default."""
+"""Duration of a benchmark episode over an observer's time constant, by default."""
 
 
 def default_rate(system: System) -> float:
-    """The rate at which errors should decay, in 1/s: the same rule for all systems."""
+    """Return the default decay rate of errors in 1/s, by the same rule for all systems."""
     return TIME_CONSTANTS / system.setups["benchmark"].duration
 
 
 def operating_point(system: System) -> tuple[float, np.ndarray]:
-    """A time (s) and state (nx,) to linearise at: where the model is from x̂₀ after a quarter of a
-    benchmark episode."""
+    """Return the time (s) and state (nx,) of linearisation.
+
+    It is the model's state after a quarter of a benchmark episode that begins at x̂₀.
+    """
     setup = system.setups["benchmark"]
     x = vector(setup.xhat0, system.nx, "xhat0")
     times = setup.times[: len(setup.times) // 4 + 1]
@@ -37,7 +39,7 @@ def operating_point(system: System) -> tuple[float, np.ndarray]:
 def linearised_scaled(
     system: System, t: float, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A and H at a state (nx,), both for states over their scale, and that scale (nx,).
+    """Return A and H at a state (nx,), both for states divided by their scale, and the scale (nx,).
 
     Raises:
         ValueError: if (A, H) is not observable.
@@ -46,6 +48,7 @@ def linearised_scaled(
     u = np.asarray(system.input(now))
     A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
     H = np.asarray(system.h_jacobian(now, x, u)) * scale
+    # Rank of the observability matrix; A is normalised so that its powers stay of one size.
     powers = [np.linalg.matrix_power(A / max(abs(A).max(), 1e-300), i) for i in range(system.nx)]
     rows = np.concatenate([H @ power for power in powers])
     if np.linalg.matrix_rank(rows, tol=1e-9 * abs(H).max(initial=0.0)) < system.nx:
@@ -57,14 +60,14 @@ def linearised_scaled(
 
 
 def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = None) -> np.ndarray:
-    """The gain L (nx, ny) that places the poles of A − LH, linearised at `operating_point`.
+    """Return the gain L (nx, ny) that places the poles of A − LH, linearised at `operating_point`.
 
-    At the poles given (Kautsky, Nichols & Van Dooren 1985); or, with least effort, to the left of
-    −rate (1/s): a Kalman gain for A + rate·I, which mirrors at −rate the poles that are to the
-    right of it (Anderson & Moore 1971, "Linear Optimal Control", section 4.1).
+    With ``poles``, these are placed (Kautsky, Nichols & Van Dooren 1985). Without, all poles are
+    placed to the left of −rate (1/s) by the Kalman gain for A + rate·I, which mirrors at −rate the
+    poles to the right of it (Anderson & Moore 1971, "Linear Optimal Control", section 4.1).
 
     Raises:
-        ValueError: in one line, if there is none.
+        ValueError: in one line, if (A, H) is not observable, or the number of poles is not nx.
     """
     A, H, scale = linearised_scaled(system, *operating_point(system))
     if poles is not None:
@@ -74,6 +77,7 @@ def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = N
 
         placed: Any = place_poles(A.T, H.T, poles)
         return scale[:, None] * placed.gain_matrix.T
+    # Riccati equation of the shifted system; the small process noise keeps the gain small.
     identity = np.eye(system.nx)
     noise = (0.1 * rate) ** 2 * identity
     from scipy.linalg import solve_continuous_are
@@ -84,19 +88,20 @@ def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = N
 
 @lru_cache(maxsize=64)
 def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarray:
-    """L (nx, ny) of the default design: the `placed_gain`, or a part of it.
+    """Return L (nx, ny) of the default design: the `placed_gain` times a factor of at most 1.
 
-    A gain that is right at one operating point may drive errors out at others. Of it, a half, a
-    quarter, ... and nothing of it, this is what leaves least of an initial error, linearised along
-    the model's path from x̂₀, at the end of a benchmark episode.
+    A gain that is stable at one operating point may amplify errors at others. Among the factors 1,
+    1/2, ..., 1/128 and 0, the one is chosen with the least error at the end of a benchmark episode,
+    by the error dynamics linearised along the model's trajectory from x̂₀.
 
     Args:
         system: the model.
         rate: see `placed_gain`.
-        largest: the most that the observer multiplies the gain with; it is that which is tried.
+        largest: largest factor by which the observer multiplies its gain; the candidates are
+            judged with it.
 
     Raises:
-        ValueError: in one line, if there is none.
+        ValueError: in one line, if (A, H) is not observable.
     """
     L, setup = placed_gain(system, rate), system.setups["benchmark"]
     parts = np.append(0.5 ** np.arange(8), 0.0)
@@ -106,31 +111,33 @@ def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarr
     times = setup.times
     u = np.asarray(system.input(times))[:, None]
     with np.errstate(all="ignore"):
-        for k in range(len(times) - 1):
+        for k in range(len(times) - 1):  # error transition matrix of each candidate gain
             x, F = model_step_jacobian(system, times[k], times[k + 1], x, u[k], u[k + 1])
             H = np.asarray(system.h_jacobian(times[k + 1], x, u[k + 1]))
             K = injection(L, np.repeat(H, len(parts), axis=0), weight, times[k + 1] - times[k])
             flow = (np.eye(system.nx) - K @ H) @ F @ flow
-        left = abs(flow * scale / scale[:, None]).max(axis=(1, 2))
-    gain = parts[np.argmin(np.nan_to_num(left, nan=np.inf))] * L
-    gain.flags.writeable = False  # the same array is returned again
+        # Largest scaled component of the error that is left from a unit initial error.
+        remaining = abs(flow * scale / scale[:, None]).max(axis=(1, 2))
+    gain = parts[np.argmin(np.nan_to_num(remaining, nan=np.inf))] * L
+    gain.flags.writeable = False  # the cache returns the same array again
     return gain
 
 
 def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
-    """The gain L (nx, ny) with which all errors within the initial set decay at a rate (1/s).
+    """Return the gain L (nx, ny) with which all errors in the initial set decay at a rate (1/s).
 
-    P ≻ I and Y = PL with He(PA − YH) + 2·rate·P ⪯ 0 for the Jacobians A, H at all states of a grid
-    over the benchmark's box, for then the error contracts in the constant metric P (Lohmiller &
-    Slotine 1998; the polytopic form of Alessandri 2004). It is solved by cvxpy, of the extra lmi.
+    The linear matrix inequalities are P ⪰ I and He(PA − YH) + 2·rate·P ⪯ 0 with Y = PL, for the
+    Jacobians A, H at all states of a grid over the benchmark's box of initial states. The error
+    then contracts in the constant metric P (Lohmiller & Slotine 1998; the polytopic form of
+    Alessandri 2004). They are solved by cvxpy, from the extra ``lmi``.
 
     Args:
         system: the model.
-        rate: of decay.
-        grid: points per state.
+        rate: decay rate in 1/s.
+        grid: grid points per state.
 
     Raises:
-        ValueError: in one line, if the inequality has no solution.
+        ValueError: in one line, if the inequalities have no solution.
         ImportError: if cvxpy is not installed.
     """
     try:
@@ -141,6 +148,7 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
         ) from None
     setup, nx, scale = system.setups["benchmark"], system.nx, np.asarray(system.scale)
     low, high = vector(setup.x0_low, nx, "x0_low"), vector(setup.x0_high, nx, "x0_high")
+    # Jacobians at the grid points, for scaled states.
     axes = [np.linspace(a, b, grid) for a, b in zip(low, high, strict=True)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, nx)
     now = np.asarray(0.0)
@@ -148,6 +156,7 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
     A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
     H = np.asarray(system.h_jacobian(now, x, u)) * scale
     A, kept = np.unique(np.round(A, 12), axis=0, return_index=True)
+    # One inequality per vertex of the polytope; the trace keeps P small.
     P, Y = cp.Variable((nx, nx), symmetric=True), cp.Variable((nx, system.ny))
     constraints: list[Any] = [P >> np.eye(nx)]
     for a, h in zip(A, H[kept], strict=True):
@@ -165,19 +174,20 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
 
 
 def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np.ndarray:
-    """The gain K (batch, nx, ny) of a step of length dt: x̂ = x⁻ + K(y − h(t, x⁻, u)).
+    """Return the gain K (batch, nx, ny) of the correction x̂ = x⁻ + K(y − h(t, x⁻, u)).
 
-    One step of Euler's implicit method for x̂' = L·weight·(y − h(t, x̂, u)), linearised:
-    K = dt·L·weight·(I + dt·H·L·weight)⁻¹, which large gains do not make unstable as dt·L would.
+    It is one linearised step of Euler's implicit method for x̂' = L·weight·(y − h(t, x̂, u)):
+    K = dt·L·weight·(I + dt·H·L·weight)⁻¹. Unlike dt·L, it is stable for large gains.
 
     Args:
-        L: the gain, shape (nx, ny), in state units per output unit and s.
+        L: continuous-time gain, shape (nx, ny), in state units per output unit and s.
         H: output Jacobians, shape (batch, ny, nx).
-        weight: what each output counts, shape (batch, ny); zero where it is missing.
-        dt: the step in s.
+        weight: factor of each output, shape (batch, ny); zero for a missing output.
+        dt: length of the step in s.
     """
     weighted = dt * L * weight[:, None]
     M = np.eye(H.shape[1]) + H @ weighted
+    # Rows that have diverged give NaN instead of an error.
     usable = np.isfinite(M).all(axis=(1, 2)) & (np.linalg.det(M) != 0)
     inverse = np.full_like(M, np.nan)
     inverse[usable] = np.linalg.inv(M[usable])

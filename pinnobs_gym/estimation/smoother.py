@@ -1,7 +1,7 @@
-"""Kalman filters and smoothers over whole records, of the model linearised along the filter's own
-estimates or about given states.
+"""Extended Kalman filters and smoothers over whole records.
 
-In these arrays samples come first, and in matrices the batch last.
+The model is linearised at the filter's own estimates or at given states. The first axis of all
+arrays is that of the samples; the last axis of matrices is that of the batch.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 
 _ROWS = 2000
-"""About how many samples of all rows are looked at at a time."""
+"""Approximate number of samples, over all rows, that are processed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,23 +28,23 @@ class Path:
     xhat: np.ndarray
     """Shape (num_samples, batch, nx)."""
     P: np.ndarray
-    """Their covariances, shape (num_samples, nx, nx, batch)."""
+    """Covariances of the estimates, shape (num_samples, nx, nx, batch)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Filtered(Path):
-    """What a forward pass leaves."""
+    """Result of a forward pass."""
 
     predicted: Path
-    """The estimates before each sample is seen."""
+    """Predictions, before the update by each sample."""
     F: np.ndarray
     """Jacobians of the model's steps, shape (num_samples − 1, nx, nx, batch)."""
     Q: np.ndarray
-    """Covariance of the process noise of a sample, shape (nx, nx, 1)."""
+    """Covariance of the process noise per sample, shape (nx, nx, 1)."""
     K: np.ndarray
     """Kalman gains, shape (num_samples, nx, ny, batch)."""
     H: np.ndarray
-    """Output Jacobians, shape (num_samples, ny, nx, batch); zero where an output is missing."""
+    """Output Jacobians, shape (num_samples, ny, nx, batch); zero for a missing output."""
 
 
 def forward(
@@ -55,18 +55,18 @@ def forward(
     about: np.ndarray | None = None,
     caution: float = 0.0,
 ) -> Filtered:
-    """A Kalman filter over whole records.
+    """Run a Kalman filter over whole records.
 
     Args:
         system: the model.
-        record: of a batch of episodes.
-        Q: covariance of the process noise of a sample, shape (nx, nx, 1).
+        record: record of a batch of episodes.
+        Q: covariance of the process noise per sample, shape (nx, nx, 1).
         R: covariance of the output noise, shape (ny, ny, batch or 1).
-        about: states (num_samples, batch, nx) about which the model is linearised; the filter's own
-            estimates if None, as in the extended Kalman filter.
-        caution: which part of HPHᵀ is added to R, so that no sample moves an estimate all the way
-            (as in Boutayeb & Aubry, "A strong tracking extended Kalman observer for nonlinear
-            discrete-time systems", 1999).
+        about: states (num_samples, batch, nx) of linearisation; the filter's own estimates if None,
+            as in the extended Kalman filter.
+        caution: fraction of HPHᵀ that is added to R, which shortens every update (as in Boutayeb &
+            Aubry, "A strong tracking extended Kalman observer for nonlinear discrete-time systems",
+            1999).
     """
     t, n, batch, nx, ny = record.t, record.num_samples, record.batch, system.nx, system.ny
     y, u = record.y.swapaxes(0, 1), record.u.swapaxes(0, 1)
@@ -77,16 +77,19 @@ def forward(
     if about is not None:
         ends, F = flows(system, t, about, u)
     for k in range(n):
+        # Prediction: of the EKF, or by the steps linearised about the given states.
         if k and about is None:
             x, P, F[k - 1] = predict(system, (t[k - 1], t[k]), x, P, Q, (u[k - 1], u[k]))
         elif k and about is not None:
             x = ends[k - 1] + np.einsum("ijb,bj->bi", F[k - 1], x - about[k - 1])
             P = sandwich(F[k - 1], P) + Q
         before.xhat[k], before.P[k] = x, P
+        # Innovation, with h linearised about the same states.
         at = x if about is None else about[k]
         innovation, H[k] = observe(system, float(t[k]), at, y[k], u[k])
         if about is not None:
             innovation = innovation - np.einsum("pib,bi->bp", H[k], x - about[k])
+        # Update.
         noise = R + caution * sandwich(H[k], P) if caution else R
         K[k], _ = kalman_gain(P, H[k], noise)
         x, P = update_with(K[k], x, P, innovation, H[k], noise)
@@ -95,21 +98,21 @@ def forward(
 
 
 def backward(filtered: Filtered) -> Path:
-    """Rauch, Tung & Striebel's pass back over what a forward pass left (Särkkä 2013, section 9.1).
+    """Run the Rauch-Tung-Striebel smoother over a forward pass (Särkkä 2013, section 9.1).
 
-    With C = PFᵀ(P⁻)⁻¹: x̂ₛ = x̂ + C(x̂ₛ' − x⁻') and, positive semidefinite in every term,
-    Pₛ = (I − CF)P(I − CF)ᵀ + C(Pₛ' + Q)Cᵀ, primes marking the next sample.
+    With C = PFᵀ(P⁻')⁻¹, where primes mark the next sample: x̂ₛ = x̂ + C(x̂ₛ' − x⁻') and
+    Pₛ = (I − CF)P(I − CF)ᵀ + C(Pₛ' + Q)Cᵀ, every term of which is positive semidefinite.
     """
     x, P, before = filtered.xhat.copy(), filtered.P.copy(), filtered.predicted
     count = max(1, _ROWS // x.shape[1])
-    for stop in range(len(x) - 1, 0, -count):
+    for stop in range(len(x) - 1, 0, -count):  # gains of a block at once, then the recursion
         start = max(stop - count, 0)
         C, own = _gains_back(filtered, start, stop)
         for k in range(stop - 1, start - 1, -1):
             gain = C[k - start]
             x[k] += np.einsum("ijb,bj->bi", gain, x[k + 1] - before.xhat[k + 1])
             smoothed = own[k - start] + sandwich(gain, P[k + 1])
-            P[k] = (smoothed + smoothed.transpose(1, 0, 2)) / 2
+            P[k] = (smoothed + smoothed.transpose(1, 0, 2)) / 2  # against rounding
     return Path(x, P)
 
 
@@ -123,21 +126,23 @@ def iterated(
     caution: float = 0.0,
     settled: float,
 ) -> Path:
-    """The iterated Kalman smoother (Bell, "The iterated Kalman smoother as a Gauss-Newton method",
-    1994): it minimises the squares of the innovations, of the departure from the prior and of the
-    model's defects from sample to sample, each over its variance.
+    """Run the iterated Kalman smoother.
+
+    It is a Gauss-Newton method (Bell, "The iterated Kalman smoother as a Gauss-Newton method",
+    1994) for the sum of squares, each over its variance, of the output errors, of the deviation
+    from the prior, and of the model's defects from sample to sample.
 
     Args:
         system: the model.
-        record: of a batch of episodes.
-        Q: covariance of the process noise of a sample, shape (nx, nx, 1), in each pass. A row is
-            done when a pass with the last of them moves none of its states by more than
+        record: record of a batch of episodes.
+        Q: covariance of the process noise per sample, shape (nx, nx, 1), for each pass. A row has
+            converged when a pass with the last covariance moves none of its states by more than
             ``settled``.
         R: covariance of the output noise, shape (ny, ny, batch or 1).
-        about: states (num_samples, batch, nx) about which the first pass linearises the model; the
-            filter's own estimates if None.
-        caution: see `forward`; of a first pass along the filter's own estimates.
-        settled: over the system's scale.
+        about: states (num_samples, batch, nx) of the first linearisation; the filter's own
+            estimates if None.
+        caution: see `forward`; it applies to the first pass, and only if ``about`` is None.
+        settled: tolerance of convergence, over the system's scale.
 
     Returns:
         The states of each row's last pass, and their covariances.
@@ -151,10 +156,12 @@ def iterated(
     for each in Q:
         at = None if first else x[:, rows]
         noise = R if R.shape[-1] == 1 else R[..., rows]
-        left = record if len(rows) == batch else record.rows(rows)
-        path = backward(forward(system, left, each, noise, at, caution if first else 0.0))
+        remaining = record if len(rows) == batch else record.rows(rows)
+        # One Gauss-Newton step: filter and smooth the model linearised at the last trajectory.
+        path = backward(forward(system, remaining, each, noise, at, caution if first else 0.0))
         moved = np.inf if at is None else (abs(path.xhat - at) / scale).max(axis=(0, 2))
         x[:, rows], P[..., rows] = path.xhat, path.P
+        # Drop the rows that have converged or diverged.
         last = np.array_equal(each, Q[-1])
         done = ~np.isfinite(path.xhat).all(axis=(0, 2)) | (last & (moved <= settled))
         rows, first = rows[~done], False
@@ -164,8 +171,10 @@ def iterated(
 
 
 def _gains_back(filtered: Filtered, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """C and (I − CF)P(I − CF)ᵀ + CQCᵀ of `backward` for some samples at once, (samples, nx, nx,
-    batch): neither waits for what comes after."""
+    """Return C and (I − CF)P(I − CF)ᵀ + CQCᵀ of `backward`, (samples, nx, nx, batch) each.
+
+    Neither depends on the smoothed estimates, so they are computed for many samples at once.
+    """
     parts = (
         filtered.P[start:stop],
         filtered.F[start:stop],
@@ -182,8 +191,12 @@ def _gains_back(filtered: Filtered, start: int, stop: int) -> tuple[np.ndarray, 
 def flows(
     system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the model comes to from the states x (num_samples, batch, nx) until the next sample,
-    (num_samples − 1, batch, nx), and the Jacobians, (num_samples − 1, nx, nx, batch)."""
+    """Predict from the states x (num_samples, batch, nx) to the next samples.
+
+    Returns:
+        The predictions (num_samples − 1, batch, nx), and their Jacobians
+        (num_samples − 1, nx, nx, batch).
+    """
     n, batch, nx = x.shape
     ends, F = np.empty((n - 1, batch, nx)), np.empty((n - 1, nx, nx, batch))
     count = max(1, _ROWS // batch)

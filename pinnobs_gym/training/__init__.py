@@ -1,1 +1,1 @@
-"""What trainers share: finding them, the training loop, the log."""
+"""The trainer base class, training by name, the training loop, checkpoints and the log."""

@@ -1,4 +1,4 @@
-"""Training by the name of a trainer, and loading what it made."""
+"""Training by the name of a trainer, and loading of trained estimators."""
 
 from __future__ import annotations
 
@@ -18,33 +18,32 @@ from pinnobs_gym.training.trainer import TRAINING_SEED, Trainer
 def trainer_of(
     name: str, config: TrainingConfig, game: Game, episode: int = TRAINING_SEED
 ) -> Trainer[Any, Any]:
-    """The training, not begun, of the trainer of that name on a game.
+    """Create the trainer of a name for a game, ready for its first iteration.
 
-    A trainer learns from the record of ``config.records`` episodes, or, if these are none, plays
-    episodes itself.
+    It is given the record of ``config.records`` episodes, or the game itself if that is 0.
 
     Args:
-        name: the trainer's.
+        name: name of the trainer.
         config: its Config.
-        game: what is played.
+        game: source of the episodes.
         episode: seed of the first episode.
     """
     cls, source = TRAINERS.resolve(name), game.source
-    given: dict[str, Any] = {"game": game, "episode": episode}
+    data: dict[str, Any] = {"game": game, "episode": episode}
     if config.records:
-        given = {"record": game.record(range(episode, episode + config.records))}
-    return cls(source.system, config, noise_std=source.setup.noise_std, **given)
+        data = {"record": game.record(range(episode, episode + config.records))}
+    return cls(source.system, config, noise_std=source.setup.noise_std, **data)
 
 
 def train_by_name(
     name: str, config: TrainingConfig, game: Game, episode: int = TRAINING_SEED, **options: Any
 ) -> Trained:
-    """What the trainer of that name makes of a config on a game; see `trainer_of`.
+    """Train with the trainer of a name, and return the trained object; see `trainer_of`.
 
     Args:
-        name: the trainer's.
+        name: name of the trainer.
         config: its Config.
-        game: what is played.
+        game: source of the episodes.
         episode: seed of the first episode.
         options: ``log``, ``checkpoint``, ``resume`` and ``progress`` of `train`.
     """
@@ -52,10 +51,11 @@ def train_by_name(
 
 
 def load(cls: type[BaseEstimator], path: Path, game: Game) -> BaseEstimator:
-    """The trained estimator in a file, given the noise of the game's setup if it makes use of it.
+    """Load a trained estimator for a game; one that uses the noise gets that of the game's setup.
 
     Raises:
-        ValueError: in one line, if it cannot be read or belongs to another system.
+        ValueError: in one line, if the class is not a learned estimator, or if the file cannot be
+            read or belongs to another system.
     """
     if not issubclass(cls, LearnedEstimator):
         name = getattr(cls, "name", cls.__name__)

@@ -1,4 +1,4 @@
-"""Files from which an interrupted training goes on."""
+"""Checkpoints: files from which a training is resumed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pinnobs_gym.training.trainer import Trainer
 
 
 def save_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
-    """Write all that `load_checkpoint` needs to go on exactly.
+    """Write a checkpoint from which `load_checkpoint` resumes the training exactly.
 
     Raises:
         ValueError: in one line, if the file cannot be written.
@@ -39,7 +39,7 @@ def save_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
 
 
 def load_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
-    """Go on with the training of a checkpoint, in a trainer that was made anew.
+    """Restore a checkpoint into a new trainer.
 
     Raises:
         ValueError: in one line, if it cannot be read or belongs to another training.
@@ -58,7 +58,7 @@ def load_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
 
 
 def _identity(trainer: Trainer[Any, Any]) -> dict[str, Any]:
-    """What a checkpoint must agree with."""
+    """Return the facts that a checkpoint and the resuming trainer must agree on."""
     free = (*ALWAYS_MAY_CHANGE, *trainer.config.may_change)
     config = {name: v for name, v in asdict(trainer.config).items() if name not in free}
     facts = {**identity(trainer.system), "trainer": trainer.name}
@@ -69,6 +69,7 @@ def _identity(trainer: Trainer[Any, Any]) -> dict[str, Any]:
 
 
 def _record(trainer: Trainer[Any, Any]) -> Mapping[str, np.ndarray]:
+    """Return the arrays of the record by name; none if the trainer plays episodes itself."""
     if not trainer.has_record:
         return {}
     record = trainer.record

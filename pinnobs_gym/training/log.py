@@ -1,4 +1,4 @@
-"""TensorBoard logs. Nothing else in the package knows TensorBoard."""
+"""TensorBoard logs. No other module of the package depends on TensorBoard."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 
 class Log:
-    """A run's TensorBoard log, in one folder; usable as a context manager.
+    """TensorBoard log of one run, in one folder; usable as a context manager.
 
-    Without a folder every method does nothing, so that callers never test for None. TensorBoard is
-    imported when something is first written.
+    Without a folder every method does nothing, so that callers need not test for None. TensorBoard
+    is imported at the first write.
 
     Args:
-        folder: where the event files go; it is made if it is not there.
+        folder: folder of the event files; it is created if it does not exist.
 
     Raises:
-        ValueError: in one line, if the folder cannot be made or written to.
+        ValueError: in one line, if the folder cannot be created or written to.
     """
 
     def __init__(self, folder: str | Path | None) -> None:
@@ -34,7 +34,7 @@ class Log:
         self._opened: EventFileWriter | None = None
         if self._folder is None:
             return
-        try:  # the writer's own thread would only fail much later
+        try:  # fail now: the writer's own thread would fail much later
             self._folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=self._folder).close()
         except OSError as error:
@@ -43,16 +43,16 @@ class Log:
 
     @property
     def active(self) -> bool:
-        """Whether anything is kept: what is costly to draw need not be drawn otherwise."""
+        """Whether anything is written; if not, callers can skip costly figures."""
         return self._folder is not None
 
     @property
     def folder(self) -> Path | None:
-        """Where the event files go, for libraries that write their own."""
+        """Folder of the event files, for libraries that write their own."""
         return self._folder
 
     def scalar(self, tag: str, value: float, step: int) -> None:
-        """Add the value of the curve ``tag`` at a step."""
+        """Add a point to the curve ``tag``."""
         if self.active:
             self._add(_summary().Value(tag=tag, simple_value=value), step)
 
@@ -62,22 +62,22 @@ class Log:
             self._add(_summary().Value(tag=tag, image=_image(figure)), step)
 
     def hparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
-        """Add the run's settings and what came of them to the HPARAMS table."""
+        """Add the run's settings and final metrics to the HPARAMS table."""
         if not self.active:
             return
         from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 
-        # The table takes no None and no sequences. What columns it has is not said: TensorBoard
-        # would give the table of all runs the columns of the first.
+        # The table accepts neither None nor sequences. Its columns are not declared, since
+        # TensorBoard would use those of the first run for all runs.
         shown = {k: v if isinstance(v, bool | int | float) else str(v) for k, v in params.items()}
-        run = hashlib.sha256(str(self._folder).encode()).hexdigest()[:12]  # each has its own line
+        run = hashlib.sha256(str(self._folder).encode()).hexdigest()[:12]  # a row per run
         for value in hparams_pb(shown, trial_id=run).value:
             self._add(value, 0)
         for tag, value in metrics.items():
             self.scalar(tag, value, 0)
 
     def close(self) -> None:
-        """Write everything out and close the files; a closed log that is used again reopens."""
+        """Flush and close the event file; later writes open a new one."""
         if self._opened is not None:
             self._opened.close()
             self._opened = None
@@ -94,7 +94,7 @@ class Log:
         self.close()
 
     def _add(self, value: Any, step: int) -> None:
-        """Write one value of a step."""
+        """Write one value at a step."""
         from tensorboard.compat.proto import event_pb2
         from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
@@ -106,7 +106,7 @@ class Log:
 
 
 def _summary() -> Any:
-    """The class of TensorBoard's summaries, which is generated and so has no types."""
+    """Return TensorBoard's Summary class, which is generated and therefore untyped."""
     from tensorboard.compat.proto import summary_pb2
 
     generated: Any = summary_pb2
@@ -114,7 +114,7 @@ def _summary() -> Any:
 
 
 def _image(figure: Figure) -> Any:
-    """A figure as a PNG."""
+    """Encode a figure as a PNG image."""
     with io.BytesIO() as file:
         figure.savefig(file, format="png")
         data = file.getvalue()
@@ -123,4 +123,4 @@ def _image(figure: Figure) -> Any:
 
 
 SILENT = Log(None)
-"""A log that keeps nothing."""
+"""A log that writes nothing."""

@@ -1,4 +1,4 @@
-"""The training loop: progress, log, checkpoints, resumption, budget and Ctrl-C of every trainer."""
+"""The training loop of all trainers: progress bar, log, checkpoints, budget and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -25,24 +25,26 @@ def train(
     resume: bool = False,
     progress: bool = False,
 ) -> TrainedT:
-    """Run a training to its end, and return the best of what was trained.
+    """Train until the end, and return the best trained object.
 
-    The first Ctrl-C ends it after the iteration, a second one amid it; what is best so far is kept
-    in both cases, and the trained object says so in ``ending``. On a CPU the same seed gives the
-    same weights, unless a budget ends the training.
+    The first Ctrl-C ends the training after the current iteration, a second one at once. In both
+    cases the best weights so far are returned, with ``ending`` "interrupted". On a CPU the same
+    seed gives the same weights, unless a budget or Ctrl-C ends the training.
 
     Args:
-        trainer: the training, which may have begun.
-        log: where curves, figures and settings go.
-        checkpoint: a file that the training's state is kept in, written again as it goes on.
-        resume: go on from that file, exactly.
-        progress: show a bar in the terminal.
+        trainer: the trainer, which may have made iterations already.
+        log: destination of curves, figures and settings.
+        checkpoint: file of the training's state, rewritten every ``checkpoint_every`` iterations
+            and at the end.
+        resume: resume exactly from the checkpoint.
+        progress: show a progress bar in the terminal.
 
     Raises:
         ValueError: in one line, if the checkpoint is missing, damaged, or of another training: of
-            another system, record or config (settings that only decide when training ends may
-            differ, see `TrainingConfig.may_change`).
+            another system, record or config (some settings may differ, see
+            `TrainingConfig.may_change`).
         FloatingPointError: in one line, if no loss was finite.
+        KeyboardInterrupt: if Ctrl-C interrupts the first iteration.
     """
     if resume:
         if checkpoint is None:
@@ -59,7 +61,7 @@ def train(
                     save_checkpoint(trainer, checkpoint)
         if checkpoint is not None:
             save_checkpoint(trainer, checkpoint)
-    except KeyboardInterrupt:  # amid an iteration: the last checkpoint stays as it is
+    except KeyboardInterrupt:  # within an iteration: the last checkpoint stays valid
         if not trainer.iteration:
             raise
         trainer.ending = "interrupted"
@@ -70,21 +72,21 @@ def train(
 
 
 class Interrupt:
-    """Whether Ctrl-C was pressed."""
+    """A flag that is set when Ctrl-C is pressed."""
 
     requested = False
 
 
 _active: list[Interrupt] = []
-"""The interrupt that the outermost `deferred_interrupt` of this process waits for."""
+"""The interrupt of the outermost `deferred_interrupt` of this process, if one is active."""
 
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Interrupt]:
     """Defer the first Ctrl-C to the end of the iteration; a second one interrupts at once.
 
-    Within another such context the outer one's interrupt is returned. In other threads than the
-    main one, and where Ctrl-C has another handler than Python's, nothing is deferred.
+    A nested context yields the interrupt of the outer one. Nothing is deferred outside the main
+    thread, or if a handler other than Python's default is installed for SIGINT.
     """
     if _active:
         yield _active[0]
@@ -110,14 +112,16 @@ def deferred_interrupt() -> Iterator[Interrupt]:
 
 
 def ended_now(trainer: Trainer[Any, Any], interrupt: Interrupt) -> bool:
-    """Whether a training ends now, which its ``ending`` then says. At least one iteration is
-    made."""
-    config, begun = trainer.config, trainer.iteration > 0
+    """Set the trainer's ``ending``, and return whether the training is over.
+
+    The budget and Ctrl-C take effect after the first iteration at the earliest.
+    """
+    config, started = trainer.config, trainer.iteration > 0
     if trainer.finished():
         trainer.ending = "finished"
-    elif begun and interrupt.requested:
+    elif started and interrupt.requested:
         trainer.ending = "interrupted"
-    elif begun and not trainer.paced_by_budget and config.budget is not None:
+    elif started and not trainer.paced_by_budget and config.budget is not None:
         trainer.ending = "budget" if trainer.seconds >= config.budget else "running"
     return trainer.ending != "running"
 
@@ -126,7 +130,7 @@ Show = Callable[[float, int, str], None]
 
 
 def _show(trainer: Trainer[Any, Any], log: Log, show: Show | None) -> None:
-    """Log the curves, and move the bar."""
+    """Log the curves, and update the progress bar."""
     if log.active:
         for tag, value in trainer.curves().items():
             log.scalar(tag, value, trainer.iteration)
@@ -135,7 +139,7 @@ def _show(trainer: Trainer[Any, Any], log: Log, show: Show | None) -> None:
 
 
 def _log_end(trainer: Trainer[Any, TrainedT], trained: TrainedT, log: Log) -> None:
-    """Log the pictures of what was trained, and a line of the HPARAMS table."""
+    """Log the figures of the trained object, and its row of the HPARAMS table."""
     for name, figure in trainer.figures(trained).items():
         log.figure(f"trained/{name}", figure, trainer.iteration)
     settings = {"system": trained.system, **trained.config}
@@ -145,8 +149,11 @@ def _log_end(trainer: Trainer[Any, TrainedT], trained: TrainedT, log: Log) -> No
 
 @contextmanager
 def _bar(shown: bool) -> Iterator[Show]:
-    """A progress bar in the terminal, as a function of the part that is done, the iterations and a
-    description; one that does nothing if it is not to be shown."""
+    """Show a progress bar, and yield the function that updates it.
+
+    The function takes the finished fraction, the number of iterations and a description. If the
+    bar is not shown, it does nothing.
+    """
     if not shown:
         yield lambda part, iteration, description: None
         return

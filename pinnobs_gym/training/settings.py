@@ -1,4 +1,4 @@
-"""Settings of trainings: what all trainers share, how one is checked, and how some are changed."""
+"""Settings of trainers: the shared ones, and functions that check and change settings."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from typing import Any, ClassVar, TypeVar
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """What the settings of all trainers share.
+    """Base class of the settings of a trainer.
 
-    A trainer's own Config derives from it. Each field has a real type and a real default; a preset
-    is a function that returns a whole Config, see `Trainer.presets`.
+    A trainer's Config derives from it. Each field has a type annotation and a default; a preset is
+    a function that returns a complete Config, see `Trainer.presets`.
     """
 
     may_change: ClassVar[tuple[str, ...]] = ()
-    """Settings that may differ when a training is resumed, beside `ALWAYS_MAY_CHANGE`."""
+    """Settings that may differ when a training is resumed, besides `ALWAYS_MAY_CHANGE`."""
 
     seed: int = 0
-    """What all that chance decides in a training is drawn from."""
+    """Seed of all random numbers of a training."""
     budget: float | None = None
-    """CPU seconds after which training stops, those before a resumption included."""
+    """CPU seconds after which training stops, including those before a resumption."""
     checkpoint_every: int = 100
-    """Iterations from one checkpoint to the next."""
+    """Iterations between checkpoints."""
     log_every: int = 20
-    """Iterations from one point of the logged curves to the next."""
+    """Iterations between points of the logged curves."""
 
     @property
     def records(self) -> int:
-        """How many episodes are learned from; 0 if the trainer plays its own."""
+        """Number of recorded episodes to train on; 0 if the trainer plays episodes itself."""
         return 1
 
     def check_shared(self) -> None:
-        """Check the settings of this class.
+        """Check the settings that all trainers share.
 
         Raises:
             ValueError: in one line, naming the setting, its value and what was expected.
@@ -44,17 +44,17 @@ class TrainingConfig:
 
 
 ALWAYS_MAY_CHANGE = ("budget", "checkpoint_every", "log_every")
-"""Settings of every trainer that may differ when a training is resumed: they decide nothing but
-when it ends and what is kept of it."""
+"""Settings of every trainer that may differ when a training is resumed; they affect only when it
+ends and what is saved and logged."""
 
 ConfigT = TypeVar("ConfigT")
 
 
 def changed(config: ConfigT, changes: Mapping[str, Any]) -> ConfigT:
-    """A config, or any dataclass of settings, with some of its fields replaced.
+    """Return a copy of a config, or of any dataclass of settings, with some fields replaced.
 
     Raises:
-        ValueError: in one line, if there is no such setting, naming those that there are, or if a
+        ValueError: in one line, if a setting is unknown, with the names of the known ones, or if a
             value is not allowed.
     """
     settings: Any = config
@@ -66,7 +66,13 @@ def changed(config: ConfigT, changes: Mapping[str, Any]) -> ConfigT:
 
 
 def check_setting(config: object, name: str, expected: str, allowed: Callable[[Any], bool]) -> None:
-    """Check one setting.
+    """Check one setting of a config.
+
+    Args:
+        config: the settings.
+        name: name of the setting.
+        expected: description of the allowed values, for the error message.
+        allowed: returns whether a value is allowed.
 
     Raises:
         ValueError: in one line, naming the setting, its value and what was expected.
@@ -81,7 +87,7 @@ def check_setting(config: object, name: str, expected: str, allowed: Callable[[A
 
 
 def check_whole(config: object, names: Iterable[str], least: int = 1) -> None:
-    """Check settings that are whole numbers.
+    """Check that settings are whole numbers of at least ``least``.
 
     Raises:
         ValueError: as `check_setting` does.
@@ -92,7 +98,7 @@ def check_whole(config: object, names: Iterable[str], least: int = 1) -> None:
 
 
 def check_choice(config: object, name: str, known: Iterable[str]) -> None:
-    """Check a setting that is one of some words.
+    """Check that a setting is one of the known words.
 
     Raises:
         ValueError: as `check_setting` does.

@@ -1,4 +1,4 @@
-"""What a trainer is: a training in progress, one iteration at a time."""
+"""The base class of trainers: a training in progress, one iteration at a time."""
 
 from __future__ import annotations
 
@@ -19,39 +19,40 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRAINING_SEED = 10**6
-"""Seed of the first episode that an estimator trained beforehand learns from; further ones have the
-seeds after it. None is scored on them."""
+"""Seed of the first training episode; further episodes have the seeds after it. No estimator is
+scored on them."""
 
 ConfigT = TypeVar("ConfigT", bound=TrainingConfig)
 TrainedT = TypeVar("TrainedT", bound=Trained)
 
 
 class Trainer(ABC, Generic[ConfigT, TrainedT]):
-    """A training in progress. `pinnobs_gym.training.loop.train` runs it to its end; it owns the
-    progress bar, the log, checkpoints, resumption, the budget and Ctrl-C.
+    """A training in progress.
 
-    A trainer is a class of a module of ``trainers`` that assigns ``name``; it is found by that.
+    `pinnobs_gym.training.loop.train` runs it to its end, and handles the progress bar, the log,
+    checkpoints, resumption, the budget and Ctrl-C. The registry finds a trainer as a class in a
+    module of ``trainers`` that assigns ``name``.
 
     Args:
         system: the model.
-        config: the recipe.
-        record: the samples that are learned from, and the prior; NaN is a missing output. None for
-            a trainer that plays episodes itself.
+        config: the settings.
+        record: the training samples and the prior; NaN marks a missing output. None for a trainer
+            that plays episodes itself.
         noise_std: standard deviation of the output noise in output units, shape (ny,) or one number
             for all outputs; that of the benchmark setup if None.
-        game: what is played, for a trainer that plays episodes itself.
-        episode: seed of the first episode that is played.
+        game: source of the episodes, for a trainer that plays episodes itself.
+        episode: seed of the first episode that such a trainer plays.
 
     Raises:
-        ValueError: in one line, if it cannot be trained with these.
+        ValueError: in one line, if training is impossible with these arguments.
     """
 
     name: ClassVar[str]
-    """What it is called, and what estimators say in ``needs_training``."""
+    """Name of the trainer, which its estimators give in ``needs_training``."""
     presets: ClassVar[Mapping[str, Callable[[], Any]]]
-    """Functions that return a whole Config each, by name; the first is the default."""
+    """Functions by name, each of which returns a complete Config; the first is the default."""
     paced_by_budget: ClassVar[bool] = False
-    """Whether it lays its own schedule out over the budget, and so is finished by it."""
+    """Whether `finished` takes the budget into account, because the schedule depends on it."""
 
     def __init__(
         self,
@@ -70,7 +71,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         self.noise_std = vector(known_noise, system.ny, "noise_std")
         self.episode = episode
         self.iteration = 0
-        """Iterations made so far."""
+        """Number of iterations so far."""
         self.ending: Ending = "running"
         self._record, self._game = record, game
         self._earlier, self._started_at = 0.0, time.process_time()
@@ -78,55 +79,64 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
 
     @classmethod
     def configured(cls, changes: Mapping[str, Any]) -> Any:
-        """The Config of a preset with some settings changed.
+        """Return the Config of a preset with some settings changed.
 
         Args:
-            changes: settings by name; ``preset`` names the preset, the first one if left out.
+            changes: settings by name; ``preset`` names the preset, the first one by default.
 
         Raises:
-            ValueError: in one line, if the preset or a setting is unknown or not allowed.
+            ValueError: in one line, if the preset or a setting is unknown, or a value is not
+                allowed.
         """
-        left = dict(changes)
-        name = left.pop("preset", next(iter(cls.presets)))
+        settings = dict(changes)
+        name = settings.pop("preset", next(iter(cls.presets)))
         if name not in cls.presets:
             raise ValueError(f"preset={name!r}; expected one of {', '.join(cls.presets)}")
-        return changed(cls.presets[name](), left)
+        return changed(cls.presets[name](), settings)
 
     @property
     def record(self) -> Record:
-        """The samples that are learned from."""
+        """The training record.
+
+        Raises:
+            ValueError: if the trainer was given a game.
+        """
         if self._record is None:
             raise ValueError(f"trainer {self.name!r} learns from a record; it was given a game")
         return self._record
 
     @property
     def game(self) -> Game:
-        """What is played."""
+        """The source of the episodes.
+
+        Raises:
+            ValueError: if the trainer was given a record.
+        """
         if self._game is None:
             raise ValueError(f"trainer {self.name!r} plays episodes; it was given a record")
         return self._game
 
     @property
     def has_record(self) -> bool:
-        """Whether it learns from a record."""
+        """Whether the trainer was given a record."""
         return self._record is not None
 
     @property
     def seconds(self) -> float:
-        """CPU seconds so far, those before a resumption included."""
+        """CPU seconds so far, including those before a resumption."""
         return self._earlier + time.process_time() - self._started_at
 
     def continue_from(self, iteration: int, seconds: float) -> None:
-        """Count on from an interrupted training's iterations and CPU seconds."""
+        """Continue the counts of iterations and CPU seconds of an interrupted training."""
         self.iteration = iteration
         self._earlier += seconds
 
     def facts(self, *, loss: float, seed: int) -> dict[str, Any]:
-        """The fields that all `Trained` have, as they are now.
+        """Return the current values of the fields that all `Trained` share.
 
         Args:
             loss: the least loss.
-            seed: what the weights were drawn from.
+            seed: seed of the initial weights.
         """
         system = self.system
         return {
@@ -144,43 +154,44 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
 
     @abstractmethod
     def start(self) -> None:
-        """Check and prepare what is learned from, and draw the first weights.
+        """Check and prepare the training data, and draw the initial weights.
 
         Raises:
-            ValueError: in one line, if it cannot be trained with what it was given.
+            ValueError: in one line, if training is impossible with the data or settings.
         """
 
     @abstractmethod
     def step(self) -> None:
-        """Make one iteration, and count it in ``iteration``."""
+        """Make one iteration, and increment ``iteration``."""
 
     @abstractmethod
     def finished(self) -> bool:
-        """Whether the training is over by itself, whatever its budget."""
+        """Return whether the training is complete; the loop checks the budget, unless
+        ``paced_by_budget``."""
 
     @abstractmethod
     def progress(self) -> float:
-        """How much of the training is over, from 0 to 1."""
+        """Return the finished fraction of the training, from 0 to 1."""
 
     @abstractmethod
     def status(self) -> str:
-        """What the progress bar says, in a few words."""
+        """Return a few words for the progress bar."""
 
     @abstractmethod
     def curves(self) -> Mapping[str, float]:
-        """Values of the logged curves after this iteration, by tag."""
+        """Return the current values of the logged curves by tag."""
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """All that `load_state` needs to go on exactly: tensors, arrays and plain values."""
+        """Return all that `load_state` needs to resume exactly: tensors, arrays, plain values."""
 
     @abstractmethod
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` gave; ``iteration`` is already that of the state."""
+        """Restore the result of `state`; ``iteration`` is already restored."""
 
     @abstractmethod
     def result(self) -> TrainedT:
-        """The best of what was trained so far.
+        """Return the trained object with the best weights so far.
 
         Raises:
             FloatingPointError: in one line, if no loss was finite.
@@ -188,4 +199,4 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
 
     @abstractmethod
     def figures(self, trained: TrainedT) -> Mapping[str, Figure]:
-        """Pictures of what was trained, by name."""
+        """Return Matplotlib figures of the trained object by name."""

@@ -1,4 +1,4 @@
-"""Groups of measured figures: one module each, with ``figures(repeats)``."""
+"""Groups of measured figures; each group is a module with a function ``figures(repeats)``."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ class Figure:
     unit: str
     asked: str
     holds: bool | None
-    """None where nothing is asked."""
+    """Whether the bound holds; None without a bound."""
 
 
 def at_least(figure: str, value: float, unit: str, bound: float | None) -> Figure:
-    """A figure that should be large."""
+    """Return a figure with a lower bound, or without a bound."""
     asked = "" if bound is None else f">= {bound:g}"
     return Figure(figure, value, unit, asked, None if bound is None else value >= bound)
 
 
 def at_most(figure: str, value: float, unit: str, bound: float) -> Figure:
-    """A figure that should be small."""
+    """Return a figure with an upper bound."""
     return Figure(figure, value, unit, f"<= {bound:g}", value <= bound)
 
 
 def cpu_seconds(run: Callable[[], object]) -> float:
-    """CPU time of a call."""
+    """Measure the CPU time of a call in s."""
     start = time.process_time()
     run()
     return time.process_time() - start
 
 
 def median_ratio(peer: Callable[[], object], own: Callable[[], object], repeats: int) -> float:
-    """The median of the peer's CPU time over one's own, the two taken in turn."""
-    peer()  # the first call builds what is kept
+    """Return the median ratio of the peer's CPU time to our own, measured alternately."""
+    peer()  # the first calls fill caches
     own()
     return float(np.median([cpu_seconds(peer) / cpu_seconds(own) for _ in range(repeats)]))

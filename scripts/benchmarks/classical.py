@@ -35,12 +35,12 @@ SEEN = {
     "Satellite": "3/.88/.0022 0/.94/.0022 0/.99/.0091 8/1.66/.0047 13/1.10/.0024 0/.80/.0032",
     "InductionMotor": "0/.19/.0007 0/.09/.0007 0/.04/.0077 0/.02/.0014 8/.28/.0008 0/.03/.0002",
 }
-"""What independent implementations of `NAMES` reached on 100 benchmark episodes: rate of divergence
-in %, median settling time in s, median tail NRMSE, modulo indistinguishable states."""
+"""Scores of independent implementations of `NAMES` on 100 benchmark episodes: rate of divergence in
+%, median settling time in s, and median tail NRMSE modulo indistinguishable states."""
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """Classical estimators."""
+    """Measure the classical estimators."""
     yield from against_filterpy(repeats)
     yield from moving_horizon(repeats)
     yield from false_locks()
@@ -51,7 +51,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def played(name: str, episodes: int) -> tuple[EpisodeSource, np.ndarray, Record]:
-    """The source, true states (batch, num_samples, nx) and record of benchmark episodes."""
+    """Return the source, true states (batch, num_samples, nx) and record of benchmark episodes."""
     source = EpisodeSource(name)
     streams = [Stream(np.random.SeedSequence(seed)) for seed in range(episodes)]
     result = source.play(source.draw(streams))
@@ -59,7 +59,8 @@ def played(name: str, episodes: int) -> tuple[EpisodeSource, np.ndarray, Record]
 
 
 def against_filterpy(repeats: int) -> Iterator[Figure]:
-    """Filters of 256 episodes of ReverseDuffing against filterpy's of one, with the same System."""
+    """Compare filters on 256 episodes of ReverseDuffing with filterpy's on one episode, with the
+    same System."""
     _, _, record = played("ReverseDuffing", 256)
     one = record.rows(slice(0, 1))
     peers: list[tuple[GaussianEstimator, Callable[[], np.ndarray], float | None]] = []
@@ -87,8 +88,10 @@ def against_filterpy(repeats: int) -> Iterator[Figure]:
 
 
 def filterpy_sigma_points(own: GaussianEstimator, record: Record) -> np.ndarray:
-    """Estimates (num_samples, 2) of one ReverseDuffing episode by filterpy's UKF or CKF, the latter
-    made to draw its points anew after the prediction."""
+    """Return the estimates (num_samples, 2) of one ReverseDuffing episode by filterpy's UKF or CKF.
+
+    The CKF's points are drawn again after the prediction, unlike in filterpy.
+    """
     from filterpy.kalman import CubatureKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
     from filterpy.kalman.CubatureKalmanFilter import spherical_radial_sigmas
 
@@ -120,7 +123,7 @@ def filterpy_sigma_points(own: GaussianEstimator, record: Record) -> np.ndarray:
 
 
 def moving_horizon(repeats: int) -> Iterator[Figure]:
-    """The MHE of 64 episodes of ReverseDuffing against do-mpc's of one, both of window 20."""
+    """Compare the MHE on 64 episodes of ReverseDuffing with do-mpc's on one, with window 20."""
     _, _, record = played("ReverseDuffing", 64)
     part = Record(record.t[:200], record.y[:, :200], record.u[:, :200], record.prior)
     own, peer = MHE(ReverseDuffing(), window=20), do_mpc_horizon(part.rows(slice(0, 1)), 20)
@@ -137,8 +140,12 @@ def moving_horizon(repeats: int) -> Iterator[Figure]:
 
 
 def do_mpc_horizon(record: Record, window: int) -> Iterator[np.ndarray]:
-    """Estimates (2,) of one ReverseDuffing episode by do-mpc's MHE, from when its window is full:
-    the same Runge-Kutta step, weights of the outputs and prior, the latter its arrival cost."""
+    """Yield the estimates (2,) of one ReverseDuffing episode by do-mpc's MHE, once its window is
+    full.
+
+    The Runge-Kutta step, the weights of the outputs and the prior, its arrival cost, are those of
+    our MHE.
+    """
     import casadi
     from do_mpc.estimator import MHE as Peer
     from do_mpc.model import Model
@@ -173,7 +180,7 @@ def do_mpc_horizon(record: Record, window: int) -> Iterator[np.ndarray]:
 
 
 def false_locks() -> Iterator[Figure]:
-    """Episodes of the motor that the EKF loses with a large Q, without and with its gate."""
+    """Measure the EKF's rate of divergence on the motor with a large Q, without and with a gate."""
     for gate in (None, 0.9999):
         options = {"process_noise": 1e-3, "gate": gate}
         rows = evaluate("ekf", "pinnobs/InductionMotor-v0", episodes=100, options=options)
@@ -185,7 +192,7 @@ def false_locks() -> Iterator[Figure]:
 def reached(
     name: str, system: str, diverged: float, settling: float, tail: float
 ) -> Iterator[Figure]:
-    """An estimator on 100 benchmark episodes beside what was seen elsewhere."""
+    """Compare an estimator on 100 benchmark episodes with an independent implementation."""
     rows = evaluate(name, f"pinnobs/{system}-v0", episodes=100, seed=0)
     tails = np.array([row["nrmse_tail_modulo"] for row in rows])
     lost = ~(tails <= 0.2)
@@ -199,9 +206,11 @@ def reached(
 
 
 def over_the_reference() -> Iterator[Figure]:
-    """The best online estimator of each system: NRMSE over the Cramér-Rao reference of the same
-    episode, median of 100."""
-    good = 0
+    """Compare the best online estimator of each system with the Cramér-Rao reference.
+
+    The figure is the NRMSE over the reference of the same episode, median of 100 episodes.
+    """
+    within = 0
     for name in SYSTEMS.classes():
         source, x, record = played(name, 100)
         R = np.diag(EKF.for_setup(source.system, source.setup).output_variance)
@@ -217,6 +226,6 @@ def over_the_reference() -> Iterator[Figure]:
             now = float(np.median(scores.nrmse_modulo / reference))
             if now < ratio:
                 best, ratio = label, now
-        good += ratio <= 1.15
+        within += ratio <= 1.15
         yield Figure(f"NRMSE / reference of {best}, best on {name}", ratio, "x", "", None)
-    yield at_least("systems on which that is at most 1.15", good, "", 4.0)
+    yield at_least("systems on which that is at most 1.15", within, "", 4.0)

@@ -26,12 +26,12 @@ EKF_TABLE = {
     "Satellite": (0.0022, 0.03),
     "InductionMotor": (0.0007, 0.0),
 }
-"""Tail NRMSE (median of 100 episodes, modulo indistinguishable states) and rate of divergence that
-an independent EKF reached on the benchmark setup, to two digits."""
+"""Tail NRMSE (median of 100 episodes, modulo indistinguishable states) and rate of divergence of an
+independent EKF on the benchmark setup, to two digits."""
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """Envs, truth and EKF."""
+    """Measure the envs, the truth and the EKF."""
     yield single_env(repeats)
     for name in ("ReverseDuffing", *(n for n in SYSTEMS.classes() if n != "ReverseDuffing")):
         yield vector_env(name, repeats)
@@ -43,7 +43,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def single_env(repeats: int) -> Figure:
-    """Steps of one env with random actions drawn beforehand, resets included."""
+    """Measure the steps of one env with random actions drawn beforehand, resets included."""
     steps = 20_000
 
     def player(name: str) -> Callable[[], None]:
@@ -66,7 +66,7 @@ def single_env(repeats: int) -> Figure:
 
 
 def vector_env(name: str, repeats: int) -> Figure:
-    """Steps of 1,024 rows with random actions drawn beforehand, resets included."""
+    """Measure the steps of 1,024 rows with random actions drawn beforehand, resets included."""
     rows = 1024
 
     def player(name: str, steps: int) -> Callable[[], None]:
@@ -89,11 +89,10 @@ def vector_env(name: str, repeats: int) -> Figure:
 
 
 def ekf_against_filterpy(repeats: int) -> Iterator[Figure]:
-    """The EKF over 256 episodes against filterpy's over one, with the same model and tuning.
+    """Compare the EKF on 256 episodes with filterpy's on one, with the same model and tuning.
 
-    The peer's model is given in three ways: by the same System's f and Jacobian, which is what is
-    asked for; written anew in NumPy; and unrolled in plain floats, the fastest that one episode
-    can have.
+    The peer's model is given in three ways: by the same System's f and Jacobian, to which the bound
+    applies; written separately in NumPy; and unrolled in plain floats, the fastest for one episode.
     """
     source = EpisodeSource("ReverseDuffing")
     streams = [Stream(np.random.SeedSequence(seed)) for seed in range(256)]
@@ -125,7 +124,7 @@ Step = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
 
 
 def filterpy_ekf(ekf: EKF, record: Record, step: Step) -> np.ndarray:
-    """Estimates (num_samples, nx) of one ReverseDuffing episode by filterpy's EKF."""
+    """Return the estimates (num_samples, nx) of one ReverseDuffing episode by filterpy's EKF."""
     from filterpy.kalman import ExtendedKalmanFilter
 
     dt = float(record.t[1] - record.t[0])
@@ -152,7 +151,7 @@ def filterpy_ekf(ekf: EKF, record: Record, step: Step) -> np.ndarray:
 def runge_kutta(
     f: Callable[[np.ndarray], np.ndarray], A: Callable[[np.ndarray], np.ndarray]
 ) -> Step:
-    """The classical Runge-Kutta step of ẋ = f(x) and of its flow Φ' = A(x)Φ."""
+    """Return the classical Runge-Kutta step of ẋ = f(x) and of its flow Φ' = A(x)Φ."""
 
     def step(x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         F = np.eye(len(x))
@@ -180,7 +179,7 @@ numpy_step = runge_kutta(
 
 
 def float_step(x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """The step of ReverseDuffing, unrolled in plain floats."""
+    """Make the step of ReverseDuffing, unrolled in plain floats."""
     a0, b0 = float(x[0]), float(x[1])
     a, b, c = a0, b0, ((1.0, 0.0), (0.0, 1.0))
     rates = []
@@ -198,7 +197,7 @@ def float_step(x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def truth_error(name: str) -> Figure:
-    """The truth of 20 benchmark episodes against an independent solver at rtol 1e-12."""
+    """Compare the truth of 20 benchmark episodes with an independent solver at rtol 1e-12."""
     source = EpisodeSource(name)
     streams = [Stream(np.random.SeedSequence(seed)) for seed in range(20)]
     x0 = source.draw(streams).x0
@@ -218,7 +217,7 @@ def truth_error(name: str) -> Figure:
 
 
 def ekf_scores(name: str, tail: float, diverged: float) -> Iterator[Figure]:
-    """The EKF on 100 benchmark episodes."""
+    """Score the EKF on 100 benchmark episodes."""
     rows = evaluate("ekf", f"pinnobs/{name}-v0", episodes=100, seed=0)
     median = float(np.median([row["nrmse_tail_modulo"] for row in rows]))
     yield at_most(f"EKF's tail NRMSE, median of 100, {name}", median, "", round(1.3 * tail, 6))

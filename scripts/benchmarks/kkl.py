@@ -33,38 +33,38 @@ TRAINERS: dict[str, type[Trainer[Any, Any]]] = {
     "kkl_autoencoder": KKLAutoencoderTrainer,
 }
 SEEDS = range(3)
-"""Training seeds, of which the worst counts."""
+"""Training seeds; bounds apply to the worst one."""
 TIMES = 0.05 * np.arange(1001)
-"""Samples of the episodes on ReverseDuffing, in s."""
+"""Sample times of the ReverseDuffing episodes, in s."""
 FROM = 10.0
-"""When scoring begins there, in s."""
+"""Time in s at which the scoring of these episodes begins."""
 STATES = 400
-"""Initial states that are scored there."""
+"""Number of their initial states."""
 STATES_SEED = 20_261_122
-"""What they are drawn from; nothing was tuned on these."""
+"""Seed of these states, which were not used for tuning."""
 BUDGET = 40.0
-"""CPU seconds of each training there."""
+"""CPU seconds of each training for these episodes."""
 SETTINGS: dict[str, Any] = {"start": "zero", "transient": False, "budget": BUDGET}
 ACCURACY = {"kkl_supervised": 2e-6, "kkl_pinn": 1e-5, "kkl_autoencoder": 2e-5}
-"""Asked of the mean squared error without noise."""
+"""Bounds of the mean squared error without noise."""
 AUTHORS = {"kkl_supervised": 3.8e-4, "kkl_pinn": 3.5e-4, "kkl_autoencoder": 4.7e-4}
-"""What the code that Niazi et al. published reached, in 77 to 205 CPU s."""
+"""Mean squared errors of the code published by Niazi et al., after 77 to 205 CPU s."""
 FAITHFUL_BUDGET = 200.0
 """CPU seconds of each training by a preset ``faithful``."""
 TAIL = {
     **{"ReverseDuffing": 0.005, "ModifiedAcademic": 0.005},
     **{"HarmonicOscillator": 0.01, "Satellite": 0.01},
 }
-"""Asked of the median tail NRMSE of the best of the three on the benchmark."""
+"""Bounds of the median tail NRMSE of the best of the three on the benchmark."""
 EPISODES = 100
-"""Episodes of the benchmark, of seeds 0, 1, ..."""
+"""Number of benchmark episodes, with seeds 0, 1, ..."""
 BENCHMARK_BUDGET = 45.0
-"""CPU seconds of each training on the benchmark, as the leaderboard gives."""
+"""CPU seconds of each training on the benchmark, as on the leaderboard."""
 COST_BATCH = 256
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """All figures of the group."""
+    """Measure all figures of the group."""
     trained = yield from accuracy()
     yield from cost(trained, repeats)
     yield from noisy()
@@ -74,7 +74,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def readme_table(lines: Sequence[dict[str, Any]]) -> str:
-    """The figures with a bound in a table, those of the benchmark's episodes in another."""
+    """Return a table of the figures with a bound, and one of the scores on the benchmark."""
     asked = [line for line in lines if line["asked"] and "training" not in line["figure"]]
     scores = {line["figure"]: line["value"] for line in lines}
     table = []
@@ -100,70 +100,72 @@ def readme_table(lines: Sequence[dict[str, Any]]) -> str:
 
 
 def accuracy() -> Iterator[Figure]:
-    """Without noise on [−1, 1]²."""
+    """Measure the errors without noise on [−1, 1]²; return the last trained object."""
     trained: Any = None
     for name, bound in ACCURACY.items():
         box = {"low": (-1.0, -1.0), "high": (1.0, 1.0), "cutoff": 0.35, "noise": False}
-        found = []
+        errors = []
         for seed in SEEDS:
             trained = fitted(name, 0.0, seed=seed, **box, **SETTINGS)
-            found.append(mse(trained, inside(1.0), 0.0))
-            yield Figure(f"{name}, MSE without noise, seed {seed}", found[-1], "", "", None)
+            errors.append(mse(trained, inside(1.0), 0.0))
+            yield Figure(f"{name}, MSE without noise, seed {seed}", errors[-1], "", "", None)
             title = f"{name}, training, seed {seed}"
             yield at_most(title, trained.seconds, "CPU s", 100.0)
-        yield at_most(f"{name}, MSE without noise, worst seed", max(found), "", bound)
+        yield at_most(f"{name}, MSE without noise, worst seed", max(errors), "", bound)
     return trained
 
 
 def faithful() -> Iterator[Figure]:
-    """The presets that do what the papers say, on the task of `accuracy`."""
-    for name, seen in AUTHORS.items():
+    """Measure the presets with the papers' settings, on the task of `accuracy`."""
+    for name, published in AUTHORS.items():
         box = {"low": (-1.0, -1.0), "high": (1.0, 1.0), "budget": FAITHFUL_BUDGET}
         trained = fitted(name, 0.0, seed=0, preset="faithful", **box)
-        found = mse(trained, inside(1.0), 0.0)
-        yield Figure(f"{name}, MSE without noise, preset faithful", found, "", "", None)
+        error = mse(trained, inside(1.0), 0.0)
+        yield Figure(f"{name}, MSE without noise, preset faithful", error, "", "", None)
         yield Figure(f"{name}, training, preset faithful", trained.seconds, "CPU s", "", None)
-        ratio = seen / found
-        yield Figure(f"MSE of the authors' code ({seen:g}) / that of {name}", ratio, "x", "", None)
+        ratio = published / error
+        yield Figure(
+            f"MSE of the authors' code ({published:g}) / that of {name}", ratio, "x", "", None
+        )
 
 
 def noisy() -> Iterator[Figure]:
-    """With output noise of 0.1 on [−1, 1]², trained with that noise."""
+    """Measure the errors with output noise of 0.1 on [−1, 1]², after training with that noise."""
     box = {"low": (-1.0, -1.0), "high": (1.0, 1.0), "cutoff": 0.1, "order": 5}
-    found = []
+    errors = []
     for seed in SEEDS:
         trained = fitted("kkl_supervised", 0.1, seed=seed, **box, **SETTINGS)
-        found.append(mse(trained, inside(1.0), 0.1))
-        yield Figure(f"kkl_supervised, MSE at noise 0.1, seed {seed}", found[-1], "", "", None)
-    yield at_most("kkl_supervised, MSE at noise 0.1, worst seed", max(found), "", 5e-4)
+        errors.append(mse(trained, inside(1.0), 0.1))
+        yield Figure(f"kkl_supervised, MSE at noise 0.1, seed {seed}", errors[-1], "", "", None)
+    yield at_most("kkl_supervised, MSE at noise 0.1, worst seed", max(errors), "", 5e-4)
 
 
 def outside() -> Iterator[Figure]:
-    """Beyond [−1, 1]², trained on [−3, 3]²."""
+    """Measure the errors from initial states far from the origin, after training on [−3, 3]²."""
     box = {"low": (-3.0, -3.0), "high": (3.0, 3.0), "cutoff": 0.35, "noise": False}
-    found = []
+    errors = []
     for seed in SEEDS:
         trained = fitted("kkl_supervised", 0.0, seed=seed, **box, **SETTINGS)
-        found.append(mse(trained, beyond(), 0.0))
+        errors.append(mse(trained, beyond(), 0.0))
         title = f"kkl_supervised, MSE from 1.5 <= abs x0 <= 3, seed {seed}"
-        yield Figure(title, found[-1], "", "", None)
+        yield Figure(title, errors[-1], "", "", None)
     title = "kkl_supervised, MSE from 1.5 <= abs x0 <= 3, worst seed"
-    yield at_most(title, max(found), "", 5e-5)
+    yield at_most(title, max(errors), "", 5e-5)
 
 
 def inside(side: float) -> np.ndarray:
-    """Initial states uniform in a square."""
+    """Draw initial states, uniform in a square."""
     return np.random.default_rng(STATES_SEED).uniform(-side, side, (STATES, 2))
 
 
 def beyond() -> np.ndarray:
-    """Initial states of both components between 1.5 and 3 in size."""
+    """Draw initial states whose components are both between 1.5 and 3 in size."""
     rng = np.random.default_rng(STATES_SEED)
     return rng.uniform(1.5, 3.0, (STATES, 2)) * rng.choice([-1.0, 1.0], (STATES, 2))
 
 
 def fitted(name: str, noise_std: float, **settings: Any) -> TrainedKKL:
-    """A training on ReverseDuffing."""
+    """Train on ReverseDuffing."""
     cls = TRAINERS[name]
     torch.set_num_threads(1)
     record, config = played(np.zeros((1, 2)), 0.0), cls.configured(settings)
@@ -171,11 +173,12 @@ def fitted(name: str, noise_std: float, **settings: Any) -> TrainedKKL:
 
 
 def played(x0: np.ndarray, noise_std: float) -> Record:
-    """Episodes of ReverseDuffing from initial states."""
+    """Return the record of ReverseDuffing episodes from initial states."""
     return _with_states(x0, noise_std)[0]
 
 
 def _with_states(x0: np.ndarray, noise_std: float) -> tuple[Record, np.ndarray]:
+    """Return the record of episodes, and their true states (batch, num_samples, nx)."""
     system = ReverseDuffing()
     x = truth(system, x0, TIMES).swapaxes(0, 1)
     u = np.empty((*x.shape[:2], 0))
@@ -185,7 +188,7 @@ def _with_states(x0: np.ndarray, noise_std: float) -> tuple[Record, np.ndarray]:
 
 
 def mse(trained: TrainedKKL, x0: np.ndarray, noise_std: float) -> float:
-    """Mean squared error over both states, all episodes and all samples from `FROM` on."""
+    """Return the mean squared error over states, episodes and samples from `FROM` on."""
     record, x = _with_states(x0, noise_std)
     xhat = KKL(ReverseDuffing(), trained=trained).run(record).xhat
     late = record.t >= FROM - 1e-9
@@ -193,7 +196,7 @@ def mse(trained: TrainedKKL, x0: np.ndarray, noise_std: float) -> float:
 
 
 def cost(trained: TrainedKKL, repeats: int) -> Iterator[Figure]:
-    """CPU time of an update, per step and episode."""
+    """Measure the CPU time of an update, per step and episode."""
     record = played(inside(1.0)[:COST_BATCH], 0.0)
     observer = KKL(ReverseDuffing(), trained=trained)
     taken = []
@@ -207,7 +210,7 @@ def cost(trained: TrainedKKL, repeats: int) -> Iterator[Figure]:
 
 
 def benchmark() -> Iterator[Figure]:
-    """The benchmark's episodes, with the default recipes."""
+    """Score the default presets on the benchmark's episodes."""
     for name in SYSTEMS.classes():
         tails, diverged = {}, {}
         for trainer in TRAINERS:
@@ -225,6 +228,7 @@ def benchmark() -> Iterator[Figure]:
 
 
 def _scored(name: str, trainer: str) -> list[dict[str, Any]]:
+    """Train on a system, and return the rows of its benchmark episodes."""
     torch.set_num_threads(1)
     game = Game.of(name)
     system, setup = game.source.system, game.source.setup

@@ -30,7 +30,7 @@ EPISODES = 105
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """CPU seconds and MB of the page of 100,000 made-up rows with their curves."""
+    """Measure the CPU seconds and MB of the page of 100,000 synthetic rows with their curves."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rows.jsonl"
         count = _make(path, np.random.default_rng(0))
@@ -46,7 +46,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def _make(path: Path, rng: np.random.Generator) -> int:
-    """Write the rows and curves of a leaderboard; returns how many rows."""
+    """Write the rows and curves of a leaderboard; return the number of rows."""
     count = 0
     for system, cls in SYSTEMS.classes().items():
         own = [cls.ranked_condition, *(c for c in CONDITIONS if c != cls.ranked_condition)]
@@ -64,7 +64,7 @@ def _make(path: Path, rng: np.random.Generator) -> int:
 def _rows(
     system: str, number: int, condition: str, skill: float, rng: np.random.Generator
 ) -> list[Row]:
-    """The rows of one estimator under one condition."""
+    """Return the rows of one estimator under one condition."""
     cls = SYSTEMS.resolve(system)
     names = (*SCORES, *OPTIONAL_SCORES)
     values = skill * np.exp(rng.normal(-3, 0.5, (EPISODES, len(names))))

@@ -23,9 +23,9 @@ from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer, paper, transfer
 
 SEEDS = range(5)
 PAPER_ITERATIONS = 101_431
-"""What the paper's best training took (its table of depths and widths, 9×20)."""
+"""Iterations of the paper's best training (its table of depths and widths, 9×20)."""
 LOSS, RMSE = 9.56e-4, 0.0562
-"""What it reached."""
+"""Loss and RMSE of that training."""
 EKF_RMSE = {
     "ReverseDuffing": 0.0216,
     "HarmonicOscillator": 0.168,
@@ -34,7 +34,7 @@ EKF_RMSE = {
     "Satellite": 0.0372,
     "InductionMotor": 0.0102,
 }
-"""RMSE over the whole episode, paper setup, that an independent EKF reached without noise."""
+"""RMSE of an independent EKF over the whole episode of the paper setup, without noise."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Case:
 
     @staticmethod
     def of(name: str) -> Case:
-        """The episode that the paper shows."""
+        """Return the episode shown in the paper."""
         source = EpisodeSource(name, "paper")
         played = source.play(source.draw([Stream(np.random.SeedSequence(0))]))
         record = source.record(played)
         return Case(source.system, record, played.x[: record.num_samples, 0])
 
     def elsewhere(self, x0: list[float], xhat0: list[float]) -> Case:
-        """The same plant from another initial state and estimate."""
+        """Return an episode of the same plant from another initial state and estimate."""
         record = self.record
         x = truth(self.system, np.array([x0]), record.t, None)[:, 0]
         prior = Prior(np.array([xhat0]), record.prior.cov)
@@ -63,30 +63,30 @@ class Case:
         return Case(self.system, replace(record, y=y[None], prior=prior), x)
 
     def noisy(self, std: float, seed: int) -> Case:
-        """The same episode with noise on its outputs."""
+        """Return the same episode with noise on its outputs."""
         noise = std * np.random.default_rng(seed).standard_normal(self.record.y.shape)
         return replace(self, record=replace(self.record, y=self.record.y + noise))
 
     def trained(self, config: PinnObsConfig, noise_std: float = 0.0) -> TrainedNetwork:
-        """What comes of a training on this record."""
+        """Train on this record."""
         return train(PinnObsTrainer(self.system, config, record=self.record, noise_std=noise_std))
 
     def rmse(self, xhat: np.ndarray) -> float:
-        """Root mean square of the errors of all states and samples, as in the paper."""
+        """Return the root mean square error over all states and samples, as in the paper."""
         return float(np.sqrt(np.mean((xhat - self.x) ** 2)))
 
     def direct(self, trained: TrainedNetwork) -> float:
-        """RMSE of the network's own estimates."""
+        """Return the RMSE of the network's own estimates."""
         return self.rmse(trained.xhat(self.record.t))
 
     def replayed(self, trained: TrainedNetwork) -> float:
-        """RMSE of the observer with the learned gain; not finite if it diverges."""
+        """Return the RMSE of the observer with the learned gain; not finite if it diverges."""
         with np.errstate(all="ignore"):
             return self.rmse(PinnObsReplay(self.system, trained=trained).run(self.record).xhat[0])
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """Everything asked of PINN-Obs."""
+    """Measure all figures of PINN-Obs."""
     duffing = Case.of("ReverseDuffing")
     plain, own = iteration_seconds(duffing, max(repeats, 3))
     whole = plain * PAPER_ITERATIONS
@@ -107,13 +107,13 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def iteration_seconds(case: Case, repeats: int) -> tuple[float, float]:
-    """CPU seconds of an iteration of the paper's recipe: in plain autograd, and ours."""
+    """Measure the CPU seconds of an iteration of the paper's recipe: plain autograd's, and ours."""
     torch.set_num_threads(1)
     run = PinnObsTrainer(case.system, paper(), record=case.record, noise_std=0.0)
     peer = plain_iteration(case)
     batch = 10
     times = []
-    for _ in range(repeats + 1):  # the first builds what is kept
+    for _ in range(repeats + 1):  # the first repeat fills caches
         theirs = cpu_seconds(lambda: [peer() for _ in range(batch)])
         times.append((theirs, cpu_seconds(lambda: [run.step() for _ in range(batch)])))
     plain, own = np.median(times[1:], axis=0) / batch
@@ -121,8 +121,11 @@ def iteration_seconds(case: Case, repeats: int) -> tuple[float, float]:
 
 
 def plain_iteration(case: Case) -> Callable[[], None]:
-    """An iteration of the paper's recipe as a script in torch does it: dx̂/dt by a reverse pass per
-    state, the loss's gradient by another through these, Adam."""
+    """Return a function that makes an iteration of the paper's recipe in plain torch.
+
+    dx̂/dt is computed by a reverse pass per state, and the gradient of the loss by another reverse
+    pass through these; the optimiser is Adam.
+    """
     system, record = case.system, case.record
     chosen = np.sort(np.random.default_rng(0).permutation(record.num_samples)[:6000])
     t = torch.tensor(record.t[chosen], dtype=torch.float32, requires_grad=True)
@@ -150,8 +153,10 @@ def plain_iteration(case: Case) -> Callable[[], None]:
 
 
 def seconds_to_paper(case: Case, depth: int, seed: int, limit: float) -> float:
-    """CPU seconds of the fast recipe until loss and RMSE are the paper's, looked at every ten
-    iterations; infinite if that takes over the limit."""
+    """Measure the CPU seconds of the fast recipe until loss and RMSE reach the paper's.
+
+    They are checked every ten iterations. The result is infinite if the limit is exceeded.
+    """
     spent, start = 0.0, time.process_time()
     config = PinnObsConfig(depth=depth, seed=seed)
     run = PinnObsTrainer(case.system, config, record=case.record, noise_std=0.0)
@@ -169,7 +174,7 @@ def seconds_to_paper(case: Case, depth: int, seed: int, limit: float) -> float:
 
 
 def replays(case: Case, budget: float) -> Iterator[Figure]:
-    """The gain on the record that it was trained on, without and with output noise."""
+    """Score the gain on its training record, without and with output noise."""
     for std, asked in ((0.0, 0.021), (0.05, 0.025)):
         values = []
         for seed in SEEDS:
@@ -182,7 +187,7 @@ def replays(case: Case, budget: float) -> Iterator[Figure]:
 
 
 def transfers(case: Case) -> Iterator[Figure]:
-    """A gain meant for other records on one that it was not trained on."""
+    """Score a gain of the preset ``transfer`` on a record that it was not trained on."""
     other = case.elsewhere([1.0, 1.5], [0.0, 0.0])
     own, elsewhere = [], []
     for seed in SEEDS:
@@ -195,7 +200,7 @@ def transfers(case: Case) -> Iterator[Figure]:
 
 
 def paper_setup(name: str) -> Iterator[Figure]:
-    """A system on the paper's setup: the network's estimates and its gain replayed."""
+    """Score the network's estimates and the replay of its gain on a system's paper setup."""
     case = Case.of(name)
     results = []
     for seed in SEEDS:

@@ -19,22 +19,22 @@ from pinnobs_gym.training.by_name import train_by_name
 from trainers.pinn_gain import PinnGainConfig
 
 SEEDS = 3
-"""Training seeds, of which the median counts."""
+"""Number of training seeds; bounds apply to the median."""
 EPISODES = 100
-"""Episodes of seeds 0, 1, ..."""
+"""Number of episodes, with seeds 0, 1, ..."""
 CONDITIONS = ("nominal", "noise5")
 WHOLE = {"ReverseDuffing": 0.8, "InductionMotor": 0.8}
-"""Asked of the whole window's NRMSE over the EKF's; one elsewhere."""
+"""Bounds of the NRMSE over the whole episode, relative to the EKF's; 1 for other systems."""
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """The shared gain, system by system."""
+    """Measure the shared gain, system by system."""
     for name in SYSTEMS.classes():
         yield from of_system(name, repeats)
 
 
 def of_system(name: str, repeats: int) -> Iterator[Figure]:
-    """The figures of all training seeds on one system, their medians, and its speed."""
+    """Measure the figures of all training seeds on one system, their medians, and the speed."""
     ratios: dict[tuple[str, str], list[float]] = {}
     trainings = []
     for seed in range(SEEDS):
@@ -54,13 +54,13 @@ def of_system(name: str, repeats: int) -> Iterator[Figure]:
 
 
 def trained_on(name: str, seed: int) -> Any:
-    """A gain trained by the default recipe."""
+    """Train a gain with the default settings."""
     config = PinnGainConfig(seed=seed)
     return train_by_name("pinn_gain", config, Game.of(name))
 
 
 def compared(name: str, condition: str, trained: TrainedGain) -> dict[str, float]:
-    """The scores of a gain and of the EKF, both told the noise; see `summary`."""
+    """Compare a gain with the EKF, both with known noise; see `summary`."""
     env = env_id(name)
     source = Game.of(name, condition=condition).source
     system, setup = source.system, source.setup
@@ -70,11 +70,11 @@ def compared(name: str, condition: str, trained: TrainedGain) -> dict[str, float
 
 
 def summary(ekf: list[Row], gain: list[Row]) -> dict[str, float]:
-    """Both rates of divergence, and the gain's figures over the EKF's, all modulo states that no
-    output tells apart."""
-    found = {}
+    """Return both rates of divergence, and the gain's scores over the EKF's, all modulo
+    indistinguishable states."""
+    scores = {}
     for label, rows in (("EKF", ekf), ("gain", gain)):
-        found[f"diverged, {label}"] = float(
+        scores[f"diverged, {label}"] = float(
             np.mean([not r["nrmse_tail_modulo"] <= 0.2 for r in rows])
         )
     for what, key, part in (
@@ -83,20 +83,20 @@ def summary(ekf: list[Row], gain: list[Row]) -> dict[str, float]:
         ("settling median", "settling", 0.5),
         ("settling 90th percentile", "settling", 0.9),
     ):
-        # Episodes that never settle count as infinite, between which nothing can be interpolated.
+        # Settling times may be infinite, so quantiles are taken without interpolation.
         own, peer = (
             np.quantile([r[key] for r in rows], part, method="higher") for rows in (gain, ekf)
         )
-        found[f"{what} / EKF's"] = float(own / peer)
-    return found
+        scores[f"{what} / EKF's"] = float(own / peer)
+    return scores
 
 
 def asked(
-    name: str, condition: str, what: str, found: dict[tuple[str, str], list[float]]
+    name: str, condition: str, what: str, scores: dict[tuple[str, str], list[float]]
 ) -> float | None:
-    """What is asked of a median, if anything."""
+    """Return the bound of a median, if it has one."""
     if what == "diverged, gain":
-        return 0.0 if condition == "nominal" else found[condition, "diverged, EKF"][0]
+        return 0.0 if condition == "nominal" else scores[condition, "diverged, EKF"][0]
     if what == "tail NRMSE / EKF's":
         return 1.15
     if condition != "nominal":
@@ -109,7 +109,7 @@ def asked(
 
 
 def speed(name: str, trained: TrainedGain, repeats: int) -> Iterator[Figure]:
-    """Time per step and episode of a batch of 256."""
+    """Measure the time per step and episode of a batch of 256."""
     game = Game.of(name)
     system, setup, record = game.source.system, game.source.setup, game.record(range(256))
     steps = record.batch * record.num_samples

@@ -16,12 +16,12 @@ from trainers.pinn_obs.objective import Objective
 
 MANY = 64
 SINGLE = 4
-"""How many records are taken for the time of one."""
+"""Number of records by which the time of a single training is measured."""
 ITERATIONS = 60
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """PINN-Obs on many records."""
+    """Measure PINN-Obs on many records."""
     source = EpisodeSource("ReverseDuffing")
     streams = [Stream(np.random.SeedSequence(seed)) for seed in range(MANY)]
     record = source.record(source.play(source.draw(streams)))
@@ -30,8 +30,10 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def at_once(source: EpisodeSource, record: Record, repeats: int) -> Figure:
-    """Records per CPU-second of `train_rows` over those of `train`, in the first iterations of the
-    fast preset, which all cost the same."""
+    """Compare the records per CPU-second of `train_rows` with those of `train`.
+
+    Only the first iterations of the fast preset are run; all iterations cost the same.
+    """
     system, noise = source.system, source.setup.noise_std
     config = PinnObsConfig(iterations=ITERATIONS)
 
@@ -55,11 +57,14 @@ def at_once(source: EpisodeSource, record: Record, repeats: int) -> Figure:
 
 
 def stacked_evaluations(source: EpisodeSource, record: Record, repeats: int) -> Figure:
-    """Losses and gradients per CPU-second of the stack that a GPU is given over those of single
-    records, both on the CPU: why `train_rows` takes one record after another there."""
+    """Compare the evaluations per CPU-second of stacked objectives with those of single ones.
+
+    Both run on the CPU, where the result is the reason that `train_rows` trains one record after
+    another.
+    """
     noise = source.setup.noise_std
     rows = [record.rows(slice(i, i + 1)) for i in range(MANY)]
-    config = PinnObsConfig(guide=0.0)  # which takes no part in the time of an evaluation
+    config = PinnObsConfig(guide=0.0)  # the guide is no part of an evaluation
     runs = [PinnObsTrainer(source.system, config, record=r, noise_std=noise) for r in rows]
     objectives = [run.recipe.objective for run in runs]
     thetas = [run.theta for run in runs]

@@ -1,4 +1,4 @@
-"""PINN-Obs' network as a script in torch has it: what ours is compared with."""
+"""The network of PINN-Obs in plain torch, as a reference for ours."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ _ACTIVATIONS = {
 
 
 class Network(nn.Module):
-    """A multilayer perceptron t ↦ (x̂(t), L(t)) (Farkane et al., PINN-Obs, "Proposed Adaptive
-    PINN-Based Model"); weights drawn as Glorot & Bengio (2010) propose, biases zero.
+    """Multilayer perceptron t ↦ (x̂(t), L(t)) (Farkane et al., PINN-Obs, "Proposed Adaptive
+    PINN-Based Model").
+
+    The initial weights are those of Glorot & Bengio (2010); the initial biases are zero.
 
     Args:
-        architecture: the sizes.
-        generator: where the weights are drawn from; one of seed 0 if None.
+        architecture: architecture of the network.
+        generator: random generator of the weights; one with seed 0 if None.
     """
 
     def __init__(
@@ -40,11 +42,11 @@ class Network(nn.Module):
 
     @property
     def layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights and biases of each layer."""
+        """Return the weights and biases of each layer."""
         return list(zip(self.weights, self.biases, strict=True))
 
     def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimates (..., nx) in state units and gains (..., nx, ny) at times t (...) in s."""
+        """Return x̂ (..., nx) in state units and L (..., nx, ny) at times t (...) in s."""
         *hidden, (weight, bias) = self.layers
         a, _ = self.architecture.features(t)
         for W, b in hidden:

@@ -11,21 +11,21 @@ from benchmarks import Figure, at_least, cpu_seconds
 from pinnobs_gym.systems import SYSTEMS
 
 FRAMES = 50
-"""Frames that are drawn at the end of an episode, where its curves are longest."""
+"""Number of frames that are drawn at the end of an episode, where its curves are longest."""
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """Frames per CPU-second with ``render_mode="rgb_array"``, a step of the env in each."""
+    """Measure the frames per CPU-second with ``render_mode="rgb_array"``, with a step per frame."""
     for name in SYSTEMS.classes():
         fps = float(np.median([FRAMES / cpu_seconds(last_frames(name)) for _ in range(repeats)]))
         yield at_least(f"rgb_array, {name}, steps with a frame per CPU-second", fps, "1/s", 30.0)
 
 
 def last_frames(name: str) -> Callable[[], None]:
-    """Play an episode up to its last frames; what is returned plays and draws these."""
+    """Play an episode up to its last frames; return a function that plays and draws these."""
     env = gym.make(f"pinnobs/{name}-v0", render_mode="rgb_array")
     _, info = env.reset(seed=0)
-    env.render()  # the first one of an episode draws what stays the same
+    env.render()  # the first frame of an episode draws the fixed parts
     estimate = info["xhat0"].astype(np.float32)
     num_steps = SYSTEMS.resolve(name).setups["benchmark"].num_steps
     for _ in range(num_steps - FRAMES):

@@ -25,16 +25,16 @@ from pinnobs_gym.training.by_name import train_by_name
 from trainers.rl import RLConfig
 
 SEEDS = 3
-"""Training seeds."""
+"""Number of training seeds."""
 EPISODES = 100
-"""Episodes of seeds 0, 1, ..."""
+"""Number of episodes, with seeds 0, 1, ..."""
 DUFFING = "ReverseDuffing"
 FRAMES = 16_384
-"""Frames of a rollout, and of a measurement."""
+"""Number of steps of a rollout, and of a measurement."""
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """Speed, then training and scores, system by system."""
+    """Measure the speed, then the training and scores, system by system."""
     yield from speed(repeats)
     near = []
     for name in SYSTEMS.classes():
@@ -62,7 +62,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def readme_table(lines: Sequence[dict[str, Any]]) -> str:
-    """The agents' tail NRMSE, system by system and seed by seed, over the EKF's."""
+    """Return the table of the agents' tail NRMSE over the EKF's, by system and seed."""
     values = {line["figure"]: line["value"] for line in lines}
     table = []
     for name in SYSTEMS.classes():
@@ -94,24 +94,24 @@ def _of(values: dict[str, float], start: str, end: str = "") -> float:
 
 
 def trained_on(name: str, seed: int) -> Any:
-    """An agent trained by the default recipe."""
+    """Train an agent with the default settings."""
     return train_by_name("rl", RLConfig(seed=seed), Game.of(name))
 
 
 def scores(name: str, trained: TrainedAgent) -> list[Row]:
-    """The rows of an agent's episodes."""
+    """Return the rows of an agent's episodes."""
     system = SYSTEMS.resolve(name)()
     estimator = Sb3(system, trained.setup["noise_std"], trained=trained)
     return evaluate(estimator, env_id(name), episodes=EPISODES)
 
 
 def tail(rows: list[Row]) -> float:
-    """The median over episodes."""
+    """Return the median tail NRMSE over episodes, modulo indistinguishable states."""
     return float(np.median([row["nrmse_tail_modulo"] for row in rows]))
 
 
 def limited(figure: str, value: float, bound: float | None) -> Figure:
-    """A figure with a limit, or none."""
+    """Return a figure with an upper bound, or without a bound."""
     return (
         Figure(figure, value, "x", "", None)
         if bound is None
@@ -120,7 +120,7 @@ def limited(figure: str, value: float, bound: float | None) -> Figure:
 
 
 def reproduced(name: str, trained: TrainedAgent) -> Figure:
-    """The largest difference of any score of the agent and of the same one saved and loaded."""
+    """Measure the largest difference in any score between an agent and its reloaded copy."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "agent.pt"
         trained.save(path)
@@ -131,8 +131,10 @@ def reproduced(name: str, trained: TrainedAgent) -> Figure:
 
 
 def speed(repeats: int) -> Iterator[Figure]:
-    """PPO on the gain form through the adapter at 256 rows against SB3's way with 8 single envs:
-    the same frames of a rollout, gradients and network."""
+    """Compare the speed of PPO with gains on 256 rows through the adapter, and on 8 single envs.
+
+    Both have the same steps per rollout, gradients and network.
+    """
     name = env_id(DUFFING)
     arguments: dict[str, Any] = {"action_mode": "gain", "reward": "improvement"}
 
@@ -149,7 +151,7 @@ def speed(repeats: int) -> Iterator[Figure]:
 
 
 def learner(env: VecEnv, epochs: int) -> Callable[[], object]:
-    """A function that trains an agent for one rollout."""
+    """Return a function that trains an agent for one rollout."""
     steps = FRAMES // env.num_envs
     model = PPO("MlpPolicy", env, n_steps=steps, batch_size=512, n_epochs=epochs, device="cpu")
     return lambda: model.learn(FRAMES)

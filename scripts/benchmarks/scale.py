@@ -33,7 +33,7 @@ EPISODES = 120
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """The engine and the tables."""
+    """Measure the engine and the tables."""
     yield from overhead("loky", Workers(2), 5.0)
     with cluster() as address:
         yield from overhead("Dask", Workers(scheduler=address), 20.0)
@@ -42,13 +42,16 @@ def figures(repeats: int) -> Iterator[Figure]:
 
 
 def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
-    """So many rows as a leaderboard would store them, with made-up scores: estimators on systems
-    under conditions, game by game, `EPISODES` of each."""
+    """Return ``count`` rows of a leaderboard with synthetic scores.
+
+    There are `EPISODES` rows for each estimator, system and condition; if these are too few, they
+    are repeated with further training seeds.
+    """
     rng = np.random.default_rng(seed)
     names = sorted(set(ESTIMATORS.classes()) - {"ekf"})
     systems = [cls for name, cls in SYSTEMS.classes().items() if cls.__module__.startswith("pinn")]
     games = product(CONDITIONS, systems, ["ekf", *names])
-    found: list[rows.Row] = []
+    made: list[rows.Row] = []
     for condition, cls, name in games:
         model, _ = cls.configured()
         estimator = ESTIMATORS.classes()[name]
@@ -73,30 +76,30 @@ def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
             "batch": EPISODES,
         }
         level = rng.lognormal(-3, 1)
-        for episode in range(min(EPISODES, count - len(found))):
+        for episode in range(min(EPISODES, count - len(made))):
             score = float(level * rng.lognormal(0, 0.4))
             row = base | dict.fromkeys(SCORES, score) | dict.fromkeys(OPTIONAL_SCORES)
             row |= {"nrmse_tail": score / 10, "nrmse_tail_modulo": score / 10, "settling": 1.0}
             row |= {"anees": 1.0, "coverage": 0.9, "reference_ratio": score / 0.03}
-            found.append(
+            made.append(
                 row | {"diverged": score > 2, "episode_seed": episode, "us_per_step": float(level)}
             )
-        if len(found) == count:
-            return found
-    seeds = range(1, 1 + count // len(found))  # of training, once all games are full
-    return (found + [row | {"training_seed": s} for s in seeds for row in found])[:count]
+        if len(made) == count:
+            return made
+    seeds = range(1, 1 + count // len(made))  # training seeds
+    return (made + [row | {"training_seed": s} for s in seeds for row in made])[:count]
 
 
 @dataclass(frozen=True)
 class Trivial:
-    """A job that does nothing but append a row."""
+    """A job that only appends a row."""
 
     folder: Path
     row: rows.Row
 
     @property
     def name(self) -> str:
-        """What it does."""
+        """Name of the job."""
         return "trivial"
 
     def run(self) -> None:
@@ -104,32 +107,34 @@ class Trivial:
         rows.append(self.folder / "rows.jsonl", [self.row])
 
     def anew(self) -> Trivial:
-        """The same."""
+        """Return the job itself."""
         return self
 
     def fail(self, error: str) -> None:
-        """Never."""
+        """Raise an error; this job never fails."""
         raise AssertionError(error)
 
 
 def overhead(name: str, workers: Workers, bound: float) -> Iterator[Figure]:
-    """Wall time a job of `JOBS` that each append a row, once all workers have done one, and with
-    the start of the workers."""
+    """Measure the wall time per job of `JOBS` jobs that each append a row.
+
+    It is measured once all workers are running, and including their start.
+    """
     with tempfile.TemporaryDirectory() as folder:
         jobs = [Trivial(Path(folder), row) for row in synthetic_rows(JOBS)]
-        begun = time.perf_counter()
+        start = time.perf_counter()
         times = [time.perf_counter() for _ in Engine(workers).run(jobs)]
         assert len(rows.read(Path(folder) / "rows.jsonl")) == JOBS
-    first = 50  # by then both workers have loaded what they need
+    first = 50  # by then both workers have imported all modules
     steady = 1000 * (times[-1] - times[first]) / (JOBS - 1 - first)
     yield at_most(f"overhead of a job, two workers of {name}", steady, "ms", bound)
-    whole = 1000 * (times[-1] - begun) / JOBS
+    whole = 1000 * (times[-1] - start) / JOBS
     yield Figure(f"the same, {name}'s start included", whole, "ms", "", None)
 
 
 @contextmanager
 def cluster() -> Iterator[str]:
-    """A Dask scheduler of this machine with two workers; its address."""
+    """Start a local Dask scheduler with two workers, and yield its address."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scheduler.json"
         local = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
@@ -154,18 +159,21 @@ def cluster() -> Iterator[str]:
 
 
 def two_over_one(repeats: int) -> Figure:
-    """Wall time of the EKF on every system under some conditions, in one process over two, which
-    have been started and have done the suite once."""
+    """Measure the ratio of wall times with one process and with two.
+
+    The suite is the EKF on every system under some conditions; the processes are warmed up by one
+    run of the suite.
+    """
     played = ("nominal", "noise5", "outliers", "dropout30", "gap")
     suite = Suite(estimators=(Entry("ekf"),), conditions=played)
 
     def seconds(processes: int) -> float:
         with tempfile.TemporaryDirectory() as folder:
             jobs = plan.jobs_of(suite, Path(folder))
-            begun = time.perf_counter()
+            start = time.perf_counter()
             for job, error in Engine(Workers(processes)).run(jobs):
                 assert error is None, (job, error)
-            return time.perf_counter() - begun
+            return time.perf_counter() - start
 
     seconds(2)
     ratios = [seconds(1) / seconds(2) for _ in range(repeats)]
@@ -174,14 +182,14 @@ def two_over_one(repeats: int) -> Figure:
 
 
 def many_rows() -> Iterator[Figure]:
-    """Seconds from a rows file to all tables."""
+    """Measure the seconds from a file of rows to all tables."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rows.jsonl"
         rows.append(path, synthetic_rows(ROWS))
-        begun = time.perf_counter()
+        start = time.perf_counter()
         stored = rows.load(path)
         read = time.perf_counter()
         markdown(board(stored))
         end = time.perf_counter()
-    yield at_most(f"{ROWS:,} rows read", read - begun, "s", 4)
-    yield at_most(f"{ROWS:,} rows read, and all tables", end - begun, "s", 4)
+    yield at_most(f"{ROWS:,} rows read", read - start, "s", 4)
+    yield at_most(f"{ROWS:,} rows read, and all tables", end - start, "s", 4)

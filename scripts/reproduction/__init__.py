@@ -1,1 +1,1 @@
-"""The paper's tables and examples made anew: what it prints, how a case is run, and the report."""
+"""Reproduction of the paper's tables and examples: printed figures, training and report."""

@@ -1,4 +1,4 @@
-"""PINN-Obs and the three learned KKL observers on the same records of ReverseDuffing."""
+"""Comparison of PINN-Obs and the three learned KKL observers on the same ReverseDuffing records."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ PRINTED: Mapping[str, tuple[float | None, ...]] = {
     "kkl_supervised": (3.94e-5, 0.00628, None, None),
     "kkl_autoencoder": (4.39e-5, 0.00663, None, None),
 }
-"""What the paper prints, "Comparison with Existing Methods", in the order of `METRICS`; the others
-are bars of a figure."""
+"""Figures printed in the paper, "Comparison with Existing Methods", in the order of `METRICS`; the
+others are shown as bars only."""
 WINDOWS = {"whole": 0.0, "from 10 s": 10.0}
-"""Windows that are scored, by when they begin in s."""
+"""Start in s of each scored window."""
 HEADER = ("method", "by", "window", "statistic", "MSE", "RMSE", "MAE", "SMAPE %", "training s")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is compared."""
+    """Settings of the comparison."""
 
     preset: str
-    """PINN-Obs' recipe: fast or paper."""
+    """Recipe of PINN-Obs: fast or paper."""
     budget: float | None
     """CPU seconds of each training."""
     seed: int
-    """Seed of the weights."""
+    """Seed of the initial weights."""
     records: int
-    """Initial states: episodes of the benchmark's seeds 0, 1, ..."""
+    """Number of records: benchmark episodes with seeds 0, 1, ..."""
 
     def config(self, method: str) -> Any:
-        """A method's recipe."""
+        """Return the config of a method."""
         common: dict[str, Any] = {"seed": self.seed, "budget": self.budget}
         if method.startswith("pinn_obs"):
             transfer = method == "pinn_obs_replay" and self.preset == "fast"
@@ -74,12 +74,12 @@ class Comparison:
         return METHODS[method].configured(common)
 
     def key(self, method: str, episode: int) -> str:
-        """What decides a method's scores on an episode."""
+        """Return a hash of all that determines a method's scores on an episode."""
         text = json.dumps([method, episode, canonical(self.config(method))], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def protocol(self) -> list[str]:
-        """What the figures are of, a paragraph each."""
+        """Return the paragraphs that describe how the figures are obtained."""
         source = _source()
         setup = source.setup
         return [
@@ -106,7 +106,7 @@ def _source() -> EpisodeSource:
 
 
 def played(records: int) -> tuple[Record, np.ndarray]:
-    """The records, and the true states (records, num_samples, nx)."""
+    """Return the records, and their true states (records, num_samples, nx)."""
     source = _source()
     streams = [Stream(np.random.SeedSequence(seed)) for seed in range(records)]
     episodes = source.play(source.draw(streams))
@@ -115,7 +115,7 @@ def played(records: int) -> tuple[Record, np.ndarray]:
 
 
 def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]:
-    """Train and score what is missing, keeping each row as it is made; yields what was done."""
+    """Train and score the missing cases, store each row at once, and yield progress messages."""
     torch.set_num_threads(1)
     record, x = played(comparison.records)
     system = _source().system
@@ -164,27 +164,27 @@ def _row(
 
 
 def read(path: Path) -> dict[str, Row]:
-    """Rows by key; none if the file is not there.
+    """Read the rows by key; none if the file does not exist.
 
     Raises:
-        ValueError: in one line, if a line of it is not a row.
+        ValueError: in one line, if a line of the file is not a row.
     """
-    found: dict[str, Row] = {}
+    results: dict[str, Row] = {}
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
-            found[row["key"]] = row
+            results[row["key"]] = row
         except (ValueError, TypeError, KeyError):
             raise ValueError(
                 f"{path}, line {number}, is cut off or no result: {line[:40]!r}; delete that line "
                 "and run again"
             ) from None
-    return found
+    return results
 
 
 def lines(comparison: Comparison, rows: Mapping[str, Row]) -> list[tuple[str, ...]]:
-    """The table's cells: for each method the paper's line, then ours."""
+    """Return the rows of the table: for each method the paper's, then ours."""
     table: list[tuple[str, ...]] = []
     for method in METHODS:
         if method in PRINTED:
@@ -207,7 +207,7 @@ def _values(rows: Sequence[Row], window: str, metric: str) -> list[float]:
 
 
 def markdown(comparison: Comparison, rows: Mapping[str, Row]) -> str:
-    """The table with its protocol as Markdown."""
+    """Return the table with its protocol as Markdown."""
     cells = [HEADER, ("---",) * 4 + ("---:",) * 5, *lines(comparison, rows)]
     body = "\n".join("| " + " | ".join(line) + " |" for line in cells)
     title = "# PINN-Obs and learned KKL observers on ReverseDuffing"

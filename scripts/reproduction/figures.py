@@ -1,4 +1,4 @@
-"""Pictures of a training, from those of the package and the trainer."""
+"""Figures of a training, based on those of the package and the trainer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def estimates_figure(played: Played, title: str) -> Figure:
-    """True states and estimates of an episode, the legend above instead of on the curves."""
+    """Plot the true states and estimates of an episode, with the legend above the curves."""
     figure = played.figure(title)
     top = figure.axes[0]
     legend = top.get_legend()
@@ -28,8 +28,11 @@ def estimates_figure(played: Played, title: str) -> Figure:
 
 
 def readable_gain_figure(trained: TrainedNetwork) -> Figure:
-    """The learned gains over the record; those over ten times a state's usual gain, as right after
-    t₀, are on a logarithmic scale."""
+    """Plot the learned gains over the record.
+
+    If a state's gain exceeds ten times its 95 % quantile, as it may right after t₀, the scale is
+    logarithmic above that quantile, rounded up to a power of ten.
+    """
     L = trained.gain(trained.t)
     figure = gain_figure(trained.t, L)
     for i, panel in enumerate(figure.axes):
@@ -43,7 +46,7 @@ def readable_gain_figure(trained: TrainedNetwork) -> Figure:
 
 
 def loss_figure(curve: np.ndarray, title: str) -> Figure:
-    """The least loss over iterations, from points (num_points, 2)."""
+    """Plot the least loss over iterations, from points (num_points, 2)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 3), layout="constrained")

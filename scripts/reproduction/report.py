@@ -1,4 +1,4 @@
-"""Results as the paper's tables, its figures beside ours; and the file they are kept in."""
+"""Tables of the results beside the paper's figures, and the file of the results."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ PROTOCOL = (
 
 
 def starts(table: Table) -> str:
-    """The records of a table: initial states and estimates, and samples."""
+    """Describe the records of a table: initial states and estimates, and samples."""
     parts, sizes = [], set()
     for name in dict.fromkeys(case.system for case in table.cases):
         _, setup = SYSTEMS.resolve(name).configured(SETUP)
@@ -59,10 +59,10 @@ def _vector(values: Sequence[float] | float) -> str:
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a results file, of which the last of a key counts; none if it is not there.
+    """Read the last row of each key from a results file; none if the file does not exist.
 
     Raises:
-        ValueError: in one line, if the file cannot be read or a line of it is not a row.
+        ValueError: in one line, if the file cannot be read, or a line of it is not a row.
     """
     if not path.exists():
         return []
@@ -70,21 +70,23 @@ def read(path: Path) -> list[Row]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read results from {path}: {error}") from None
-    found: dict[str, Row] = {}
+    results: dict[str, Row] = {}
     for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
-            found[row["key"]] = row | {n: math.inf if row[n] is None else row[n] for n in _NUMBERS}
+            results[row["key"]] = row | {
+                n: math.inf if row[n] is None else row[n] for n in _NUMBERS
+            }
         except (ValueError, TypeError, KeyError):
             raise ValueError(
                 f"{path}, line {number}, is cut off or no result: {line[:40]!r}; delete that line "
                 "and run again"
             ) from None
-    return list(found.values())
+    return list(results.values())
 
 
 def of_case(case: Case, rows: Iterable[Row]) -> list[Row]:
-    """The rows of a case, whatever table they were made for; by preset, seed and budget."""
+    """Return the rows of a case, of any table, ordered by preset, seed and budget."""
 
     def job(row: Row) -> Job:
         free = {name: row["config"][name] for name in ("seed", "budget")}
@@ -97,8 +99,11 @@ def of_case(case: Case, rows: Iterable[Row]) -> list[Row]:
 
 
 def is_done(job: Job, rows: Iterable[Row]) -> bool:
-    """Whether a row holds what the job would give: its own, or that of a training with another
-    budget that came to its end within the job's."""
+    """Return whether the result of a job is known.
+
+    It is known from the job's own row, or from a training with another budget that finished within
+    the job's budget.
+    """
     budget, seed = job.config.budget, job.config.seed
     for row in of_case(job.case, rows):
         if (row["preset"], row["config"]["seed"]) == (job.preset, seed):
@@ -109,12 +114,12 @@ def is_done(job: Job, rows: Iterable[Row]) -> bool:
 
 
 def longest(rows: Iterable[Row]) -> list[Row]:
-    """Of the rows that differ in their budget alone, those of the largest."""
-    found = {}
+    """Return, among rows that differ only in their budget, those with the largest budget."""
+    largest = {}
     for row in sorted(rows, key=_budget):
         settings = {name: value for name, value in row["config"].items() if name != "budget"}
-        found[row["system"], json.dumps(settings, sort_keys=True)] = row
-    return list(found.values())
+        largest[row["system"], json.dumps(settings, sort_keys=True)] = row
+    return list(largest.values())
 
 
 def _budget(row: Row) -> float:
@@ -123,13 +128,13 @@ def _budget(row: Row) -> float:
 
 
 def lines(table: Table, rows: Sequence[Row]) -> list[tuple[str, ...]]:
-    """A table's cells: for each case the paper's line, then those of the rows."""
-    found = []
+    """Return the rows of a table: for each case the paper's, then ours."""
+    cells = []
     for case in table.cases:
         if case.printed != Printed():
-            found.append((case.name, "the paper", *_printed(case.printed)))
-        found += [(case.name, _recipe(row), *_measured(row)) for row in of_case(case, rows)]
-    return found
+            cells.append((case.name, "the paper", *_printed(case.printed)))
+        cells += [(case.name, _recipe(row), *_measured(row)) for row in of_case(case, rows)]
+    return cells
 
 
 def _printed(printed: Printed) -> tuple[str, ...]:
@@ -149,14 +154,14 @@ def _printed(printed: Printed) -> tuple[str, ...]:
 
 
 def _error(value: float) -> str:
-    """An RMSE in the paper's digits."""
+    """Format an RMSE with the paper's number of digits."""
     if not math.isfinite(value):
         return "diverges"
     return format(value, ".5f" if value < 0.01 else ".4f" if value < 10 else ".4g")
 
 
 def _recipe(row: Row) -> str:
-    """Preset and seed of a row, and whether it was trained to its end."""
+    """Describe the preset and seed of a row, and whether its training was finished."""
     config = row["config"]
     seed = f", seed {config['seed']}" if config["seed"] else ""
     end = f"stopped at {_budget(row):g} s" if _is_cut(row) else "to the end"
@@ -181,15 +186,15 @@ def _measured(row: Row) -> tuple[str, ...]:
 
 
 def measured_on(rows: Sequence[Row]) -> str:
-    """When and on what the rows were made, in a line."""
+    """Describe in a line when and on which machine the rows were measured."""
     dates = sorted({row["date"][:10] for row in rows})
     span = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
-    made = {f"Python {row['versions']['python']}, {row['processor']}" for row in rows}
-    return f"Measured on {span}, one thread ({'; '.join(sorted(made))})."
+    machines = {f"Python {row['versions']['python']}, {row['processor']}" for row in rows}
+    return f"Measured on {span}, one thread ({'; '.join(sorted(machines))})."
 
 
 def markdown(table: Table, rows: Sequence[Row]) -> str:
-    """The table with its notes as Markdown."""
+    """Return the table with its notes as Markdown."""
     cells = [HEADER, ("---",) * 2 + ("---:",) * (len(HEADER) - 2), *lines(table, rows)]
     body = "\n".join("| " + " | ".join(line) + " |" for line in cells)
     source = f"In the paper: {table.source}."
@@ -197,21 +202,21 @@ def markdown(table: Table, rows: Sequence[Row]) -> str:
 
 
 def readme_section(rows: Sequence[Row], tables: Iterable[Table]) -> str:
-    """The tables that have results of the recipes as they are now, each case with its longest
-    training; nothing if there are none."""
+    """Return the README's section: the tables with results of the current recipes, each case with
+    its longest training; empty if there are no results."""
     parts, used = [], []
     for table in tables:
-        found = {case: longest(of_case(case, rows)) for case in table.cases}
-        shown = [row for chosen in found.values() for row in chosen]
+        results = {case: longest(of_case(case, rows)) for case in table.cases}
+        shown = [row for chosen in results.values() for row in chosen]
         if shown:
-            with_rows = tuple(case for case, chosen in found.items() if chosen)
+            with_rows = tuple(case for case, chosen in results.items() if chosen)
             parts += [f"**{table.title}**", markdown(replace(table, cases=with_rows), shown)]
             used += shown
     if not used:
         return ""
-    made = (
+    intro = (
         "`python scripts/reproduce_paper.py depth` (`activation`, `weights`, `examples`) makes the "
         f"paper's tables anew. {measured_on(used)} `fast` is guided by a Kalman smoother of the "
         "same record; `paper` is the recipe of the paper."
     )
-    return "\n\n".join([made, *parts, *PROTOCOL])
+    return "\n\n".join([intro, *parts, *PROTOCOL])

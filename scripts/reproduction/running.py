@@ -1,4 +1,4 @@
-"""Running one case: train, keep what came of it, and measure."""
+"""Run one case: train, store the results and measure."""
 
 from __future__ import annotations
 
@@ -32,44 +32,44 @@ SETUP = "paper"
 SEED = 0
 """Setup, condition and seed of the episode."""
 REPEATS = 20
-"""How often inference is timed; the median counts."""
+"""Number of timings of inference, of which the median is taken."""
 CHECKPOINT = "checkpoint.pt"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A case and how it is to be trained."""
+    """The training of a case."""
 
     case: Case
     preset: str
-    """Name of the recipe that the config is made of."""
+    """Name of the preset from which the config is derived."""
     config: PinnObsConfig
     out: Path
-    """Folder under which all goes."""
+    """Folder of all output."""
 
     @property
     def key(self) -> str:
-        """What decides the result: two jobs of one key are the same."""
+        """Hash of all that determines the result; jobs with the same key are identical."""
         return _digest(self.case, self.config)
 
     @property
     def folder(self) -> Path:
-        """Where this budget's checkpoint, curves and pictures go."""
+        """Folder of the checkpoint, curves and figures for this budget."""
         budget = self.config.budget
         return self._training / ("to-the-end" if budget is None else f"budget-{budget:g}")
 
     @property
     def _training(self) -> Path:
-        """The folder of all budgets of this training, of which a larger one goes on from a smaller
-        one's checkpoint."""
+        """Folder of this training with all budgets; a larger budget resumes from the checkpoint of
+        a smaller one."""
         config = self.config
         network = f"{config.depth}x{config.width}-{config.activation}"
         digest = _digest(self.case, replace(config, budget=None))
         return self.out / f"{self.case.system}-{self.preset}-{network}-{digest}"
 
     def prepare(self) -> bool:
-        """Make the folder; returns whether it has a checkpoint to go on from, its own or that of
-        the largest smaller budget."""
+        """Create the folder; return whether it has a checkpoint to resume from, its own or a copy
+        of that of the next smaller budget."""
         if (self.folder / CHECKPOINT).exists():
             return True
         shutil.rmtree(self.folder, ignore_errors=True)  # stopped before the first checkpoint
@@ -95,17 +95,17 @@ def _digest(case: Case, config: PinnObsConfig) -> str:
 
 
 def run(job: Job, progress: bool = False) -> Row:
-    """Train a case, going on from its checkpoint if there is one, draw its pictures, and measure.
+    """Train a case, from its checkpoint if it has one, draw its figures, and measure.
 
     Returns:
-        A row: ``key``, ``case``, ``system``, ``preset``, ``config``; ``loss``, ``iterations`` made
-        and that of the best loss, ``best_iteration``, to within ``log_every``; training CPU
-        ``seconds``; ``inference_ms``; ``rmse`` and ``mae`` of the network, ``replay_rmse`` and
-        ``replay_mae`` of the observer with its gain, over the whole record in state units;
-        ``date``, ``processor`` and ``versions``.
+        A row: ``key``, ``case``, ``system``, ``preset``, ``config``; the ``loss``; the number of
+        ``iterations``, and ``best_iteration``, that of the least loss to within ``log_every``; the
+        CPU ``seconds`` of the training; ``inference_ms``; ``rmse`` and ``mae`` of the network, and
+        ``replay_rmse`` and ``replay_mae`` of the observer with its gain, over the whole record in
+        state units; ``date``, ``processor`` and ``versions``.
 
     Raises:
-        KeyboardInterrupt: on Ctrl-C; the last checkpoint stays.
+        KeyboardInterrupt: on Ctrl-C; the last checkpoint is kept.
     """
     torch.set_num_threads(1)
     game = _game(job)
@@ -115,14 +115,14 @@ def run(job: Job, progress: bool = False) -> Row:
     trainer = PinnObsTrainer(system, job.config, record=record, noise_std=noise_std)
     with Log(job.folder / "tensorboard") as log:
         trained = train(trainer, log=log, checkpoint=checkpoint, resume=resume, progress=progress)
-    if trained.ending == "interrupted":  # a training cut short is no result
+    if trained.ending == "interrupted":  # an interrupted training is not a result
         raise KeyboardInterrupt
     trained.save(job.folder / "trained.pt")
     scores, curve = _scores(job, game, trained), loss_curve(job.folder / "tensorboard")
     write_figure(job.folder / "gain.png", readable_gain_figure(trained))
     write_figure(job.folder / "loss.png", loss_figure(curve, f"{trained.system}: as minimised"))
     budget = job.config.budget
-    if budget is None or trained.seconds < budget:  # nothing could go on from it
+    if budget is None or trained.seconds < budget:  # no larger budget needs it
         checkpoint.unlink(missing_ok=True)
     return {
         "key": job.key,
@@ -143,28 +143,29 @@ def run(job: Job, progress: bool = False) -> Row:
 
 
 def _game(job: Job) -> Game:
-    """What is played: the paper's setup."""
+    """Return the game of the paper's setup."""
     return Game.of(job.case.system, SETUP)
 
 
 def _scores(job: Job, game: Game, trained: TrainedNetwork) -> Row:
-    """The scores of the network and of its replay, each with a picture."""
-    found: Row = {}
+    """Score the network and its replay, and draw a figure of each."""
+    scores: Row = {}
     for prefix, picture, cls in (
         ("", "states", PinnObsDirect),
         ("replay_", "replay", PinnObsReplay),
     ):
         played = play(game, cls(game.source.system, trained=trained), [SEED])
         row: Row = played.scores.rows()[0]
-        found |= {f"{prefix}{name}": row[name] for name in ("rmse", "mae")}
+        scores |= {f"{prefix}{name}": row[name] for name in ("rmse", "mae")}
         rmse = f"RMSE {row['rmse']:.3g}" if math.isfinite(row["rmse"]) else "diverges"
         figure = estimates_figure(played, f"{job.case.system}, {cls.name}: {rmse}")
         write_figure(job.folder / f"{picture}.png", figure)
-    return found
+    return scores
 
 
 def inference_ms(trained: TrainedNetwork) -> float:
-    """Median time in ms to evaluate the network at all times of the record, one thread."""
+    """Measure the median time in ms of the network's evaluation at all times of the record, in one
+    thread."""
     taken = []
     for _ in range(REPEATS):
         start = time.perf_counter()
@@ -174,11 +175,11 @@ def inference_ms(trained: TrainedNetwork) -> float:
 
 
 def loss_curve(folder: Path) -> np.ndarray:
-    """Iterations and the least loss by then, shape (num_points, 2), from a TensorBoard log."""
+    """Read iterations and the least loss so far, (num_points, 2), from a TensorBoard log."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
-    # A training that went on from a checkpoint repeats some iterations.
+    # A training resumed from a checkpoint repeats some iterations.
     points = {event.step: event.value for event in events.Scalars("loss/best")}
     return np.array(sorted(points.items()), dtype=float)

@@ -1,4 +1,4 @@
-"""What the paper prints, as it prints it, and the settings of each case.
+"""The figures printed in the paper, unchanged, and the settings of each case.
 
 Farkane, Boutayeb, Oudani & Ghogho, "PINN-Obs: Physics-Informed Neural Network-Based Observer for
 Nonlinear Dynamical Systems", section "Applications".
@@ -15,7 +15,7 @@ from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 
 @dataclass(frozen=True)
 class Printed:
-    """The paper's figures of a case; None where it prints none."""
+    """The paper's figures of a case; None if not printed."""
 
     rmse: float | None = None
     mae: float | None = None
@@ -35,12 +35,12 @@ class Case:
     name: str
     printed: Printed
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of the trainer's Config, beside preset, seed and budget."""
+    """Settings of the trainer's Config, besides preset, seed and budget."""
     system: str = "ReverseDuffing"
 
 
 def recipe(preset: str, case: Case, seed: int, budget: float | None) -> PinnObsConfig:
-    """The settings of a case in a preset.
+    """Return the config of a case in a preset.
 
     Raises:
         ValueError: in one line, if the preset is unknown or a setting is not allowed.
@@ -55,10 +55,10 @@ class Table:
 
     title: str
     source: str
-    """Where the paper has it."""
+    """The table's place in the paper."""
     cases: tuple[Case, ...]
     notes: tuple[str, ...] = ()
-    """What to know about the printed figures."""
+    """Remarks on the printed figures."""
 
 
 # Layers, neurons, RMSE, MAE, inference ms, training s, iterations, best loss.
@@ -177,4 +177,4 @@ TABLES: Mapping[str, Table] = {
         ),
     ),
 }
-"""The tables by their names on the command line."""
+"""The tables by their command-line names."""

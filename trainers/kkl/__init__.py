@@ -1,13 +1,17 @@
 """Kazantzis-Kravaris-Luenberger observers: ż = Az + By driven by the output alone, x̂ = T*(z).
 
-T of an autonomous plant depends on x alone; it is fitted over the states that episodes of the
-initial set visit, so that unbounded plants (Academic) are trained on what an episode's length
-reaches, and plants with several classes of states (Satellite) on the declared one. A plant with
-inputs (the motor) is not autonomous: its T is told u(t), whose values are the phase of a periodic
-input, and how long ago z began, and starts at the first sample instead of in the infinite past;
-nothing is integrated backward, along which a dissipative plant would run away.
+The map T of an autonomous plant depends on x alone. It is fitted on the states of simulated
+episodes from the initial set, so that unbounded plants (Academic) are trained on the states
+reached within an episode, and plants with several classes of states (Satellite) on the declared
+class.
 
-`config` has the settings, `labels` the simulated states and their T(x), `samples` these as scaled
-tensors, `fitting` one training of one network, `two_stages` that of both, `trainer` what the three
-trainers share, `pictures` the figures.
+A plant with inputs (InductionMotor) is not autonomous. Its T depends also on u(t), whose values
+give the phase of a periodic input, and on the time since the first sample. Its z begins at the
+first sample, not in the infinite past. Such a plant is not integrated backward, because the states
+of a dissipative plant would diverge.
+
+Modules: `config` has the settings, `labels` the simulated states and their T(x), `samples` these as
+scaled tensors, `fitting` the training of one network, `two_stages` that of T and T*, `trainer` the
+base class of the three trainers, `learned_poles` the design of poles by training, and `pictures`
+the figures.
 """

@@ -1,4 +1,4 @@
-"""The settings that the trainers of KKL observers share."""
+"""The settings of all trainers of KKL observers."""
 
 from __future__ import annotations
 
@@ -28,77 +28,77 @@ Precision: TypeAlias = Literal["float32", "float64"]
 Sweep: TypeAlias = Literal["none", "cutoff"]
 
 _CYCLES = 4.0
-"""Fewest periods of the cut-off in the benchmark's episodes, unless it is given."""
+"""Fewest periods of the default cut-off in a benchmark episode."""
 _PART = 0.4
-"""The cut-off over the frequency of the outputs, unless it is given."""
+"""Default cut-off over the frequency of the outputs."""
 
 
 @dataclass(frozen=True)
 class KKLConfig(TrainingConfig):
-    """What the recipes of the learned KKL observers share."""
+    """Base class of the settings of the learned KKL observers."""
 
     may_change = ("device",)
 
     design: Design = "bessel"
-    """The poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or learned
-    beforehand with a small T*, beginning with ``poles`` (see `learned_poles`)."""
+    """Poles of A_z: Bessel's at ``cutoff``; −1, −2, ... (niazi); ``poles``; or poles learned
+    together with a small T*, from the initial values ``poles`` (learned; see `learned_poles`)."""
     cutoff: float | None = None
     """Cut-off of Bessel's poles in Hz; if None, two fifths of the outputs' `labels.frequency`, but
-    not under four over the benchmark's duration."""
+    at least four over the benchmark's duration."""
     order: int | None = None
-    """Bessel's poles for each output; if None, as many as give z one component more than x. Ramos
-    et al. take nx + 1 for each."""
+    """Number of Bessel's poles per output; if None, the least that gives z at least nx + 1
+    components. Ramos et al. use nx + 1 per output."""
     poles: tuple[float, ...] = ()
-    """Given poles in 1/s, all real, for each output."""
+    """Poles in 1/s per output, all real."""
     mode: Mode = "continuous"
-    """Continuous time, exact for outputs joined by straight lines; or discrete, by Euler steps."""
+    """Continuous time, exact for piecewise linear outputs; or discrete time, by Euler steps."""
     start: Start = "output"
-    """z before the first sample: at rest under y₀ (output), 0 (zero), or T(x̂₀) (prior)."""
+    """Initial z: the steady state for constant y₀ (output), 0 (zero), or T(x̂₀) (prior)."""
     transient: bool = True
-    """Whether T* is told the time since the first sample, as e^(−rt), so that it inverts z from the
-    start on and not only when its beginning is forgotten."""
+    """Whether T* has the time since the first sample, as e^(−rt), as an input, so that it is valid
+    also during the transient of z."""
     low: tuple[float, ...] | None = None
     """Lower corner of a box of initial states to train on instead of the benchmark's set."""
     high: tuple[float, ...] | None = None
-    """Upper corner."""
+    """Upper corner of that box."""
     trajectories: int = 1000
-    """Episodes that are simulated, a tenth more to validate."""
+    """Number of simulated training episodes; a tenth as many more are simulated for validation."""
     samples: int = 200
-    """Samples of each that are kept."""
+    """Number of samples kept of each episode."""
     depth: int = 2
-    """Hidden layers of T and of T*."""
+    """Number of hidden layers of T and of T*."""
     width: int = 28
-    """Neurons in each."""
+    """Neurons in each hidden layer."""
     activation: Activation = "tanh"
-    """Of the hidden layers."""
+    """Activation of the hidden layers."""
     method: Method = "gauss_newton"
     """Averaged Gauss-Newton steps, or Adam."""
     learning_rate: float = 0.3
-    """The first step; it falls as a half cosine."""
+    """Initial step size; it decays as a half cosine."""
     batch: int = 800
-    """Equations in a step: samples times the outputs of the network."""
+    """Equations per step: samples times outputs of the network."""
     iterations: int = 600
-    """Steps for T*."""
+    """Number of steps for T*."""
     share: float = 0.2
-    """Steps for T over those for T*; so for their CPU time if there is a budget."""
+    """Steps for T over steps for T*, and CPU time likewise if there is a budget."""
     patience: float = 0.6
-    """Part of the steps without a lower validation error after which a network is done."""
+    """Fraction of a network's steps without a lower validation error after which it stops."""
     noise: bool = True
-    """Whether z is trained on with the output noise that is told."""
+    """Whether the known output noise is added to z in training."""
     dtype: Precision = "float64"
-    """Precision of the networks; labels are always in double."""
+    """Precision of the networks; labels are always in double precision."""
     device: Device = "auto"
-    """Where networks are trained; ``auto`` takes a GPU if there is one."""
+    """Device of the training; ``auto`` takes a GPU if there is one."""
     sweep: Sweep = "none"
-    """Whether the cut-off is first chosen by short trainings over many."""
+    """Whether the cut-off is first chosen by short trainings at several cut-offs."""
     budget: float | None = None
-    """CPU seconds by which the step's cosine has come to its end, and training with it."""
+    """CPU seconds of the training, by the end of which the step size has decayed."""
     check_every: int = 20
-    """Steps from one validation to the next."""
+    """Steps between validations."""
     checkpoint_every: int = 100
-    """Steps from one checkpoint to the next."""
+    """Steps between checkpoints."""
     log_every: int = 20
-    """Steps from one point of the logged curves to the next."""
+    """Steps between points of the logged curves."""
 
     def __post_init__(self) -> None:
         self.check_shared()
@@ -124,20 +124,20 @@ class KKLConfig(TrainingConfig):
             raise ValueError(f"low={self.low}, high={self.high}; expected both corners or none")
 
     def filters(self, system: System) -> int:
-        """Bessel's poles for each output."""
+        """Return the number of Bessel's poles per output."""
         return self.order or math.ceil((system.nx + 1) / system.ny)
 
     def cutoff_for(self, system: System) -> float:
-        """The cut-off for a system, in Hz."""
+        """Return the cut-off for a system in Hz."""
         if self.cutoff is not None:
             return self.cutoff
         return max(_CYCLES / system.setups["benchmark"].duration, _PART * frequency(system))
 
     def dynamics(self, system: System) -> Dynamics:
-        """A_z and B_z for a system.
+        """Return the dynamics of z for a system.
 
         Raises:
-            ValueError: in one line, if they do not give an observer.
+            ValueError: in one line, if they are not those of an observer.
         """
         if self.design == "bessel":
             poles: Sequence[complex] = bessel(self.filters(system), self.cutoff_for(system))
@@ -153,8 +153,11 @@ KKLConfigT = TypeVar("KKLConfigT", bound=KKLConfig)
 
 
 def as_published(config: KKLConfigT, **changes: Any) -> KKLConfigT:
-    """A recipe with the settings that those of the three methods' papers have in common: z from 0,
-    no noise, Adam; and with further changes."""
+    """Return a config with the settings common to the papers of the three methods, and further
+    changes.
+
+    The common settings are: z from 0, no noise, Adam.
+    """
     common: dict[str, Any] = {
         "start": "zero",
         "transient": False,

@@ -1,4 +1,4 @@
-"""Fitting one network to equations that are linear in what it returns."""
+"""Fitting of one network to equations that are linear in its outputs."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ Method: TypeAlias = Literal["gauss_newton", "adam"]
 AVERAGE = 0.9
 """Weight of the past in the averaged Gauss-Newton matrix."""
 LAST_STEP = 0.01
-"""The last step over the first; between them it falls as a half cosine."""
+"""Last step size over the first; the step size decays as a half cosine."""
 _TRIALS = 6
-"""Dampings tried before a batch is given up."""
+"""Largest number of dampings tried per batch."""
 _LEAST_DAMPING, _FIRST_DAMPING = 1e-4, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """M·N(a), or M·(∂N/∂a)·da, of a network N at scaled inputs."""
+    """The term M·N(a), or M·(∂N/∂a)·da, of a network N at scaled inputs a."""
 
     a: Tensor
     """Shape (batch, num_inputs)."""
     matrix: Tensor | None = None
-    """M, (num_outputs, num_outputs) or one for each row; None for the identity."""
+    """M, shape (num_outputs, num_outputs) or one for each row; None for the identity."""
     along: Tensor | None = None
-    """da, shape of a; None for N itself."""
+    """da, of the shape of a; None for the term M·N(a)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """weight·(Σ terms − target) = 0, in scaled outputs."""
+    """The equations weight·(Σ terms − target) = 0, in scaled outputs."""
 
     terms: Sequence[Term]
     target: Tensor
@@ -48,7 +48,7 @@ class Equations:
     """A number, or one for each row, (batch, 1)."""
 
     def residual(self, net: Mlp) -> Tensor:
-        """Shape (batch, num_outputs), with its gradient."""
+        """Return the residual (batch, num_outputs), differentiable by the parameters."""
         total = -self.target
         for term in self.terms:
             value = net(term.a) if term.along is None else net.tangent(term.a, term.along)[1]
@@ -56,7 +56,7 @@ class Equations:
         return self.weight * total
 
     def linearised(self, net: Mlp) -> tuple[Tensor, Tensor]:
-        """The residual, and its Jacobian (batch, num_outputs, num_parameters)."""
+        """Return the residual and its Jacobian (batch, num_outputs, num_parameters)."""
         total, J = -self.target, None
         for term in self.terms:
             if term.along is None:
@@ -76,22 +76,23 @@ def _times(matrix: Tensor, values: Tensor) -> Tensor:
 
 
 Objective: TypeAlias = Callable[[torch.Generator], Sequence[Equations]]
-"""Draws the equations of a step."""
+"""Draws the equations of one step, a mini-batch."""
 
 
 class Fit:
-    """One network's training, step by step.
+    """Training of one network, step by step.
 
-    ``gauss_newton`` solves (H + μI)s = g with the batch's gradient g and a moving average H of the
-    batches' JᵀJ; the step is shortened as a half cosine over the training, which averages what the
-    batches differ in. μ follows Marquardt's rule. ``adam`` has the same schedule.
+    ``gauss_newton`` solves (H + μI)s = g, with the gradient g of the batch and a moving average H
+    of JᵀJ over batches. The damping μ is proportional to the loss and adapted by Marquardt's rule.
+    The step size decays as a half cosine, which averages out the differences between batches.
+    ``adam`` has the same schedule.
 
     Args:
-        net: trained in place.
-        objective: what it is fitted to.
-        method: how.
-        learning_rate: the first step.
-        generator: where batches are drawn from.
+        net: the network, trained in place.
+        objective: draws the equations of a step.
+        method: the optimiser.
+        learning_rate: initial step size.
+        generator: random generator of the batches.
     """
 
     def __init__(
@@ -110,7 +111,7 @@ class Fit:
         self._adam = torch.optim.Adam(net.parameters, learning_rate)
 
     def step(self, progress: float) -> None:
-        """One step, at a part of the training between 0 and 1."""
+        """Make one step at a training progress between 0 and 1."""
         shape = LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
         length = self.learning_rate * shape
         equations = self.objective(self.generator)
@@ -133,6 +134,7 @@ class Fit:
 
     def _newton_step(self, equations: Sequence[Equations], length: float) -> None:
         with torch.no_grad():
+            # Normal equations of the batch: JᵀJ and the gradient Jᵀr, averaged over equations.
             H, g, self.loss = 0.0, 0.0, 0.0
             for each in equations:
                 residual, J = each.linearised(self.net)
@@ -143,10 +145,11 @@ class Fit:
             assert isinstance(g, Tensor)
             if not math.isfinite(self.loss):
                 return
-            if self._H is not None:
+            if self._H is not None:  # moving average over batches, shorter in the first steps
                 past = AVERAGE * min(1.0, self.iteration / (self.iteration + 10.0))
                 H = past * self._H + (1 - past) * H
             self._H = H
+            # Levenberg-Marquardt: raise the damping until a step lowers the batch's loss.
             before = [p.clone() for p in self.net.parameters]
             for _ in range(_TRIALS):
                 damped = H.clone()
@@ -163,13 +166,14 @@ class Fit:
                     p.copy_(old)
 
     def _move(self, step: Tensor) -> None:
+        """Subtract a step (num_parameters,) from the parameters."""
         start = 0
         for p in self.net.parameters:
             p.sub_(step[start : start + p.numel()].view_as(p))
             start += p.numel()
 
     def state(self) -> dict[str, Any]:
-        """All that changes, as arrays and plain values."""
+        """Return the state of the training, as arrays and plain values."""
         return {
             "iteration": self.iteration,
             "damping": self._damping,
@@ -180,7 +184,7 @@ class Fit:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly from what `state` gave."""
+        """Restore the result of `state` exactly."""
         self.iteration, self._damping = state["iteration"], state["damping"]
         device = self.net.parameters[0].device
         self._H = None if state["H"] is None else torch.from_numpy(state["H"]).to(device)

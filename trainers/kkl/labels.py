@@ -1,4 +1,4 @@
-"""States of simulated episodes and the z that goes with them."""
+"""States of simulated episodes and the corresponding z and T(x)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from pinnobs_gym.simulation.system import Array, System, vector
 from pinnobs_gym.simulation.truth import truth
 
 SETTLED = 16.0
-"""How long x is integrated backward, over z's slowest time constant: e⁻¹⁶ of z(−t_c) is left, where
-the papers' 10 leave enough to be the largest error of a good fit."""
+"""Duration of the backward integration of x, over z's slowest time constant. It leaves e⁻¹⁶ of the
+initial error of z; the papers' 10 would leave the largest error of a good fit."""
 MOST_ESCAPED = 0.1
-"""Largest part of the initial states that may be dropped."""
+"""Largest fraction of the initial states that may be dropped."""
 FAR = 1e3
-"""Size of a state, over its scale, from which on it has escaped."""
+"""Size of a state, over its scale, above which it counts as escaped."""
 _TIMES = 9
-"""Times of an episode at which the equations are compared."""
+"""Number of times of an episode at which the equations are compared."""
 _DRAWS = 100
-"""Latin hypercubes without enough admissible states before the initial set is taken as empty."""
+"""Largest number of Latin hypercubes that are drawn for enough admissible states."""
 
 
 @dataclass(frozen=True)
 class _Reversed(System):
-    """A plant run backward in time."""
+    """A plant in reversed time."""
 
     plant: System = field(kw_only=True)
 
@@ -58,7 +58,7 @@ class _Reversed(System):
 
 @dataclass(frozen=True)
 class _Joint(System):
-    """A plant and the z that its output drives, as one system of state (x, z)."""
+    """A plant and the z driven by its output, as one system with state (x, z)."""
 
     plant: System = field(kw_only=True)
     dynamics: Dynamics = field(kw_only=True)
@@ -90,8 +90,8 @@ class _Joint(System):
 
 
 def driven(system: System) -> bool:
-    """Whether T changes with time: the plant has inputs, or its equations are not the same at all
-    times of a benchmark episode."""
+    """Return whether T depends on time: the plant has inputs, or its equations vary over a
+    benchmark episode."""
     if system.nu:
         return True
     setup, u = system.setups["benchmark"], np.empty(0)
@@ -106,18 +106,21 @@ def driven(system: System) -> bool:
 def steady(
     system: System, dynamics: Dynamics, x: np.ndarray, h: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """T(x) of an autonomous plant: x is integrated backward for `SETTLED` of z's slowest time
-    constants, then (x, z) jointly forward from z = 0.
+    """Compute T(x) of an autonomous plant.
+
+    x is integrated backward for `SETTLED` of z's slowest time constants, then (x, z) jointly
+    forward from z = 0.
 
     Args:
         system: the plant.
-        dynamics: of z; in discrete time z is driven by the output's samples.
+        dynamics: dynamics of z; in discrete time z is driven by samples of the output.
         x: states, shape (batch, nx).
-        h: time between samples in s, for discrete time.
+        h: time between samples in s.
 
     Returns:
-        z (batch, nz), not a number where x escapes, and which do not: bool (batch,).
+        z (batch, nz), NaN where x escapes; and a mask (batch,) of the states that do not escape.
     """
+    # Drop the states that diverge when integrated backward.
     duration = float(np.ceil(SETTLED / dynamics.slowest / h) * h)
     stays = ~_escapes(system, x, duration)
     z = np.full((len(x), dynamics.size), np.nan)
@@ -125,12 +128,13 @@ def steady(
         return z, stays
     step = system.setups["benchmark"].truth_step
     backward = _Reversed(plant=system)
-    if dynamics.mode == "discrete":
+    if dynamics.mode == "discrete":  # filter the samples of the output along the path
         t = np.arange(round(duration / h) + 1) * h
         path = truth(backward, x[stays], t, step)[::-1]
         y = system.h(t[:, None] - duration, path, np.empty((len(t), 1, 0)))
         z[stays] = dynamics.filtered(t, y)[-1]
         return z, stays
+    # Backward integration of x, then forward integration of (x, z) until z has settled to T(x).
     start = truth(backward, x[stays], np.array([0.0, duration]), step)[-1]
     begin = np.concatenate([start, np.zeros((len(start), dynamics.size))], axis=1)
     joint = _Joint(plant=system, dynamics=dynamics)
@@ -139,7 +143,7 @@ def steady(
 
 
 def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
-    """Which states (batch, nx) leave for good on the way back."""
+    """Return which states (batch, nx) diverge when integrated backward, over twice the duration."""
     step = system.setups["benchmark"].truth_step or duration / 100
     steps = int(np.ceil(2 * duration / step))
     h, u = -duration / steps, np.zeros(system.nu)
@@ -155,8 +159,10 @@ def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
 
 
 def frequency(system: System) -> float:
-    """How fast the outputs of the benchmark's episodes change: the root mean square of their rate
-    over that of their departures from the mean, in Hz."""
+    """Return the mean frequency of the outputs of benchmark episodes, in Hz.
+
+    It is the root mean square of their rate over that of their deviations from the mean, over 2π.
+    """
     setup = system.setups["benchmark"]
     x0 = initial_states(system, None, None, 20, seed=0)
     t, x = setup.times, truth(system, x0, setup.times, setup.truth_step)
@@ -173,11 +179,13 @@ def initial_states(
     count: int,
     seed: int,
 ) -> np.ndarray:
-    """States (count, nx) of a Latin hypercube over a box or, without one, over the benchmark's,
-    less those that are not admissible.
+    """Draw states (count, nx) from Latin hypercubes over a box.
+
+    Without a box it is the benchmark's, of which only the admissible states are taken.
 
     Raises:
-        ValueError: in one line, if the box is none or has hardly any admissible states.
+        ValueError: in one line, if the corners are not those of a box, or hardly any states of the
+            benchmark's box are admissible.
     """
     setup = system.setups["benchmark"]
     own = low is None or high is None
@@ -186,21 +194,21 @@ def initial_states(
     if not (np.isfinite([lower, upper]).all() and (lower <= upper).all()):
         raise ValueError(f"low={low}, high={high}; expected finite corners, low at most high")
     cube = qmc.LatinHypercube(system.nx, rng=np.random.default_rng(seed))
-    found = np.empty((0, system.nx))
+    states = np.empty((0, system.nx))
     for _ in range(_DRAWS):
         x0 = lower + (upper - lower) * cube.random(count)
-        found = np.concatenate([found, x0[system.admissible(x0)] if own else x0])
-        if len(found) >= count:
-            return found[:count]
+        states = np.concatenate([states, x0[system.admissible(x0)] if own else x0])
+        if len(states) >= count:
+            return states[:count]
     raise ValueError(
-        f"{type(system).__name__}: of {_DRAWS * count} states of the box {len(found)} are "
+        f"{type(system).__name__}: of {_DRAWS * count} states of the box {len(states)} are "
         f"admissible; expected {count}"
     )
 
 
 @dataclass(frozen=True, eq=False)
 class SampledEpisodes:
-    """Simulated episodes at some of their samples."""
+    """Simulated episodes at the kept samples."""
 
     t: np.ndarray
     """Time since the first sample, in s, shape (kept,)."""
@@ -209,18 +217,18 @@ class SampledEpisodes:
     x: np.ndarray
     """States, shape (kept, batch, nx)."""
     z: np.ndarray
-    """z as it occurs online, driven by noise-free samples of y, shape (kept, batch, nz)."""
+    """z as it occurs online, driven by noise-free samples of y; shape (kept, batch, nz)."""
     x0: np.ndarray
     """Initial states, shape (batch, nx)."""
     flow: np.ndarray
-    """Φ from the first sample on, (kept, nz, nz)."""
+    """Φ from the first sample to each, shape (kept, nz, nz)."""
     T: np.ndarray | None
-    """T(x) along the episodes, (kept, batch, nz): z from T(x₀) at the first. None if T changes with
-    time."""
+    """T(x) along the episodes, the z that begins at T(x₀); shape (kept, batch, nz). None if T
+    depends on time."""
     dropped: int
-    """Initial states that escaped backward."""
+    """Number of initial states that escaped backward."""
     drawn: int
-    """Initial states drawn."""
+    """Number of initial states drawn."""
 
 
 def simulated(
@@ -232,18 +240,26 @@ def simulated(
     start: Start = "zero",
     xhat0: np.ndarray | None = None,
 ) -> SampledEpisodes:
-    """Simulate episodes from x0 (batch, nx) on the sample times t (num_samples,) in s; of the
-    samples ``kept`` (kept,) are returned. z begins as ``start`` says, x̂₀ (1, nx) being the prior's.
+    """Simulate episodes, and keep some of their samples.
 
-    T of a plant that is `driven` changes with time: T(t, x) begins at the first sample at what z
-    begins with (Bernard & Andrieu 2019), and nothing is integrated backward.
+    The T of a `driven` plant depends on time: T(t, x) is the z that begins at the first sample with
+    its initial value (Bernard & Andrieu 2019), and nothing is integrated backward.
+
+    Args:
+        system: the plant.
+        dynamics: dynamics of z.
+        t: sample times in s, shape (num_samples,).
+        x0: initial states, shape (batch, nx).
+        kept: indices of the samples to keep, shape (kept,).
+        start: initial value of z.
+        xhat0: prior mean, shape (1, nx); needed for ``start="prior"`` unless the plant is driven.
 
     Raises:
         ValueError: in one line, if over `MOST_ESCAPED` of the initial states escape backward.
     """
     varying, drawn = driven(system), len(x0)
     T0, h, u = None, float(np.diff(t).mean()), np.asarray(system.input(t))
-    if not varying:
+    if not varying:  # labels T(x₀), without the states that escape backward
         T0, stays = steady(system, dynamics, x0, h)
         escaped = drawn - int(stays.sum())
         if escaped > MOST_ESCAPED * drawn:
@@ -253,6 +269,7 @@ def simulated(
                 f"{MOST_ESCAPED:.0%}: take faster poles, or a smaller box"
             )
         x0, T0 = x0[stays], T0[stays]
+    # Initial z of the online observer.
     z0 = system.h(t[0], x0, u[0]) @ at_rest(dynamics, start).T
     if start == "prior" and not varying:
         assert xhat0 is not None
@@ -261,19 +278,19 @@ def simulated(
     x = np.empty((len(kept), len(x0), system.nx))
     z = np.empty((len(kept), len(x0), dynamics.size))
     T = None if T0 is None else np.empty_like(z)
-    for first in range(0, len(x0), _AT_ONCE):  # whole paths of all would take too much memory
+    for first in range(0, len(x0), _AT_ONCE):  # blocks, to limit memory
         rows = slice(first, first + _AT_ONCE)
         path = truth(system, x0[rows], t, setup.truth_step)
         y = system.h(t[:, None], path, u[:, None])
         x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows])[kept]
-        if T is not None and T0 is not None:
+        if T is not None and T0 is not None:  # T(x) along a path is the z that begins at T(x₀)
             T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
     flow = dynamics.flows(t)[kept]
     return SampledEpisodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, drawn - len(x0), drawn)
 
 
 _AT_ONCE = 256
-"""Episodes whose whole paths are held at a time."""
+"""Number of episodes whose whole paths are in memory at a time."""
 
 
 def noise_in_z(
@@ -285,8 +302,19 @@ def noise_in_z(
     rng: np.random.Generator,
     rest: np.ndarray,
 ) -> np.ndarray:
-    """What white noise of standard deviations (ny,) in the samples of y adds to z: draws
-    (kept, count, nz). z is linear in y: they can be added to any episode's. z begins at rest·y₀."""
+    """Draw the effect (kept, count, nz) on z of white noise in the samples of y.
+
+    z is linear in y, so a draw can be added to the z of any episode.
+
+    Args:
+        dynamics: dynamics of z.
+        t: sample times in s, shape (num_samples,).
+        std: standard deviations of the output noise, shape (ny,).
+        kept: indices of the samples to keep, shape (kept,).
+        count: number of draws.
+        rng: random generator.
+        rest: initial z per unit of y₀, shape (nz, ny).
+    """
     out = np.empty((len(kept), count, dynamics.size))
     for start in range(0, count, _AT_ONCE):
         rows = min(_AT_ONCE, count - start)

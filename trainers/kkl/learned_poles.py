@@ -1,4 +1,4 @@
-"""Poles learned together with a small T*."""
+"""Training of the poles of z together with a small T*."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import truth
 
 EPISODES = 200
-"""Most episodes that windows are taken from."""
+"""Largest number of episodes from which windows are drawn."""
 STEPS = 400
-"""Steps of Adam."""
+"""Number of steps of Adam."""
 MEMORY = 6.0
-"""Length of the outputs that z is computed from, over the slowest time constant to begin with."""
+"""Length of the windows of outputs, over the slowest initial time constant."""
 _BATCH, _WIDTH, _RATE = 128, 24, 1e-2
 _LONGEST = 400
 
@@ -30,32 +30,37 @@ def learn(
     x0: np.ndarray,
     seed: int,
 ) -> tuple[float, ...]:
-    """Real poles from which a small network finds x best, by Adam on both together.
+    """Train real poles together with a small network that maps z to x, by Adam.
 
-    z is the exact response, from rest, to windows of sampled outputs with their noise; its
-    derivative by a pole is automatic differentiation's. The logarithms of the poles' sizes are what
-    moves: they stay stable.
+    z is the exact response, from z = 0, to windows of noisy output samples; its derivatives by the
+    poles come from automatic differentiation. The variables are the logarithms of the poles' sizes,
+    so that the poles stay stable.
 
     Args:
         system: the plant.
-        poles: to begin with, in 1/s, all negative, for each output.
-        t: sample times in s, (num_samples,), taken as regular.
-        noise_std: standard deviation of the output noise, (ny,).
-        x0: initial states of simulated episodes, (batch, nx).
-        seed: what windows, noise and the network are drawn from.
+        poles: initial poles per output, in 1/s, all negative.
+        t: sample times in s, shape (num_samples,), assumed to be regular.
+        noise_std: standard deviation of the output noise, shape (ny,).
+        x0: initial states of simulated episodes, shape (batch, nx).
+        seed: seed of the windows, the noise and the network.
+
+    Returns:
+        The poles in 1/s.
 
     Raises:
-        ValueError: in one line, if a pole is not negative.
+        ValueError: in one line, if an initial pole is not negative.
     """
     sizes = -np.asarray(poles, dtype=float)
     if not (sizes > 0).all():
         raise ValueError(f"A_z is not Hurwitz: poles={tuple(poles)}; expected all below 0")
+    # Simulated episodes: scaled states and outputs.
     h = float(np.diff(t).mean())
     window = min(int(np.ceil(MEMORY / sizes.min() / h)), len(t) // 2, _LONGEST)
     x = truth(system, x0[:EPISODES], t, system.setups["benchmark"].truth_step)
     scale = vector(system.scale, system.nx, "scale")
     states = torch.tensor((x - x.mean(axis=(0, 1))) / scale)
     y = torch.tensor(system.h(t[:, None], x, np.asarray(system.input(t))[:, None]))
+    # The network and the logarithms of the poles, with one optimiser.
     generator = torch.Generator().manual_seed(seed)
     ny, number = system.ny, len(sizes)
     logs = torch.tensor(np.log(sizes), requires_grad=True)
@@ -67,11 +72,14 @@ def learn(
     for step in range(STEPS):
         for group in adam.param_groups:
             group["lr"] = _RATE * 0.5 * (1 + np.cos(np.pi * step / STEPS))
+        # A batch of windows, each ending at a sample k of an episode i, with fresh noise.
         k = torch.randint(window, len(t), (_BATCH,), generator=generator)
         i = torch.randint(x.shape[1], (_BATCH,), generator=generator)
-        seen = y[k[:, None] - window + steps, i[:, None]]
-        seen = seen + std * torch.randn(seen.shape, generator=generator, dtype=seen.dtype)
-        z = torch.einsum("pw,bwo->bop", _response(logs, h, window), seen).reshape(_BATCH, -1)
+        windows = y[k[:, None] - window + steps, i[:, None]]
+        noise = torch.randn(windows.shape, generator=generator, dtype=windows.dtype)
+        windows = windows + std * noise
+        # z at the end of each window, standardised over the batch, and the network's error.
+        z = torch.einsum("pw,bwo->bop", _response(logs, h, window), windows).reshape(_BATCH, -1)
         z = (z - z.mean(0)) / z.std(0)
         loss = (net(z) - states[k, i]).square().mean()
         adam.zero_grad()
@@ -81,12 +89,15 @@ def learn(
 
 
 def _response(logs: Tensor, h: float, window: int) -> Tensor:
-    """Weights (poles, window + 1) of outputs in z at the last of them, exact for outputs joined by
-    straight lines, z being 0 at the first."""
+    """Return the weights (poles, window + 1) of a window's outputs in z at its end.
+
+    z is 0 at the window's first sample; the weights are exact for piecewise linear outputs.
+    """
     rate = torch.exp(logs)[:, None]
     flow = torch.exp(-rate * h)
     now = 1 - (1 - flow) / (rate * h)
     before = 1 - flow - now
-    left = torch.exp(-rate * h * torch.arange(window - 1, -1, -1))  # of each interval's response
+    # Decay of each interval's response until the end of the window.
+    decay = torch.exp(-rate * h * torch.arange(window - 1, -1, -1))
     nothing = torch.zeros_like(rate)
-    return torch.cat([left * before, nothing], 1) + torch.cat([nothing, left * now], 1)
+    return torch.cat([decay * before, nothing], 1) + torch.cat([nothing, decay * now], 1)

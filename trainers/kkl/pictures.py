@@ -1,4 +1,4 @@
-"""Pictures of a trained KKL observer."""
+"""Figures of a trained KKL observer."""
 
 from __future__ import annotations
 
@@ -16,30 +16,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GRID = 51
-"""Points along each side of a map."""
+"""Grid points along each side of a map."""
 RADII = np.linspace(0.1, 2.0, 14)
-"""Sizes of initial states, over that of the training set's edge."""
+"""Distances of initial states from the middle of the training set, over that of its edge."""
 _RAYS = 12
 _FLOOR = 1e-6
-"""Least error that is shown."""
+"""Smallest error that is shown."""
 
 
 def figures(system: System, trained: TrainedKKL, record: Record) -> dict[str, Figure]:
-    """All pictures by name: ``error`` over the state space, error against initial ``radius``, the
-    ``maps`` T and T*, and the ``sweep`` if there was one. A plant whose T changes with
-    time has no ``error`` and ``maps``."""
-    found = {"radius": radius_figure(system, trained, record)}
+    """Return all figures by name.
+
+    They are the ``error`` over the state space, the error against the initial ``radius``, the
+    ``maps`` T and T*, and the ``sweep`` if there was one. If T depends on time, there are no
+    ``error`` and ``maps``.
+    """
+    drawn = {"radius": radius_figure(system, trained, record)}
     if not driven(system):
-        found["error"] = error_figure(system, trained, record)
-        found["maps"] = maps_figure(system, trained)
+        drawn["error"] = error_figure(system, trained, record)
+        drawn["maps"] = maps_figure(system, trained)
     if trained.facts.get("sweep"):
-        found["sweep"] = sweep_figure(trained)
-    return found
+        drawn["sweep"] = sweep_figure(trained)
+    return drawn
 
 
 def _plane(system: System, trained: TrainedKKL) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values of the first two states, a little beyond those trained on, and the states over them,
-    (GRID, GRID, nx): further ones are the benchmark's x̂₀."""
+    """Return a grid over the first two states, a little beyond the states trained on.
+
+    Returns:
+        The values (GRID,) of both states, and the states (GRID, GRID, nx) of the grid, whose
+        further components are those of the benchmark's x̂₀.
+    """
     low, high = (np.array(trained.facts[name]) for name in ("low", "high"))
     margin = 0.25 * (high - low)
     sides = [np.linspace(low[i] - margin[i], high[i] + margin[i], GRID) for i in range(2)]
@@ -50,13 +57,15 @@ def _plane(system: System, trained: TrainedKKL) -> tuple[np.ndarray, np.ndarray,
 
 
 def _late(trained: TrainedKKL) -> float:
-    """A time at which z's beginning is forgotten, in s."""
+    """Return a time in s at which the transient of z has decayed."""
     return 20 / trained.dynamics.slowest
 
 
 def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
-    """The scaled error of T*(T(x)) over the first two states, without noise, T(x) integrated; the
-    box of the states trained on, and a trajectory."""
+    """Plot the scaled error of T*(T(x)) over the first two states.
+
+    T(x) is integrated, without noise. The box of the training states and an episode are drawn, too.
+    """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -91,14 +100,16 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
 
 
 def _starts(system: System, trained: TrainedKKL, count: int) -> np.ndarray:
-    """Initial states (count, nx) of the set that was trained on, others than those."""
+    """Draw new initial states (count, nx) from the set trained on."""
     low, high = (trained.config[name] for name in ("low", "high"))
     return initial_states(system, low, high, count, 10**6 + 7)
 
 
 def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
-    """The error of the observer over the last quarter of episodes without noise, against how far
-    from the middle of the training set they begin, over the distance of its edge."""
+    """Plot the error over the last quarter of noise-free episodes against the initial radius.
+
+    The radius is the distance from the middle of the training set over that of its edge.
+    """
     from matplotlib.figure import Figure
 
     x0 = _starts(system, trained, 400)
@@ -123,8 +134,8 @@ def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure
 
 
 def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) -> np.ndarray:
-    """NRMSE of the last quarter of episodes from states (groups, batch, nx): (groups, batch), not a
-    number in groups of which an episode runs away."""
+    """Return the NRMSE (groups, batch) over the last quarter of episodes from states
+    (groups, batch, nx); NaN in groups with a diverging episode."""
     states = x0.reshape(-1, system.nx)
     try:
         x = truth(system, states, record.t).swapaxes(0, 1)
@@ -144,8 +155,8 @@ def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) 
 
 
 def maps_figure(system: System, trained: TrainedKKL) -> Figure:
-    """Components of T over the first two states, and of T* over the plane of z in which states
-    spread most."""
+    """Plot components of T over the first two states, and of T* over the plane of the first two
+    principal components of z."""
     from matplotlib.figure import Figure
 
     first, second, x = _plane(system, trained)
@@ -181,7 +192,7 @@ def maps_figure(system: System, trained: TrainedKKL) -> Figure:
 
 
 def sweep_figure(trained: TrainedKKL) -> Figure:
-    """Noise gain, error and convergence over the cut-off; the one chosen is marked."""
+    """Plot error, noise gain and convergence time over the cut-off, with the chosen one marked."""
     from matplotlib.figure import Figure
 
     points = trained.facts["sweep"]

@@ -1,4 +1,4 @@
-"""The simulated samples that the maps of a KKL observer are fitted to."""
+"""The simulated training samples of the maps of a KKL observer."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from trainers.kkl.labels import driven, initial_states, noise_in_z, simulated
 from trainers.kkl.learned_poles import EPISODES, learn
 
 _PARTS = 12
-"""Parts of the episode whose errors are weighed alike."""
+"""Number of parts of the episode whose errors have the same weight."""
 _FORGOTTEN = 8.0
-"""How long z's beginning is waited for to be forgotten, over its slowest time constant."""
+"""Duration of the skipped transient of z, over its slowest time constant."""
 
 
 class Samples:
-    """Simulated states and z at some samples of many episodes, with their scalings, as tensors.
+    """Simulated states and z at the kept samples of many episodes, as scaled tensors.
 
     Args:
         system: the model.
-        config: the recipe.
-        t: sample times of an episode in s, (num_samples,).
-        prior: the prior's mean, (1, nx).
-        noise_std: standard deviation of the output noise, (ny,).
-        gap: samples from the first to the second of each pair that is kept, if pairs are.
+        config: the settings.
+        t: sample times of an episode in s, shape (num_samples,).
+        prior: prior mean, shape (1, nx).
+        noise_std: standard deviation of the output noise, shape (ny,).
+        gap: number of samples between the two of each kept pair; 0 without pairs.
         labelled: whether networks are fitted to the simulated z, and not to T's own.
 
     Raises:
-        ValueError: in one line, if the recipe gives no observer of the system.
+        ValueError: in one line, if the settings give no observer of the system.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Samples:
             self.dynamics: Dynamics = realised(poles, system.ny, config.mode)
         else:
             self.dynamics = config.dynamics(system)
-        self.dynamics.step(self.interval)  # a bad one is told before anything is simulated
+        self.dynamics.step(self.interval)  # raise an error before the simulation
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
         self._simulate()
         self._prepare(labelled)
@@ -69,12 +69,15 @@ class Samples:
         return float(np.diff(self.t).mean())
 
     def _simulate(self) -> None:
+        """Simulate the episodes and the effect of output noise on z."""
         config, system = self.config, self.system
+        # Initial states in random order, so that the held-out ones are a random subset.
         held = max(20, config.trajectories // 10)
         total = config.trajectories + held
         x0 = initial_states(system, config.low, config.high, total, config.seed)
         rng = np.random.default_rng([config.seed, 1])
         x0 = x0[rng.permutation(total)]
+        # A T* without the time since the first sample is fitted after the transient only.
         first = 0
         if not (config.transient or self.driven):
             settled = self.t[0] + _FORGOTTEN / self.dynamics.slowest
@@ -89,6 +92,7 @@ class Samples:
                 f"{type(system).__name__} escape when integrated backward, and are left out",
                 stacklevel=2,
             )
+        # The first episodes are held out for validation.
         batch = self.data.x.shape[1]
         self.held = slice(0, min(held, batch // 2))
         std = self.noise_std if config.noise else np.zeros(system.ny)
@@ -97,14 +101,16 @@ class Samples:
         self.noise = noise_in_z(self.dynamics, self.t, std, self.kept, rows, rng, rest)
 
     def _prepare(self, labelled: bool) -> None:
-        """The scalings, and the samples as scaled tensors."""
+        """Compute the scalings, and the samples as scaled tensors."""
         config, data = self.config, self.data
+        # Inputs besides z: decaying exponentials of the time, and the plant's inputs.
         real = abs(np.linalg.eigvals(self.dynamics.A).real)
         clocked = config.transient or self.driven
         rates = tuple(dict.fromkeys((float(real.min()), float(real.max())))) if clocked else ()
         sizes = abs(data.u).max(axis=0) if self.driven else np.empty(0)
         self.clock = Clock(rates, tuple(float(size) or 1.0 for size in sizes))
         times = self.clock(data.t, data.u) if self.clock.size else np.empty((len(data.t), 0))
+        # States by their scale, labels to unit variances, and the inputs of T* whitened.
         scale = vector(self.system.scale, self.system.nx, "scale")
         self.x_scaling = Scaling(data.x.mean(axis=(0, 1)), np.diag(scale))
         self.z_scaling = Scaling.of(data.z)
@@ -116,19 +122,25 @@ class Samples:
         if labelled:
             self.labels = self.tensor(self.z_scaling.scaled(data.z if data.T is None else data.T))
             self.z = self.tensor(self.whitening.scaled(data.z))
+        # The noise is added to whitened z, so its own scaling must not subtract the mean.
         shifted = self.noise + self.whitening.mean
         self.z_noise = self.tensor(self.whitening.scaled(shifted))
         self.parts = torch.arange(len(data.t)) * (_PARTS if clocked else 1) // len(data.t)
 
     def tensor(self, array: np.ndarray) -> Tensor:
-        """As a tensor of the training's precision, where the training runs."""
+        """Return a tensor of the training's precision on its device."""
         return torch.tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
 
     def draw(
         self, generator: torch.Generator, outputs: int, part: float = 1.0
     ) -> tuple[Tensor, Tensor]:
-        """Indices of kept samples and of episodes that are trained on, (count,) each: as many as
-        make a part of the batch with a network of so many outputs."""
+        """Draw the indices of kept samples and of training episodes, (count,) each.
+
+        Args:
+            generator: random generator.
+            outputs: number of outputs of the network; ``config.batch`` counts equations.
+            part: fraction of the batch to draw.
+        """
         count = max(8, round(part * self.config.batch / outputs))
         k = torch.randint(len(self.data.t), (count,), generator=generator)
         episodes = torch.randint(
@@ -137,30 +149,33 @@ class Samples:
         return k.to(self.device), episodes.to(self.device)
 
     def outputs(self) -> np.ndarray:
-        """The noise-free outputs at the kept samples, (kept, batch, ny)."""
+        """Return the noise-free outputs at the kept samples, (kept, batch, ny)."""
         return np.asarray(
             self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u[:, None])
         )
 
     def encoded(self, k: Tensor, i: Tensor) -> Tensor:
-        """What T is given at samples k of episodes i."""
+        """Return the scaled inputs of T at samples k of episodes i."""
         x = self.x[k, i]
         return torch.cat([x, self.times[k]], dim=-1) if self.driven else x
 
     def pairs(self) -> np.ndarray:
-        """Kept samples that are ``gap`` samples apart, as indices (pairs, 2)."""
+        """Return the pairs of kept samples that are ``gap`` samples apart, as indices
+        (pairs, 2)."""
         where = {int(k): index for index, k in enumerate(self.kept)}
         later = {k: where.get(k + self.gap) for k in where}
         return np.array([[where[k], i] for k, i in later.items() if i is not None])
 
     def rates(self) -> np.ndarray:
-        """Rates of change in 1/s of what T is given, at the kept samples: (kept, batch, size)."""
+        """Return the time derivatives in 1/s of T's scaled inputs at the kept samples,
+        (kept, batch, size)."""
         data, system = self.data, self.system
         t = self.t[self.kept]
         each = [system.f(t[k], data.x[k], data.u[k]) for k in range(len(t))]
         rate = np.array(each) @ np.linalg.inv(self.x_scaling.root).T
         if not self.driven:
             return rate
+        # Central differences of the clock's inputs.
         h = 1e-4 * self.interval
         after, before = (self.clock(data.t + d, system.input(t + d)) for d in (h, -h))
         clock_rate = (after - before) / (2 * h) @ np.linalg.inv(self.clock_scaling.root).T
@@ -172,18 +187,28 @@ class Samples:
 def kept_samples(
     count: int, first: int, wanted: int, gap: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Samples that are trained on, ascending: the first and the last of those from ``first`` on;
-    half of the others evenly spread, half, if that is the very first, over the logarithm of the
-    time since it. With a gap each comes with the one so much later, of as many pairs."""
+    """Draw the indices of the samples to train on, in ascending order.
+
+    They include the first and the last index allowed. Of the others half are uniform, and half
+    uniform in the logarithm of the index if ``first`` is 0, else uniform, too. With a gap, each
+    index k comes with k + gap.
+
+    Args:
+        count: number of samples of an episode.
+        first: first index allowed.
+        wanted: number of indices to draw, approximately.
+        gap: distance of the two samples of a pair; 0 without pairs.
+        rng: random generator.
+    """
     last = count - 1 - gap
-    found = {first, last}
+    chosen = {first, last}
     wanted = min(wanted // (2 if gap else 1), last + 1 - first)
-    while len(found) < wanted:
+    while len(chosen) < wanted:
         even = int(rng.integers(first, last + 1))
         late = int(np.exp(rng.uniform(0, np.log(last + 1)))) if first == 0 else even
-        found |= {even, min(late, last)}
-    later = {k + gap for k in found}
-    return np.array(sorted(found | later))
+        chosen |= {even, min(late, last)}
+    later = {k + gap for k in chosen}
+    return np.array(sorted(chosen | later))
 
 
 def _device(config: KKLConfig) -> torch.device:

@@ -1,4 +1,4 @@
-"""What the trainers of KKL observers share."""
+"""The base class of the trainers of KKL observers."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MIN_SAMPLES = 20
-"""Fewest samples of the record whose times are trained on."""
+"""Fewest samples of a record."""
 SWEEP = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""The cut-offs of a sweep, over that of the recipe."""
+"""The cut-offs of a sweep, over that of the settings."""
 SWEEP_SHARE = 0.5
-"""Part of a budget that a sweep takes."""
+"""Fraction of the budget that a sweep takes."""
 _SWEEP_STEPS = 120
-"""Most steps of each fit of a sweep."""
+"""Largest number of steps of T* in each fit of a sweep."""
 
 KKLConfigT = TypeVar("KKLConfigT", bound=KKLConfig)
 
 
 class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
-    """Trains T and T* on simulated episodes of the model; of the record it takes the sample times
-    and the prior.
+    """Train T and T* on simulated episodes of the model; the record gives the sample times and the
+    prior.
 
-    With ``sweep`` the cut-off is first chosen by short fits at several, one after another. Found is
-    for each its ``cutoff`` in Hz; the ``loss`` that cut-offs are chosen by; the NRMSE at the end of
-    an episode without (``clean``) and with noise (``noisy``), their difference in squares
-    (``noise_gain``, over the NRMSE of the outputs' own noise); and the time in s after which the
-    error stays below twice that at the end (``convergence``).
+    With ``sweep`` the cut-off is first chosen by short fits at several cut-offs. The results of
+    each fit are its ``cutoff`` in Hz; the ``loss``, by which the cut-off is chosen; the NRMSE in
+    the last quarter of an episode without noise (``clean``) and with noise (``noisy``); the root of
+    the difference of their squares over the NRMSE of the output noise (``noise_gain``); and the
+    time in s after which the noisy error stays below twice that of the last quarter
+    (``convergence``).
     """
 
     paced_by_budget = True
@@ -50,16 +51,16 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
 
     @abstractmethod
     def encoding(self, samples: Samples) -> Objective:
-        """The equations that T is fitted to."""
+        """Return the equations to which T is fitted."""
 
     @abstractmethod
     def gap(self) -> int:
-        """Samples from the first to the second of each pair that is kept, if pairs are; else 0."""
+        """Return the number of samples between the two of each kept pair; 0 without pairs."""
 
     def start(self) -> None:
         _check(self.system, self.record)
         self.sweep: list[dict[str, float]] = []
-        """What is found at each cut-off so far."""
+        """The results at each cut-off so far."""
         if self.config.sweep == "cutoff":
             self.fit = self._fit(self._swept_config())
         else:
@@ -71,6 +72,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         return self.config.sweep == "cutoff" and len(self.sweep) < len(SWEEP)
 
     def _fit(self, config: KKLConfigT) -> TwoStageFit:
+        """Simulate the samples for a config, and prepare the fit to them."""
         record = self.record
         prior = record.prior.mean[:1]
         samples = Samples(
@@ -79,7 +81,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         return TwoStageFit(samples, config, self.encoding)
 
     def _swept_config(self) -> KKLConfigT:
-        """The recipe of the sweep's next fit, or of the last one with the best of its cut-offs."""
+        """Return the config of the sweep's next fit, or of the final fit with the best cut-off."""
         config, budget = self.config, self.config.budget
         if self.sweeping:
             cutoff = SWEEP[len(self.sweep)] * config.cutoff_for(self.system)
@@ -122,7 +124,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         return {f"loss/{name}": self.fit.fit.loss, f"loss/{name}_held_out": self.fit.latest}
 
     def state(self) -> dict[str, Any]:
-        # A fit of a sweep that is not over begins anew.
+        # A fit of an unfinished sweep is restarted.
         return {"sweep": self.sweep, "fit": None if self.sweeping else self.fit.state()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -133,7 +135,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
             self.fit.load_state(state["fit"])
 
     def result(self) -> TrainedKKL:
-        """The observer of the least validation errors."""
+        """Return the observer with the least validation errors."""
         fit, samples = self.fit, self.fit.samples
         decoder = fit.decoder
         facts = self.facts(loss=fit.best["T*"].error, seed=self.config.seed)

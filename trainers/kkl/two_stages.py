@@ -1,4 +1,4 @@
-"""The fit of T, then that of T*."""
+"""The fit in two stages: of T, then of T*."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from trainers.kkl.samples import Samples
 Stage: TypeAlias = Literal["T", "T*", "done"]
 
 _USUAL = 0.95
-"""Weight of the past in the mean squared error of each part."""
+"""Weight of the past in the moving average of each part's mean squared error."""
 _SHARE = 0.02
-"""Part of the mean squared error that is added to each part's before it is divided by."""
+"""Fraction of the overall mean squared error that regularises that of each part."""
 
 
 @dataclass(eq=False)
@@ -35,16 +35,16 @@ class BestWeights:
     iteration: int
     layers: Layers
     made: int = 0
-    """Steps that were made in all."""
+    """Number of steps of the whole stage."""
 
 
 class TwoStageFit:
-    """A fit of T to the trainer's equations, then of T* to x at the z that occur online.
+    """Fit T to the trainer's equations, then T* to x at the z that occur online.
 
     Args:
-        samples: what is fitted to.
-        config: the recipe.
-        encoding: makes the equations that T is fitted to.
+        samples: the training samples.
+        config: the settings.
+        encoding: returns the equations to which T is fitted.
     """
 
     def __init__(
@@ -63,28 +63,31 @@ class TwoStageFit:
 
     @property
     def iterations(self) -> int:
-        """Steps so far, for both networks."""
+        """Number of steps so far, for both networks."""
         return self.fit.iteration + (self.best["T"].made if self.stage != "T" else 0)
 
     @property
     def encoder(self) -> Layers:
-        """T's best weights."""
+        """The best weights of T."""
         return self.best["T"].layers
 
     @property
     def decoder(self) -> Layers:
-        """T*'s best weights; if T is not done, as they are drawn, so that there are some."""
+        """The best weights of T*.
+
+        If T is still in training, the stage of T* is begun, and these are its initial weights.
+        """
         if self.stage == "T":
             self.best["T"].made = self.fit.iteration
             self._begin("T*")
         return self.best["T*"].layers
 
     def finished(self) -> bool:
-        """Whether both networks are trained."""
+        """Return whether both networks are trained."""
         return self.stage == "done"
 
     def step(self) -> None:
-        """Make a step of the present network; the next one's turn if that was the last."""
+        """Make a step of the current stage, and begin the next stage after its last step."""
         self.fit.step(self._stage_progress)
         if self.fit.iteration % self.config.check_every == 0:
             self._validate()
@@ -97,14 +100,14 @@ class TwoStageFit:
                 self.stage = "done"
 
     def progress(self) -> float:
-        """How much of the whole fit is over, from 0 to 1."""
+        """Return the finished fraction of the whole fit, from 0 to 1."""
         share = self.config.share / (1 + self.config.share)
         if self.stage == "T":
             return share * min(self._stage_progress, 1.0)
         return 1.0 if self.finished() else share + (1 - share) * min(self._stage_progress, 1.0)
 
     def _begin(self, stage: Stage) -> None:
-        """Draw the network of a stage."""
+        """Draw the network of a stage, and prepare its data."""
         self.stage: Stage = stage
         self._stage_start = self.seconds
         config, samples = self.config, self.samples
@@ -122,7 +125,7 @@ class TwoStageFit:
             objective = self._encoding(samples)
             self._checked = _held_equations(objective, config.seed)
         else:
-            if samples.labels is None:  # T is what it is now
+            if samples.labels is None:  # T* inverts the trained T, not simulated z
                 samples.z = samples.tensor(samples.whitening.scaled(self._own_z()))
             objective = self._decoding
             parts = int(samples.parts[-1]) + 1
@@ -131,8 +134,10 @@ class TwoStageFit:
         self._validate()
 
     def _own_z(self) -> np.ndarray:
-        """The z along the episodes if T is right: T(x(t)) + Φ(t)(z₀ − T(x₀)), or T(t, x(t)) of a
-        driven plant."""
+        """Compute the z along the episodes from the trained T, (kept, batch, nz).
+
+        It is T(x(t)) + Φ(t)(z₀ − T(x₀)), or T(t, x(t)) of a driven plant.
+        """
         data, map_of = self.samples.data, self.encoder
         if self.samples.driven:
             clock = self.samples.clock(data.t, data.u)[:, None]
@@ -140,6 +145,7 @@ class TwoStageFit:
                 [data.x, np.broadcast_to(clock, (*data.x.shape[:2], clock.shape[-1]))], axis=-1
             )
             return perceptron(map_of, self.config.activation, x)
+        # The transient from z₀ to T(x) decays with Φ.
         T, T0 = (perceptron(map_of, self.config.activation, x) for x in (data.x, data.x0))
         first = self.samples.t[0]
         y0 = self.samples.system.h(first, data.x0, np.asarray(self.samples.system.input(first)))
@@ -149,39 +155,43 @@ class TwoStageFit:
         return T + np.einsum("kij,bj->kbi", data.flow, z0 - T0)
 
     def _decoding(self, generator: torch.Generator) -> Sequence[Equations]:
-        """x̂ = x at samples of all parts of the episode, whose errors are divided by what is usual
-        there: else the transient, which is never small, is all that counts."""
+        """Draw the equations x̂ = x of T* at random samples.
+
+        They are weighted by the inverse of the root mean square error in their part of the episode.
+        Otherwise the transient, whose errors are never small, would dominate.
+        """
         samples = self.samples
         k, i = samples.draw(generator, samples.system.nx)
+        # Inputs of T*: z with a random draw of the noise, and the clock.
         rows = samples.z_noise.shape[1]
         j = torch.randint(rows, (len(k),), generator=generator).to(samples.device)
         a = torch.cat([samples.z[k, i] + samples.z_noise[k, j], samples.times[k]], dim=-1)
         target, part = samples.x[k, i], samples.parts.to(samples.device)[k]
-        with torch.no_grad():
+        with torch.no_grad():  # moving average of each part's error, and the weights from it
             square = (self.fit.net(a) - target).square().mean(dim=-1)
             count = torch.bincount(part, minlength=len(self._mse))
-            found = torch.zeros_like(self._mse).index_add_(0, part, square) / count.clamp(min=1)
-            self._mse = torch.where(count > 0, _USUAL * self._mse + (1 - _USUAL) * found, self._mse)
+            mse = torch.zeros_like(self._mse).index_add_(0, part, square) / count.clamp(min=1)
+            self._mse = torch.where(count > 0, _USUAL * self._mse + (1 - _USUAL) * mse, self._mse)
             usual = self._mse + _SHARE * self._mse.mean()
             weight = (usual.mean() / usual).sqrt()[part][:, None]
         return [Equations([Term(a)], target, weight)]
 
     @property
     def _stage_progress(self) -> float:
-        """How much of the present network's training is over: by steps, or by CPU time if there is
-        a budget and that is further."""
+        """Finished fraction of the current stage: of its steps or, if larger, of its CPU time."""
         config = self.config
         steps = config.iterations * (config.share if self.stage == "T" else 1.0)
         done = self.fit.iteration / steps
         if config.budget is not None:
-            left = config.budget - self._stage_start
-            mine = left * config.share / (1 + config.share) if self.stage == "T" else left
+            budget = config.budget - self._stage_start
+            share = budget * config.share / (1 + config.share) if self.stage == "T" else budget
             spent = self.seconds - self._stage_start
-            done = max(done, spent / max(mine, 1e-9))
+            done = max(done, spent / max(share, 1e-9))
         return done
 
     def traded(self) -> dict[str, float]:
-        """What a cut-off trades; see `trainers.kkl.trainer.KKLTrainer`."""
+        """Return the errors between which a cut-off trades; see
+        `trainers.kkl.trainer.KKLTrainer`."""
         noisy, clean = (self._held_squares(noise).cpu().numpy() for noise in (True, False))
         t = self.samples.data.t
         late = t >= t[0] + 0.75 * (t[-1] - t[0])
@@ -197,6 +207,7 @@ class TwoStageFit:
         }
 
     def _stage_over(self) -> bool:
+        """Return whether the steps, the time or the patience of the stage are used up."""
         best = self.best[self.stage]
         config = self.config
         steps = config.iterations * (config.share if self.stage == "T" else 1.0)
@@ -204,7 +215,7 @@ class TwoStageFit:
         return self._stage_progress >= 1 or (waited >= config.patience and self.fit.iteration > 0)
 
     def _validate(self) -> None:
-        """Find the error on what is held out, and keep the weights if it is the least so far."""
+        """Compute the validation error, and keep the weights if it is the least so far."""
         with torch.no_grad():
             self.latest = self._held_error()
         best = self.best.get(self.stage)
@@ -214,10 +225,15 @@ class TwoStageFit:
             )
 
     def _held_error(self) -> float:
+        """Return the validation error.
+
+        For T it is the mean squared residual of fixed equations; for T* the geometric mean over
+        the parts of the episode of the mean squared error on held-out episodes.
+        """
         net = self.fit.net
         if self.stage == "T":
-            found = [e.residual(net).square().mean() for e in self._checked]
-            return float(torch.stack(found).sum())
+            losses = [e.residual(net).square().mean() for e in self._checked]
+            return float(torch.stack(losses).sum())
         square = self._held_squares(noise=True)
         parts = torch.zeros_like(self._mse).index_add_(
             0, self.samples.parts.to(self.samples.device), square
@@ -226,7 +242,7 @@ class TwoStageFit:
         return float((parts / count).log().mean().exp())
 
     def _held_squares(self, noise: bool) -> Tensor:
-        """Mean squared scaled errors of x̂ on the episodes held out, (kept,)."""
+        """Return the mean squared scaled errors of x̂ on the held-out episodes, (kept,)."""
         with torch.no_grad():
             z = self.samples.z[:, self.samples.held]
             if noise:
@@ -236,7 +252,7 @@ class TwoStageFit:
             return error.square().mean((1, 2))
 
     def state(self) -> dict[str, Any]:
-        """All that `load_state` needs to go on exactly; the samples are simulated anew."""
+        """Return all that `load_state` needs to resume exactly; samples are simulated again."""
         return {
             "stage": self.stage,
             "seconds": self.seconds,
@@ -250,8 +266,8 @@ class TwoStageFit:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state` gave."""
-        self.best = {stage: BestWeights(**found) for stage, found in state["best"].items()}
+        """Restore the result of `state`."""
+        self.best = {stage: BestWeights(**weights) for stage, weights in state["best"].items()}
         kept = dict(self.best)
         if state["stage"] != "T":
             self._begin("T*")
@@ -264,5 +280,6 @@ class TwoStageFit:
 
 
 def _held_equations(objective: Objective, seed: int) -> list[Equations]:
+    """Draw five batches of equations for the validation of T."""
     generator = torch.Generator().manual_seed(seed + 10**6)
     return [e for _ in range(5) for e in objective(generator)]

@@ -1,10 +1,9 @@
-"""A gain shared by all episodes, trained on outputs and the model's equations over many of them.
+"""A gain shared by all episodes, trained on the outputs of many records and the model's equations.
 
-What the true states were is never seen. Two things stand for them: the trajectories that explain
-the outputs of whole records best (`smooth`), and the model. The gain is run over these records
-online, its errors against the smoothed trajectories are propagated back in time through the model,
-the covariance and the gain, and the outputs are drawn anew with noise of many levels, of which the
-gain is told through R.
+The true states are not used. The targets are the smoothed trajectories of whole records (`smooth`),
+computed from outputs and model. The gain runs online along these trajectories, on outputs simulated
+with noise of many levels, which R reports to it. The errors are backpropagated in time through the
+model, the covariance and the gain.
 """
 
 from __future__ import annotations
@@ -36,39 +35,40 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MIN_SAMPLES = 10
-"""The shortest records that are trained on."""
+"""Fewest samples of a record."""
 _RESTARTS = 3
+"""Largest number of restarts."""
 _PATIENCE = 10
-"""Chunks in a row without a finite loss after which training begins again."""
+"""Consecutive iterations without a finite loss after which training is restarted."""
 _WARM_UP = 20
 """Iterations over which Adam's step grows to its full size."""
 _AVERAGE = 0.98
-"""What the moving average of the weights keeps from one iteration to the next."""
+"""Weight of the past in the moving average of the weights."""
 _SLOW = 5.0
-"""Weight w of the size of scaled errors beside their logarithm."""
+"""Weight w of the scaled error relative to its logarithm in the loss."""
 _RESOLUTION = 1e-3
-"""Scaled error below which an error is hardly made smaller."""
+"""Scaled error below which the loss hardly decreases."""
 
 
 @dataclass(frozen=True, eq=False)
 class BestGain:
-    """The weights of the least held-out loss so far."""
+    """The weights with the least validation loss so far."""
 
     loss: float
     """See `HeldOut.loss`."""
     iteration: int
-    """The iteration after which they were found; 0 is the EKF itself."""
+    """The iteration of these weights; 0 stands for the initial network."""
     seed: int
-    """What these weights began from."""
+    """Seed of the initial weights."""
     layers: Layers
 
 
 class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
-    """Trains a gain on the records of a batch of ``config.episodes`` episodes.
+    """Train a gain on a record of ``config.episodes`` episodes.
 
-    It begins as the EKF, and the weights of the least error on the records held out are kept, the
-    first ones among them. If the loss leaves the finite numbers for long, training begins again
-    from the next seed, three times at most.
+    The weights with the least loss on the held-out records are kept, the initial ones included;
+    those of the variant ``kalman`` are equivalent to the EKF. If the loss is not finite in ten
+    consecutive iterations, training is restarted from the next seed, at most three times.
     """
 
     name = "pinn_gain"
@@ -102,12 +102,13 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
 
     @property
     def seed(self) -> int:
-        """What the present weights began from."""
+        """Seed of the current attempt."""
         return self.config.seed + self.attempt
 
     def _begin(self, attempt: int) -> None:
-        """Draw the weights and streams of an attempt."""
+        """Draw the initial weights and streams of an attempt."""
         self.attempt, self.failures, self.since = attempt, 0, 0
+        # The last layer begins at zero, so that the initial network corrects nothing.
         generator = torch.Generator().manual_seed(self.seed)
         config, system = self.config, self.system
         self.parameters: list[Tensor] = []
@@ -130,11 +131,11 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
             self._validate()
 
     def step(self) -> None:
-        """Roll all streams over one chunk, and make a step of Adam."""
+        """Roll out all streams over one chunk, and make a step of Adam."""
         weights = list(zip(self.parameters[::2], self.parameters[1::2], strict=True))
-        with np.errstate(all="ignore"):  # streams that are lost begin anew
-            moments, errors = self.streams.roll(weights)
-        loss = self._loss([moment.P for moment in moments], errors)
+        with np.errstate(all="ignore"):  # diverged streams are restarted
+            states, errors = self.streams.roll(weights)
+        loss = self._loss([state.P for state in states], errors)
         self.iteration += 1
         self.since += 1
         self.loss = loss.item()
@@ -143,6 +144,7 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
             loss.backward()
             self.gradient = float(torch.nn.utils.clip_grad_norm_(self.parameters, 1.0))
         if math.isfinite(self.loss) and math.isfinite(self.gradient):
+            # A step of Adam with warm-up, then the moving average of the weights.
             self.failures = 0
             for group in self._optimiser.param_groups:
                 group["lr"] = self.config.learning_rate * min(1.0, self.since / _WARM_UP)
@@ -152,16 +154,20 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
                 average.lerp_(parameter.detach(), 1 - kept)
         else:
             self.failures += 1
-        self.streams.continue_from(moments[-1])
+        self.streams.continue_from(states[-1])
         if self.failures == _PATIENCE:
             self._restart()
         elif self.iteration % self.config.check_every == 0:
             self._validate()
 
     def _loss(self, covariances: list[Tensor], errors: Tensor) -> Tensor:
-        """The mean over streams of log e + we, e the root mean square scaled error of a chunk: the
-        first counts all streams alike, the second those that are slow to settle. And that of the
-        likelihood of the errors under the covariance's diagonal, its tails made heavy."""
+        """Return the training loss of a chunk.
+
+        It is the mean over streams of log e + we, where e is a stream's root mean square scaled
+        error. The logarithm weighs all streams alike; the second term stresses slow convergence.
+        With ``consistency``, the mean negative log-likelihood of the errors under the diagonal of
+        the covariance is added, with heavy tails.
+        """
         size = (errors.square().mean((0, 1)) + _RESOLUTION**2).sqrt()
         loss = (size.log() + _SLOW * size).mean()
         if self.config.variant == "gru" or not self.config.consistency:
@@ -172,8 +178,7 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
         return loss + self.config.consistency * surprise.mean()
 
     def _validate(self) -> None:
-        """Find the loss of the averaged weights on the records held out, and keep the weights if it
-        is the least so far."""
+        """Compute the validation loss of the averaged weights, and keep them if it is the least."""
         layers = layers_of(self.average)
         loss = self.held_out.loss(layers)
         if self.best is None or loss < self.best.loss:
@@ -181,13 +186,14 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
         self.latest = loss
 
     def _restart(self) -> None:
+        """Restart from the next seed, or stop after the last restart."""
         if self.attempt == _RESTARTS:
             self.stuck = True
         else:
             self._begin(self.attempt + 1)
 
     def finished(self) -> bool:
-        """Whether the iterations are used up, or no seed gives finite losses."""
+        """Return whether the iterations are used up, or all attempts have failed."""
         return self.iteration >= self.config.iterations or self.stuck
 
     def progress(self) -> float:
@@ -206,10 +212,11 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
         }
 
     def result(self) -> TrainedGain:
-        """The network of the least held-out loss.
+        """Return the gain with the least validation loss.
 
         Raises:
-            FloatingPointError: in one line, if no seed gave finite losses for long.
+            FloatingPointError: in one line, if all attempts failed before any weights improved on
+                the initial ones.
         """
         if self.iteration % self.config.check_every and not self.stuck:
             self._validate()
@@ -254,17 +261,21 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
 
 
 _COUNTS = ("attempt", "failures", "since", "stuck", "latest")
-"""What is counted, and the latest held-out loss."""
+"""The counters and the latest validation loss."""
 
 
 def layers_of(parameters: list[Tensor]) -> Layers:
-    """The same as NumPy arrays, in pairs."""
+    """Convert parameters to NumPy arrays, as pairs of weights and biases."""
     arrays = [p.detach().numpy().copy() for p in parameters]
     return tuple(zip(arrays[::2], arrays[1::2], strict=True))
 
 
 def _check(system: System, record: Record, config: PinnGainConfig) -> None:
-    """Check that a record can be trained on."""
+    """Check that a record can be used for training.
+
+    Raises:
+        ValueError: in one line, with the value found and the value expected.
+    """
     name = type(system).__name__
     sizes = (("y", record.y, system.ny), ("u", record.u, system.nu))
     for symbol, array, size in (*sizes, ("xhat0", record.prior.mean, system.nx)):

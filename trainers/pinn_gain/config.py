@@ -1,4 +1,4 @@
-"""The settings of the trainer of shared gains."""
+"""Settings of the trainer of shared gains."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_se
 
 @dataclass(frozen=True)
 class PinnGainConfig(TrainingConfig):
-    """The recipe of a gain shared by all episodes."""
+    """Settings of a gain shared by all episodes."""
 
     may_change = ("iterations",)
 
     variant: Variant = "kalman"
-    """A network that corrects a Kalman gain, or a recurrent network that gives the gain alone."""
+    """A network that corrects a Kalman gain (kalman), or a recurrent network (gru)."""
     episodes: int = 192
-    """Records that are learned from, those held out among them."""
+    """Number of records, including the held-out ones."""
     held_out: int = 48
-    """Records that only decide which weights are kept."""
+    """Number of records held out for validation."""
     width: int = 32
     """Neurons in each of the two hidden layers, or in the recurrent unit."""
     iterations: int = 350
-    """Most iterations, each one chunk of all streams."""
+    """Largest number of iterations, each of one chunk of all streams."""
     streams: int = 128
-    """Streams that are run side by side."""
+    """Number of streams that run in parallel."""
     chunk: int = 50
-    """Samples over which errors are propagated back."""
+    """Samples over which errors are backpropagated in time."""
     learning_rate: float = 3e-3
-    """Step of Adam, after a short warm-up constant; the weights that count are a moving average."""
+    """Step size of Adam, constant after a short warm-up."""
     consistency: float = 0.1
-    """Weight of the likelihood of the errors under the covariance, beside their size."""
+    """Weight of the negative log-likelihood of the errors under the covariance in the loss."""
     check_every: int = 25
-    """Iterations from one look at the records held out to the next."""
+    """Iterations between validations."""
     checkpoint_every: int = 50
-    """Iterations from one checkpoint to the next."""
+    """Iterations between checkpoints."""
     log_every: int = 5
-    """Iterations from one point of the logged curves to the next."""
+    """Iterations between points of the logged curves."""
 
     @property
     def records(self) -> int:

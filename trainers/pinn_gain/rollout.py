@@ -1,4 +1,4 @@
-"""The learned gains run over a batch of streams in torch, so that losses have gradients."""
+"""Differentiable rollout of the learned gains over a batch of streams, in torch."""
 
 from __future__ import annotations
 
@@ -25,62 +25,73 @@ Weights = Sequence[tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True)
 class Model:
-    """What all steps of a rollout share."""
+    """The constants of a rollout."""
 
     system: System
     variant: Variant
     scale: Tensor
-    """Shape (nx, 1)."""
+    """The system's scale, shape (nx, 1)."""
     output_scale: Tensor
-    """Shape (ny, 1)."""
+    """Scale of the outputs, shape (ny, 1)."""
     Q: Tensor
-    """Covariance of the process noise of a sample, shape (nx, nx, 1)."""
+    """Covariance of the process noise per sample, shape (nx, nx, 1)."""
 
 
 @dataclass(frozen=True)
 class FilterState:
-    """The estimates of all streams after a sample, the batch last."""
+    """The estimates of all streams after a sample; the batch is the last axis."""
 
     xhat: Tensor
-    """Shape (nx, batch)."""
+    """Estimates, shape (nx, batch)."""
     P: Tensor
-    """Shape (nx, nx, batch); carried along unchanged by the variant without a covariance."""
+    """Covariances, shape (nx, nx, batch); updates of the variant ``gru`` leave them unchanged."""
     memory: Tensor
-    """Shape (memory size, batch)."""
+    """Memory of the network, shape (memory size, batch)."""
 
 
 def predict(
     model: Model,
-    moment: FilterState,
+    state: FilterState,
     t: tuple[np.ndarray, np.ndarray],
     u: tuple[np.ndarray, np.ndarray],
 ) -> FilterState:
-    """The prediction over one sample, from times t[0] to t[1], (batch,) in s, at inputs u[0] and
-    u[1], (batch, nu).
+    """Predict over one sample, from times t[0] to t[1], (batch,) in s, with inputs u[0] and u[1],
+    (batch, nu).
 
-    The derivative of the step is its exact Jacobian, which the covariance needs anyway. That the
-    Jacobian itself depends on x̂ is left out of gradients: the points of linearisation are fixed.
+    Gradients pass through the exact Jacobian of the model's step, which the covariance needs, too.
+    Its own dependence on x̂ is neglected in gradients.
     """
-    at = moment.xhat.detach()
+    # The step and its Jacobian in NumPy.
+    at = state.xhat.detach()
     x = np.ascontiguousarray(at.numpy().T)
     after, F = model_step_jacobian(model.system, t[0], t[1], x, u[0], u[1])
     flow = torch.from_numpy(np.ascontiguousarray(F.transpose(1, 2, 0)))
-    moved = (flow * (moment.xhat - at)[None]).sum(1)
+    # Zero in value; its gradient is the Jacobian.
+    moved = (flow * (state.xhat - at)[None]).sum(1)
     xhat = torch.from_numpy(np.ascontiguousarray(after.T)) + moved
-    return FilterState(xhat, sandwich(flow, moment.P) + model.Q, moment.memory)
+    return FilterState(xhat, sandwich(flow, state.P) + model.Q, state.memory)
 
 
 def update(
     model: Model,
     weights: Weights,
-    moment: FilterState,
+    state: FilterState,
     now: tuple[np.ndarray, np.ndarray],
     y: Tensor,
     R: Tensor,
 ) -> FilterState:
-    """The estimates after outputs y (ny, batch), with noise of covariance R (ny, ny, batch), at
-    times ``now[0]`` (batch,) in s and inputs ``now[1]`` (batch, nu); no output is missing."""
-    xhat, P = moment.xhat, moment.P
+    """Update the estimates by outputs, none of which is missing.
+
+    Args:
+        model: the constants of the rollout.
+        weights: weights and biases of the network.
+        state: the predictions.
+        now: times (batch,) in s, and inputs (batch, nu).
+        y: outputs, shape (ny, batch).
+        R: covariance of the output noise, shape (ny, ny, batch).
+    """
+    # Innovation; its gradient passes through H, as in `predict`.
+    xhat, P = state.xhat, state.P
     at = xhat.detach()
     (t, u), x = now, at.numpy().T
     H = np.broadcast_to(model.system.h_jacobian(t, x, u), (len(x), len(y), len(xhat)))
@@ -90,14 +101,16 @@ def update(
     if model.variant == "gru":
         std = torch.diagonal(R).T.sqrt()
         sizes = model.scale, model.output_scale
-        K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, moment.memory)
+        K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, state.memory)
         return FilterState(xhat + (K * innovation[None]).sum(1), P, memory)
+    # Kalman gain, corrected by the network.
     K, S = kalman_gain(P, H, R)
     variance = torch.diagonal(S).T
     share = 1 - torch.diagonal(R).T / variance
-    args = (xhat, P, innovation, variance, K, share, moment.memory)
+    args = (xhat, P, innovation, variance, K, share, state.memory)
     K = corrected_gain(weights, model.scale, *args)
     present = torch.ones_like(innovation, dtype=torch.bool)
-    memory = remembered(moment.memory, innovation, variance, present)
+    memory = remembered(state.memory, innovation, variance, present)
+    # Joseph's form, which is valid for any gain.
     x_after, P = update_with(K, xhat.T, P, innovation.T, H, R)
     return FilterState(x_after.T, P, memory)

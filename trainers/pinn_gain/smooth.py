@@ -1,4 +1,4 @@
-"""The trajectories behind a batch of records: what outputs and equations say of them afterwards."""
+"""Smoothed trajectories of a batch of records, from their outputs and the model's equations."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.record import Record
 
 PROCESS_NOISE = (30.0, 1.0)
-"""Process noise, over the EKF's, of further attempts at records that the first leaves unexplained,
-each beginning from the trajectory before."""
+"""Process noise, over the EKF's, of further attempts at records whose outputs the first attempt
+does not explain; each later one begins from the trajectory of the one before."""
 _PASSES = 8
-"""Most Gauss-Newton steps of an attempt."""
+"""Largest number of Gauss-Newton steps of an attempt."""
 _SETTLED = 1e-3
-"""Largest step, over the state's scale, at which a trajectory no longer changes."""
+"""Step, over the state's scale, below which a trajectory has converged."""
 _BLOCK = 300_000
-"""Samples of all rows that are smoothed at a time."""
+"""Approximate number of samples, over all rows, that are smoothed at a time."""
 _WINDOW = 25
-"""Samples over which the outputs must be explained."""
+"""Length in samples of the windows in which residuals are tested."""
 _DEVIATIONS = 6.0
-"""Standard deviations of a mean squared residual up to which outputs count as explained."""
+"""Largest excess of a sum of squared residuals over its mean, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -32,43 +32,44 @@ class Smoothed:
     xhat: np.ndarray
     """Shape (batch, num_samples, nx)."""
     explained: np.ndarray
-    """Whether the residuals of the outputs are as small as their noise, everywhere: bool (batch,).
+    """Whether the residuals of the outputs are consistent with their noise, bool, shape (batch,).
     """
 
 
 def smooth(record: Record, ekf: EKF) -> Smoothed:
-    """The trajectories that explain whole records, with the least process noise of those tried.
+    """Smooth whole records.
 
-    The first attempt has the EKF's own process noise and begins from its estimates. For records
-    that it leaves unexplained, since the filter was lost or the plant is not the model, the noise
-    is raised and lowered again.
+    The first attempt has the EKF's process noise and begins at its estimates. If its residuals are
+    too large, because the filter diverged or the plant differs from the model, the record is
+    smoothed again with more process noise, and from there with the EKF's.
     """
-    found = smooth_once(record, ekf)
-    xhat, good = found.xhat, found.explained
-    points, levels = xhat.copy(), np.where(good, 1.0, np.inf)
-    for level in PROCESS_NOISE:
-        rows = np.flatnonzero(~good)
+    first = smooth_once(record, ekf)
+    xhat, explained = first.xhat, first.explained
+    points, levels = xhat.copy(), np.where(explained, 1.0, np.inf)
+    for level in PROCESS_NOISE:  # continuation in the process noise
+        rows = np.flatnonzero(~explained)
         if not len(rows):
             break
-        begin = points[rows] if level < PROCESS_NOISE[0] else None
+        initial = points[rows] if level < PROCESS_NOISE[0] else None
         loose = replace(ekf, process_noise=level * ekf.process_noise)
-        again = smooth_once(record.rows(rows), loose, begin)
-        points[rows] = again.xhat
-        better = rows[again.explained]
+        retried = smooth_once(record.rows(rows), loose, initial)
+        points[rows] = retried.xhat
+        better = rows[retried.explained]
         xhat[better], levels[better] = points[better], level
     return Smoothed(xhat, np.isfinite(levels))
 
 
 def smooth_once(record: Record, ekf: EKF, points: np.ndarray | None = None) -> Smoothed:
-    """The trajectories of highest posterior density given whole records, by the iterated extended
-    Kalman smoother: Gauss-Newton on the batch least-squares problem of prior, outputs and process
-    noise (Bell 1994).
+    """Compute the maximum a posteriori trajectories of whole records.
+
+    The iterated extended Kalman smoother is a Gauss-Newton method for the least-squares problem of
+    prior, outputs and process noise (Bell 1994).
 
     Args:
-        record: of a batch of episodes.
-        ekf: says the model and both noises.
-        points: where to linearise first, (batch, num_samples, nx); along the EKF's own estimates
-            if None.
+        record: record of a batch of episodes.
+        ekf: the EKF, which gives the model and both noises.
+        points: states of the first linearisation, shape (batch, num_samples, nx); the EKF's own
+            estimates if None.
     """
     Q, R = ekf.tuning()
     count = max(1, _BLOCK // record.num_samples)  # rows that fit into memory
@@ -85,15 +86,19 @@ def smooth_once(record: Record, ekf: EKF, points: np.ndarray | None = None) -> S
 
 
 def _explains(ekf: EKF, record: Record, xhat: np.ndarray) -> np.ndarray:
-    """Whether outputs are where they should be, over the whole record and every window of it."""
+    """Return whether the residuals are consistent with the output noise, bool (batch,).
+
+    The sum of their squares is tested against the χ² distribution's mean and standard deviation,
+    over the whole record and over windows.
+    """
     present = ~np.isnan(record.y)
     error = record.y - ekf.system.h(record.t, xhat, record.u)
     square = np.where(present, error**2 / ekf.output_variance, 0.0)
     window = min(_WINDOW, record.num_samples)
-    good = np.isfinite(xhat).all(axis=(1, 2))
+    consistent = np.isfinite(xhat).all(axis=(1, 2))
     for length in (window, record.num_samples):
         sums = [np.cumsum(a.sum(axis=-1), axis=1) for a in (square, present)]
         total, count = (np.diff(s[:, length - 1 :: length], axis=1, prepend=0) for s in sums)
-        most = count + _DEVIATIONS * np.sqrt(2 * count)
-        good &= (total <= most).all(axis=1)
-    return np.asarray(good)
+        bound = count + _DEVIATIONS * np.sqrt(2 * count)
+        consistent &= (total <= bound).all(axis=1)
+    return np.asarray(consistent)

@@ -1,4 +1,4 @@
-"""PINN-Obs: a network and a gain for one record, by the paper's recipe or a fast one.
+"""PINN-Obs: a network for the estimates and gains of one record, by the paper's or a fast recipe.
 
 Farkane, Boutayeb, Oudani & Ghogho, "PINN-Obs: Physics-Informed Neural Network-Based Observer for
 Nonlinear Dynamical Systems". Equation numbers are the paper's.
@@ -34,18 +34,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MIN_SAMPLES = 10
-"""The shortest record that is trained on."""
+"""Fewest samples of a record."""
 _RECIPES: dict[str, type[Recipe]] = {"adam": PaperRecipe, "ssbroyden": FastRecipe}
 _RESTARTS = 3
 _TERMS = ("initial", "equation", "output")
 
 
 class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
-    """Trains PINN-Obs on the record of one episode.
+    """Train PINN-Obs on the record of one episode.
 
-    The weights of the least training loss are kept. If the loss leaves the finite numbers, training
-    begins again from the next seed, three times at most. The paper's recipe makes no use of the
-    noise.
+    The weights with the least training loss are kept. If the loss is not finite, training is
+    restarted from the next seed, at most three times. The paper's recipe does not use the noise.
     """
 
     name = "pinn_obs"
@@ -55,11 +54,11 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
         _check(self.system, self.record, self.config)
         recipe = _RECIPES[self.config.optimiser]
         self.recipe = recipe(self.system, self.config, self.record, self.noise_std)
-        self._kept: BestIterate | None = None  # of attempts that ended in a loss that is not finite
+        self._kept: BestIterate | None = None  # best of the failed attempts
         self._begin(attempt=0)
 
     def _begin(self, attempt: int) -> None:
-        """Draw the weights of an attempt."""
+        """Draw the initial weights of an attempt."""
         self.attempt = attempt
         self.best: BestIterate | None = None
         self.mark = Mark(math.inf, self.iteration)
@@ -70,11 +69,11 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
 
     @property
     def theta(self) -> np.ndarray:
-        """The iteration's weights (n,)."""
+        """The current weights (n,)."""
         return self._first if self._method is None else self._method.x
 
     def step(self) -> None:
-        """Make one iteration, of which the first only looks at the weights that were drawn."""
+        """Make one iteration; the first one only evaluates the initial weights."""
         lower = True
         if self._method is None:
             self._method = self.recipe.begin(self._first)
@@ -83,8 +82,13 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
         self.took(self._method.f, self._method.x, lower)
 
     def took(self, loss: float, theta: np.ndarray, lower: bool = True) -> None:
-        """Count an iteration that ended at weights theta (n,), and keep them if their loss is the
-        least; ``lower`` is false if there is none lower to be found."""
+        """Count an iteration, and keep its weights if their loss is the least.
+
+        Args:
+            loss: loss at the iteration's weights.
+            theta: the weights, shape (n,).
+            lower: False if the minimiser could not find a lower loss.
+        """
         self.iteration += 1
         self.stuck = not lower
         if not math.isfinite(loss):
@@ -95,8 +99,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             self.best = BestIterate(loss, self.iteration, self.config.seed + self.attempt, theta)
 
     def _restart(self) -> None:
-        """Begin again from the next seed; what was best so far is kept. After the third time there
-        is no other, and the training ends."""
+        """Keep the best weights, and restart from the next seed, or end after the third restart."""
         self._keep()
         if self.attempt == _RESTARTS:
             self.stuck = True
@@ -104,11 +107,12 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             self._begin(self.attempt + 1)
 
     def _keep(self) -> None:
+        """Keep the attempt's best weights if they are the best of all attempts."""
         if self.best is not None and (self._kept is None or self.best.loss < self._kept.loss):
             self._kept = self.best
 
     def finished(self) -> bool:
-        """Whether the iterations or the patience are used up, or nothing lower can be found."""
+        """Return whether the iterations or the patience are used up, or no lower loss is found."""
         since = self.iteration - self.mark.iteration
         return (
             self.iteration >= self.config.iterations or since >= self.config.patience or self.stuck
@@ -125,26 +129,26 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
 
     def curves(self) -> Mapping[str, float]:
         terms = self._terms(self.theta)
-        found = {f"loss/{name}": float(term) for name, term in zip(_TERMS, terms, strict=True)}
-        found["loss/total"] = self._total(terms)
+        curves = {f"loss/{name}": float(term) for name, term in zip(_TERMS, terms, strict=True)}
+        curves["loss/total"] = self._total(terms)
         if self.best is not None:
-            found["loss/best"] = self.best.loss
+            curves["loss/best"] = self.best.loss
         if (loss := self.recipe.held_out(self.theta)) is not None:
-            found["loss/held_out"] = loss
-        return found
+            curves["loss/held_out"] = loss
+        return curves
 
     def _terms(self, theta: np.ndarray) -> np.ndarray:
-        """The three terms of the loss (3,) at weights theta (n,), unweighted, in the system's own
+        """Return the three unweighted terms of the loss (3,) at weights theta (n,), in the system's
         units."""
         return self.recipe.objective.terms(theta)
 
     def _total(self, terms: np.ndarray) -> float:
-        """The paper's loss from its terms (3,)."""
+        """Return the paper's loss from its terms (3,)."""
         return float(terms @ [self.config.w0, self.config.w_ode, self.config.w_y])
 
     def state(self) -> dict[str, Any]:
-        # The attempt stands for the state of chance: nothing is drawn after the weights. After a
-        # loss that is not finite there are no best weights, and no method yet.
+        # The attempt replaces the state of the random generator: nothing is drawn after the initial
+        # weights. Right after a restart there are no best weights and no minimiser.
         return {
             "attempt": self.attempt,
             "stuck": self.stuck,
@@ -169,7 +173,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             self._method = self.recipe.load_method(state["method"], best)
 
     def result(self) -> TrainedNetwork:
-        """The network of the least loss of all attempts.
+        """Return the network with the least loss of all attempts.
 
         Raises:
             FloatingPointError: in one line, if no loss was finite.
@@ -204,48 +208,55 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
         noise_std: Sequence[float] | float | None = None,
         folder: Path | None = None,
     ) -> list[TrainedNetwork]:
-        """Train on each row of a record, of one episode each, with one seed.
+        """Train one network per row of a record, each row being one episode.
 
-        With a GPU and no folder the fast recipe trains on all rows at once, each until its own
-        patience, iterations or budget end it (of the CPU seconds of all); see
-        `PinnObsConfig.device`. Otherwise it is one row after another, exactly as by `train`: on a
-        CPU that is the fastest. After Ctrl-C rows keep the best weights that they have, be it those
-        of their first iteration.
+        On a GPU, and without a folder, the fast recipe trains all rows at once. Each row ends by
+        its own patience or iterations, or by the budget, which then counts the CPU seconds of all
+        rows; see `PinnObsConfig.device`. Otherwise the rows are trained one after another, as by
+        `train`, which is fastest on a CPU. After Ctrl-C every row returns its best weights so far,
+        after at least one iteration.
 
         Args:
             system: the model.
-            config: the recipe; its seed is that of every row.
+            config: the settings; every row has their seed.
             record: the samples of all episodes.
             noise_std: see `Trainer`.
-            folder: where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained
-                network; nothing is kept without one.
+            folder: folder in which each row gets a folder ``row-<i>`` with its log, checkpoint and
+                trained network; nothing is written if None.
         """
         rows = [record.rows(slice(i, i + 1)) for i in range(record.batch)]
         for row in rows:
             _check(system, row, config)
         device = _device(config)
 
-        def begun(row: Record) -> PinnObsTrainer:
+        def new_trainer(row: Record) -> PinnObsTrainer:
             return cls(system, config, record=row, noise_std=noise_std)
 
         with deferred_interrupt() as interrupt:
             if folder is None and device != "cpu" and config.optimiser == "ssbroyden":
-                trainers = [begun(row) for row in rows]
+                trainers = [new_trainer(row) for row in rows]
                 advance(trainers, device, interrupt)
                 return [trainer.result() for trainer in trainers]
             if folder is None:
-                return [train(begun(row)) for row in rows]
-            found = []
+                return [train(new_trainer(row)) for row in rows]
+            networks = []
             for i, row in enumerate(rows):
-                place = folder / f"row-{i}"
-                with Log(place) as log:
-                    trained = train(begun(row), log=log, checkpoint=place / "checkpoint.pt")
-                trained.save(place / "trained.pt")
-                found.append(trained)
-        return found
+                row_folder = folder / f"row-{i}"
+                with Log(row_folder) as log:
+                    trained = train(
+                        new_trainer(row), log=log, checkpoint=row_folder / "checkpoint.pt"
+                    )
+                trained.save(row_folder / "trained.pt")
+                networks.append(trained)
+        return networks
 
 
 def _device(config: PinnObsConfig) -> str:
+    """Return the torch device of a config.
+
+    Raises:
+        ValueError: in one line, if it is a GPU and torch finds none.
+    """
     present = torch.cuda.is_available()
     if config.device == "cuda" and not present:
         raise ValueError("device='cuda'; torch finds no GPU here")
@@ -253,7 +264,11 @@ def _device(config: PinnObsConfig) -> str:
 
 
 def _check(system: System, record: Record, config: PinnObsConfig) -> None:
-    """Check that a record can be trained on."""
+    """Check that a record can be used for training.
+
+    Raises:
+        ValueError: in one line, with the value found and the value expected.
+    """
     name = type(system).__name__
     if (np.diff(record.t.astype(config.dtype)) <= 0).any():
         raise ValueError(

@@ -9,7 +9,7 @@ import numpy as np
 from trainers.pinn_obs.quasi_newton import Objective
 
 _MEAN, _SQUARE = 0.9, 0.999
-"""β₁ and β₂, what the two averages keep of themselves in a step."""
+"""β₁ and β₂, the decay rates of the two moving averages."""
 _EPSILON = 1e-8
 
 
@@ -18,25 +18,25 @@ class Adam:
     """A minimisation in progress, in the precision of x."""
 
     x: np.ndarray
-    """Where it stands, shape (n,)."""
+    """Current point, shape (n,)."""
     f: float
-    """The function there."""
+    """The function at x."""
     gradient: np.ndarray
-    """The gradient there, shape (n,)."""
+    """The gradient at x, shape (n,)."""
     learning_rate: float
     mean: np.ndarray
-    """The running average of the gradients, shape (n,)."""
+    """Moving average of the gradients, shape (n,)."""
     square: np.ndarray
-    """The running average of their squares, shape (n,)."""
+    """Moving average of the squared gradients, shape (n,)."""
     steps: int = 0
 
     @staticmethod
     def start(objective: Objective, x: np.ndarray, learning_rate: float) -> Adam:
-        """A minimisation that begins at x (n,)."""
+        """Begin a minimisation at x (n,)."""
         return Adam(x, *objective(x), learning_rate, np.zeros_like(x), np.zeros_like(x))
 
     def step(self, objective: Objective) -> bool:
-        """One iteration; it always goes on."""
+        """Make one iteration; always returns True."""
         self.steps += 1
         mean = _MEAN * self.mean + (1 - _MEAN) * self.gradient
         square = _SQUARE * self.square + (1 - _SQUARE) * self.gradient**2

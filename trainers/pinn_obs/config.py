@@ -1,4 +1,4 @@
-"""The settings of the trainer of PINN-Obs, and its presets."""
+"""Settings and presets of the trainer of PINN-Obs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 @dataclass(frozen=True)
 class PinnObsConfig(TrainingConfig):
-    """The recipe of PINN-Obs: the fast one, unless its settings are changed; see `paper`."""
+    """Settings of PINN-Obs; by default those of the fast recipe, see also `paper`."""
 
     may_change = ("iterations", "device")
 
@@ -32,40 +32,37 @@ class PinnObsConfig(TrainingConfig):
     w_y: float = 1.0
     """Weight of the outputs in the loss."""
     guide: float = 10.0
-    """Weight in the loss of x̂'s squared departure from the guide, a Kalman smoother's estimates of
-    the same record, in scaled units; the gain is then drawn towards Riccati's. With 0 there is no
-    guide. Not of Adam's."""
+    """Weight of the scaled squared deviation of x̂ from the guide, a Kalman smoother's estimates of
+    the same record; 0 is without a guide, as Adam requires."""
     transfer: bool = False
-    """Whether the gain is meant for other records, too: x̂ then leaves x̂₀ as fast as Riccati's gain
-    takes it, and not by a gain that fits this record alone. Needs the guide."""
+    """Whether the gain is meant for other records, too, so that x̂ leaves x̂₀ only as fast as the
+    Riccati gain allows; needs the guide."""
     gain_penalty: float = 0.1
-    """Weight in the loss of the gain's squared departure from the guide's, or from zero without
-    one, over its size and ten units of state, output and time; 1e-3 is a good one without a guide.
-    Not of Adam's."""
+    """Weight of the scaled squared deviation of the gain from the guide's, or from zero without a
+    guide, where 1e-3 is suitable; 0 with Adam."""
     learning_rate: float = 1e-3
-    """Step of Adam; constant."""
+    """Constant step size of Adam."""
     optimiser: Optimiser = "ssbroyden"
-    """Method that minimises the loss: Adam, on samples; or self-scaled Broyden, in scaled
-    quantities."""
+    """Minimiser of the loss: Adam (the paper's recipe), or self-scaled Broyden (the fast one)."""
     iterations: int = 3000
-    """Most iterations."""
+    """Largest number of iterations."""
     patience: int = 300
-    """Iterations without a lower training loss after which training stops."""
+    """Iterations without a sufficiently lower training loss after which training stops."""
     improvement: float = 0.02
-    """How much lower the loss has to be for the patience to begin anew, relative to it."""
+    """Relative decrease of the loss that resets the patience."""
     train_fraction: float = 1.0
-    """Part of the samples that Adam trains on; the others only measure the held-out loss."""
+    """Fraction of the samples that Adam trains on; the rest are for the validation loss."""
     points: int = 300
-    """Most samples that self-scaled Broyden looks at, five times as many if they are noisy."""
+    """Approximate number of samples that self-scaled Broyden uses; five times as many if noisy."""
     dtype: Precision = "float64"
-    """Precision."""
+    """Precision of the network."""
     device: Device = "auto"
-    """Where self-scaled Broyden trains on many records: at once on a GPU, or one after another on
-    the CPU; ``auto`` takes a GPU if there is one. A single record is always trained on the CPU."""
+    """Device of self-scaled Broyden on many records: all at once on a GPU, or one after another on
+    the CPU; ``auto`` takes a GPU if there is one."""
     checkpoint_every: int = 200
-    """Iterations from one checkpoint to the next."""
+    """Iterations between checkpoints."""
     log_every: int = 20
-    """Iterations from one point of the logged curves to the next."""
+    """Iterations between points of the logged curves."""
 
     def __post_init__(self) -> None:
         self.check_shared()
@@ -97,7 +94,7 @@ def fast() -> PinnObsConfig:
 
 
 def transfer() -> PinnObsConfig:
-    """The fast recipe with a gain that is meant for other records, too, and so the aim."""
+    """The fast recipe with a gain that is meant for other records, too."""
     return PinnObsConfig(transfer=True, gain_penalty=0.3)
 
 

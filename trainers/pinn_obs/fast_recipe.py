@@ -1,5 +1,5 @@
 """The fast recipe: a small network in scaled quantities, points that resolve the initial layer, and
-a quasi-Newton method, in NumPy and float64."""
+a quasi-Newton method, in NumPy with float64."""
 
 from __future__ import annotations
 
@@ -25,34 +25,36 @@ from trainers.pinn_obs.quasi_newton import Inverse, QuasiNewton
 from trainers.pinn_obs.recipe import Recipe
 
 UNITS = 20
-"""Units of time in a record; one is the paper's second."""
+"""Units of time in a record; one unit corresponds to a second in the paper."""
 NOISE = 0.01
-"""Standard deviation of noise, over an output's scale, over which outputs weigh less."""
+"""Standard deviation of the noise, over an output's scale, above which an output weighs less."""
 _DECAYS = ((LEAVING, 2.0, 10.0), (1e-3, 1e-2))
 """Time constants of the network's inputs, over the first interval and over the record's length."""
 _GAIN = 10.0
-"""What the network's gains are multiplied by, in units of state, output and time."""
+"""Factor of the network's gains, in units of state, output and time."""
 _SLOPES = 10.0
-"""Standard deviation of the first layer's weights on the time from −1 to 1."""
+"""Standard deviation of the first layer's weights of the time from −1 to 1."""
 _PER_PERIOD = 8
-"""Samples that a period of the outputs needs."""
+"""Samples needed per period of the outputs."""
 _NOISY = 5
-"""How many times as many samples are looked at if they are noisy."""
+"""Factor of the number of samples if they are noisy."""
 
 
 class FastRecipe(Recipe):
-    """Self-scaled Broyden steps on the loss in scaled quantities.
+    """Minimisation of the loss in scaled quantities by self-scaled Broyden steps.
 
-    States are counted in `System.scale`, outputs in what that does to them, and time in twentieths
-    of the record, so that the terms of the loss are of one size on any system; the loss that is
-    logged and returned is the paper's. A record without noise is looked at in some of its samples,
-    and in further points right after t₀, where x̂ has to leave x̂₀: otherwise the network jumps to
-    the trajectory where no residual is taken, and L is arbitrary. There y is joined by straight
-    lines, as in the replay. Outputs of noise σ weigh less by (0.01/σ)², σ over their scale, if that
-    is less than one, so that the equations decide and the fit does not chase it.
+    States are scaled by `System.scale`, outputs by the effect of that scale on them, and time by
+    twentieths of the record, so that the terms of the loss have similar sizes on all systems. The
+    loss that is logged and returned is the paper's.
 
-    With `PinnObsConfig.guide` the estimates and gains are drawn towards those of
-    `guide_of`, without it the gains towards zero.
+    The loss is taken at some of the samples and at further points right after t₀, where y is
+    interpolated linearly, as in the replay. Without these points the network could jump from x̂₀ to
+    the trajectory between two samples, and L would be arbitrary. Outputs with noise σ, over their
+    scale, have the weight min(1, (0.01/σ)²), so that the estimates follow the equations and do not
+    fit the noise.
+
+    With `PinnObsConfig.guide` a penalty draws the estimates and gains towards those of `guide_of`;
+    without it, the gains towards zero.
     """
 
     def __init__(
@@ -62,7 +64,9 @@ class FastRecipe(Recipe):
         t = record.t
         noisy = bool(self.noise_std.any())
         most = config.points * (_NOISY if noisy else 1)
+        # Points of the loss, and the samples for the guide.
         self.points, samples = points_of(system, self.record, most)
+        # Units of time, states, outputs and gains, and the weights of the terms in them.
         length, interval = float(t[-1] - t[0]), float(t[1] - t[0])
         unit = length / UNITS
         x_scale, y_scale = np.asarray(system.scale, float), output_scale(system, self.record)
@@ -81,6 +85,7 @@ class FastRecipe(Recipe):
                 message = f"no smoother follows this record of {type(system).__name__}"
                 warnings.warn(f"{message}; training has no guide", stacklevel=2)
         lead = self._lead_of(x_scale, _GAIN * per_gain)
+        # Inputs of the network: the time, decays for the initial layer, and a fast oscillation.
         frequencies = fast_frequencies(self.record)
         self._check_resolution(frequencies, len(samples.t), most)
         decays = [interval * part for part in _DECAYS[0]] + [length * part for part in _DECAYS[1]]
@@ -99,7 +104,7 @@ class FastRecipe(Recipe):
         self.objective = Objective(self.architecture, system, self.points, weights, lead)
 
     def _check_resolution(self, frequencies: tuple[float, ...], samples: int, most: int) -> None:
-        """Warn of a record so long that the samples looked at do not resolve its outputs."""
+        """Warn if the samples in the loss do not resolve the outputs of a long record."""
         length = float(self.record.t[-1] - self.record.t[0])
         needed = math.ceil(max(frequencies, default=0.0) * length / (2 * math.pi) * _PER_PERIOD)
         if samples < min(needed, self.record.num_samples):
@@ -110,7 +115,7 @@ class FastRecipe(Recipe):
             warnings.warn(message, stacklevel=2)
 
     def _lead_of(self, x_scale: np.ndarray, L_scale: np.ndarray) -> Lead:
-        """What the estimates and gains are drawn towards, with weights that make both relative."""
+        """Return the targets of the penalty on estimates and gains, with relative weights."""
         config, weights, n = self.config, self.points.equation, len(self.points.t)
         xhat = np.broadcast_to(self.points.xhat0, (n, self.system.nx))
         L = np.zeros((n, *L_scale.shape))
@@ -126,7 +131,7 @@ class FastRecipe(Recipe):
 
     def draw(self, generator: torch.Generator) -> np.ndarray:
         layers = draw_layers(self.architecture, generator)
-        weight, bias = layers[0]  # neurons with their middles all over the record
+        weight, bias = layers[0]  # spread the centres of the neurons over the record
         slopes = _SLOPES * torch.randn(len(bias), generator=generator, dtype=bias.dtype)
         middles = 2 * torch.rand(len(bias), generator=generator, dtype=bias.dtype) - 1
         weight[:, 0], bias[:] = slopes, -slopes * middles
@@ -139,8 +144,11 @@ class FastRecipe(Recipe):
         return None
 
     def covariance(self, theta: np.ndarray) -> Covariance | None:
-        """The smoother's, which is Laplace's approximation for the estimates that the guide leads
-        to, and the square of how far the network is from them."""
+        """Return the smoother's covariances plus the squared deviations of the network's estimates.
+
+        The smoother's covariance is Laplace's approximation at the smoothed states; the deviations
+        are from these states.
+        """
         if self.guide is None:
             return None
         t, layers = self.guide.t, unflattened(self.architecture, theta)
@@ -152,7 +160,10 @@ class FastRecipe(Recipe):
         parts: dict[str, Any] = {"gradient": method.gradient, "direction": method.direction}
         if method.H is not None:
             parts |= {"H_scale": method.H.scale, "H_middle": method.H.middle}
-            parts |= {"H": method.H.matrix.T, "H_vectors": method.H.vectors.T}  # in C's order
+            parts |= {
+                "H": method.H.matrix.T,
+                "H_vectors": method.H.vectors.T,
+            }  # transposed to C order
         return parts
 
     def load_method(self, state: Mapping[str, Any], best: tuple[np.ndarray, float]) -> QuasiNewton:

@@ -1,10 +1,10 @@
-"""What guides the fast recipe: where the states most likely were, and a gain that is stable there.
+"""The guide of the fast recipe: the most probable states of a record, and a stable gain along them.
 
-The loss of PINN-Obs alone fixes neither. Estimates whose unmeasured states are wrong can satisfy it
-with a gain to suit, and once the innovation has died out any gain does. Both come from the same
-samples and the same model by linear algebra: the states from an iterated Kalman smoother, the gain
-from the Riccati recursion along them. The network is drawn towards both, which leaves its loss a
-single valley, the same from every seed.
+The loss of PINN-Obs alone determines neither. Estimates whose unmeasured states are wrong can
+satisfy it with a suitable gain, and where the innovation is zero, any gain satisfies it. The guide
+is computed from the same samples and the same model: the states by an iterated Kalman smoother, the
+gain by the Riccati recursion along them. A penalty draws the network towards both, so that
+trainings from different seeds reach the same minimum.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ QUIET = 1e-4
 LEAVING = 0.5
 """Time constant with which x̂ leaves x̂₀ for the smoothed states, over the first interval."""
 _CAUTION = 0.2
+"""Fraction of HPHᵀ that is added to the output noise of the filters."""
 _CLEAR = 1e-3
-"""Least innovation that tells something, over the output's scale."""
-_TOLD = 5.0
-"""How many times that, or the noise, the first innovation has to be to lead x̂ away at once."""
+"""Least significant innovation, over the output's scale."""
+_SIGNIFICANT = 5.0
+"""Factor of that, or of the noise, above which the first innovation is significant."""
 _LEFT_OVER = 0.3
-"""Part of the prior's deviation that the gains after the first interval reckon with."""
+"""Fraction of the prior's standard deviation that is left after the first interval."""
 _LAYER = 10.0
-"""How many time constants long x̂ is taken to be leaving x̂₀."""
+"""Duration of the initial layer, in which x̂ leaves x̂₀, in time constants."""
 
 
 @dataclass(frozen=True, eq=False)
 class Guide:
-    """What the network is drawn towards."""
+    """Targets of the network's estimates and gains."""
 
     xhat: np.ndarray
     """Estimates at the points, shape (num_points, nx)."""
     L: np.ndarray
-    """Gains there in state units per s and output unit, shape (num_points, nx, ny)."""
+    """Gains at the points, in state units per s and output unit, shape (num_points, nx, ny)."""
     t: np.ndarray
-    """Times in s of the samples that it was made from, shape (num_samples,)."""
+    """Times in s of the samples of the smoother, shape (num_samples,)."""
     smoothed: np.ndarray
-    """The states at these samples, given all of them, shape (num_samples, nx)."""
+    """Smoothed states at these samples, shape (num_samples, nx)."""
     P: np.ndarray
-    """Their covariances, shape (num_samples, nx, nx)."""
+    """Covariances of the smoothed states, shape (num_samples, nx, nx)."""
 
 
 def guide_of(
@@ -59,24 +60,24 @@ def guide_of(
     y_scale: np.ndarray,
     transfer: bool = False,
 ) -> Guide | None:
-    """The guide of a record of one episode; None if the smoother leaves the finite numbers.
+    """Compute the guide of a record of one episode; None if the smoother does not stay finite.
 
-    x̂ has to begin at x̂₀. Where the first innovation tells more than noise, a finite gain can lead
-    it away from there at once: it goes to the smoothed states within the first interval, and the
-    gain that this takes, good for this record alone, is added to Riccati's. Of noisy outputs that
-    is Riccati's from a part of the prior: from the whole it would give away to the noise of the
-    next samples what is known by then. Otherwise x̂ has to wait for the outputs to show what is
-    wrong, and goes with the filter.
+    x̂ has to begin at x̂₀. If the first innovation is significant, a finite gain can move x̂ at once.
+    Then x̂ goes to the smoothed states within the first interval, and the gain that this takes,
+    valid for this record alone, is added to the Riccati gain. With noisy outputs the Riccati
+    recursion begins with a part of the prior's covariance, because with all of it the gain would
+    follow the noise of the next samples. If the first innovation is not significant, x̂ is the
+    filter's estimate.
 
     Args:
         system: the model.
-        samples: those samples of the record that the filters see.
-        points: where the guide is wanted.
+        samples: the samples of the record that the filters use.
+        points: the points of the guide.
         noise: standard deviations of the output noise, shape (ny,), in output units.
-        y_scale: sizes of the outputs, shape (ny,).
-        transfer: go with the filter whatever the first innovation tells, so that the gain is
-            Riccati's alone.
+        y_scale: scales of the outputs, shape (ny,).
+        transfer: use the filter's estimate in any case, so that the gain is the Riccati gain alone.
     """
+    # Smoothed states, and a filter linearised about them for the Riccati gain.
     known_noise = np.maximum(noise, QUIET * y_scale)
     with np.errstate(all="ignore"):
         path = smooth(system, samples, known_noise, _CAUTION)
@@ -86,18 +87,20 @@ def guide_of(
     smoothed, P = path.xhat[:, 0], path.P[..., 0]
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
     first = abs(points.y[0] - system.h(t[0], points.xhat0, points.u[0])) * points.present[0]
-    if transfer or not (first > _TOLD * np.maximum(noise, _CLEAR * y_scale)).any():
+    if transfer or not (first > _SIGNIFICANT * np.maximum(noise, _CLEAR * y_scale)).any():
         L = on_lines(t, samples.t, observer_gain(samples.t, along))
         return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
-    if noise.any():
+    if noise.any():  # the Riccati recursion again, from a part of the prior
         prior = Prior(samples.prior.mean, P[0] + _LEFT_OVER**2 * samples.prior.cov)
-        begun = replace(samples, prior=prior)
-        along = forward(system, begun, known_noise, about=path.xhat, caution=_CAUTION)
+        with_prior = replace(samples, prior=prior)
+        along = forward(system, with_prior, known_noise, about=path.xhat, caution=_CAUTION)
     L = on_lines(t, samples.t, observer_gain(samples.t, along))
-    left = np.exp((t[0] - t) / tau)[:, None]
-    goal = on_lines(t, samples.t, smoothed)
-    xhat = left * points.xhat0 + (1 - left) * goal
-    rate = (1 - left) * np.gradient(goal, t, axis=0) + left / tau * (goal - points.xhat0)
+    # x̂ moves exponentially from x̂₀ to the smoothed states.
+    decay = np.exp((t[0] - t) / tau)[:, None]
+    target = on_lines(t, samples.t, smoothed)
+    xhat = decay * points.xhat0 + (1 - decay) * target
+    rate = (1 - decay) * np.gradient(target, t, axis=0) + decay / tau * (target - points.xhat0)
+    # In the initial layer add the gain of least norm that cancels the residual, regularised.
     innovation = (points.y - system.h(t, xhat, points.u)) * points.present / y_scale
     residual = rate - system.f(t, xhat, points.u)
     residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
@@ -109,8 +112,12 @@ def guide_of(
 
 
 def observer_gain(t: np.ndarray, filtered: Filtered) -> np.ndarray:
-    """Gains L (num_samples, nx, ny) with which an observer, over the interval that ends at a
-    sample, takes away as much of that output's innovation as the filter does at the sample."""
+    """Convert Kalman gains to continuous-time observer gains L (num_samples, nx, ny).
+
+    Over the interval that ends at a sample, the observer reduces each output's innovation by the
+    same factor as the filter does at the sample.
+    """
+    # Factor 1 − HK per sample, that is, the rate −log(1 − HK) over the interval.
     K, H = filtered.K[..., 0], filtered.H[..., 0]
     taken = np.clip(np.einsum("kji,kij->kj", H, K), 1e-9, 1 - 1e-9)
     per_interval = -np.log1p(-taken) / taken

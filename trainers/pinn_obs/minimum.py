@@ -1,4 +1,4 @@
-"""What a training asks of its minimisation, and what it keeps of it."""
+"""The interface of minimisers, and the best iterate of a training."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 from trainers.pinn_obs.objective import Objective
 
 FIRST_STEP = 0.3
-"""The first step that self-scaled Broyden tries on this loss. The searches' minima lie near a third
-of the quasi-Newton step; from there nearly every first trial will do, from 1.0 one of ten does."""
+"""First trial step of the line searches of self-scaled Broyden on this loss. Their minima lie near
+a third of the quasi-Newton step: nearly all first trials are accepted, but one in ten with 1.0."""
 
 
 @dataclass(frozen=True, eq=False)
 class BestIterate:
-    """The weights of the least loss so far."""
+    """The weights with the least loss so far."""
 
     loss: float
-    """What is minimised, at these weights."""
+    """The minimised loss at these weights."""
     iteration: int
-    """The iteration that found it, counted from 1."""
+    """The iteration of these weights, counted from 1."""
     seed: int
-    """What these weights began from."""
+    """Seed of the initial weights."""
     theta: np.ndarray
     """The weights in one vector (n,)."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """The last loss that was lower by enough for the patience to begin anew."""
+    """The last loss that was low enough to reset the patience."""
 
     loss: float
     iteration: int
@@ -40,10 +40,10 @@ class Minimiser(Protocol):
     """A minimisation in progress."""
 
     x: np.ndarray
-    """Where it stands, shape (n,); made anew by each step."""
+    """Current weights, shape (n,); each step makes a new array."""
     f: float
-    """The loss there."""
+    """The loss at x."""
 
     def step(self, objective: Objective) -> bool:
-        """One iteration; False if no lower value can be found."""
+        """Make one iteration; return False if no lower loss is found."""
         ...

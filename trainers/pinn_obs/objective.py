@@ -1,4 +1,4 @@
-"""The loss of PINN-Obs and its gradient in NumPy, written out by hand."""
+"""The loss of PINN-Obs and its gradient, derived by hand, in NumPy or torch."""
 
 from __future__ import annotations
 
@@ -16,74 +16,74 @@ from trainers.pinn_obs.passes import Passes, inputs_of
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Where the loss looks, and with which weights; the first is t₀."""
+    """The points at which the loss is taken, and their weights; the first is t₀."""
 
     t: np.ndarray
     """Times in s, shape (num_points,)."""
     u: np.ndarray
-    """Inputs there, shape (num_points, nu)."""
+    """Inputs, shape (num_points, nu)."""
     y: np.ndarray
-    """Outputs there, shape (num_points, ny); zero where they are missing."""
+    """Outputs, shape (num_points, ny); zero for a missing output."""
     present: np.ndarray
-    """1.0 where an output is there, 0.0 where it is missing, shape (num_points, ny)."""
+    """1.0 for an output that is present, 0.0 for a missing one, shape (num_points, ny)."""
     equation: np.ndarray
     """Quadrature weights of the equation's residuals, shape (num_points,); their sum is 1."""
     output: np.ndarray
-    """Quadrature weights of the outputs, shape (num_points, ny); zero where they are missing, with
-    a sum of ny over all."""
+    """Quadrature weights of the outputs, shape (num_points, ny); zero for a missing output. Their
+    sum is ny, or less if an output is missing throughout."""
     xhat0: np.ndarray
     """Initial estimate at t₀, shape (nx,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What the terms of the loss are multiplied by, component by component."""
+    """Weights of the terms of the loss, component by component."""
 
     initial: np.ndarray
-    """Of the squared errors of x̂(t₀), shape (nx,)."""
+    """Weights of the squared errors of x̂(t₀), shape (nx,)."""
     equation: np.ndarray
-    """Of the squared residuals of the equations, shape (nx,)."""
+    """Weights of the squared residuals of the equations, shape (nx,)."""
     output: np.ndarray
-    """Of the squared innovations, shape (ny,)."""
+    """Weights of the squared innovations, shape (ny,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """What the network is drawn towards beside the paper's loss, and how strongly."""
+    """Penalty on the estimates and gains that is added to the paper's loss."""
 
     xhat: np.ndarray
-    """Estimates, shape (num_points, nx)."""
+    """Target of the estimates, shape (num_points, nx)."""
     by_xhat: np.ndarray
-    """Weights of the squared departures from them, shape (num_points, nx)."""
+    """Weights of the squared deviations of the estimates, shape (num_points, nx)."""
     L: np.ndarray
-    """Gains, shape (num_points, nx, ny)."""
+    """Target of the gains, shape (num_points, nx, ny)."""
     by_L: np.ndarray
-    """Weights of the squared departures from them, shape (num_points, nx, ny)."""
+    """Weights of the squared deviations of the gains, shape (num_points, nx, ny)."""
 
 
 class Objective:
     """The weighted loss as a function of all weights of a network in one vector.
 
-    w₀·(x̂(t₀) − x̂₀)² + w_ode·mean (dx̂/dt − f − L(y − h))² + w_y·mean (h − y)² with f and h at
-    (t, x̂, u), summed over components, with the points' quadrature for means. These are the paper's
+    It is w₀·(x̂(t₀) − x̂₀)² + w_ode·mean (dx̂/dt − f − L(y − h))² + w_y·mean (h − y)² with f and h at
+    (t, x̂, u), summed over components; means are by the points' quadrature. These are the paper's
     terms:
 
     - MSE₀ = ‖x̂(t₀) − x̂₀‖². Equation (7) writes the norm without the square. The square is taken
-      because the paper names it a mean squared error, and because a bare norm has a gradient of
-      length one however small the error, so that a constant step never settles on x̂₀.
+      because the paper calls it a mean squared error, and because the gradient of a norm has length
+      one even for small errors, so that a constant step would not converge to x̂₀.
     - MSE_g = mean ‖dx̂/dt − f(t, x̂, u) − L(t)(y − h(t, x̂, u))‖², equations (e55) and (8), with
       h(t, x̂, u) for the paper's Cx̂.
     - MSE_y = mean ‖h(t, x̂, u) − y‖², equation (9).
 
-    A missing output counts as a zero innovation. To them come the weighted squares of x̂ and L less
-    those of the lead, if there is one. Everything is computed in the network's precision.
+    The innovation of a missing output is zero. With a ``lead``, the weighted squared deviations of
+    x̂ and L from its targets are added. All is computed in the network's precision.
 
     Args:
-        architecture: the network's.
+        architecture: architecture of the network.
         system: the model.
-        points: where the loss looks.
-        weights: of the terms.
-        lead: what x̂ and L are drawn towards.
+        points: the points at which the loss is taken.
+        weights: weights of the terms.
+        lead: penalty on x̂ and L.
     """
 
     def __init__(
@@ -117,9 +117,11 @@ class Objective:
 
     @classmethod
     def stacked(cls, objectives: Sequence[Objective], device: str) -> Objective:
-        """Many objectives of networks of one shape at as many points as one, in torch: all that
-        `values` takes and gives has the batch as its first axis. There is no copy in the cache of
-        a CPU that would serve them all; there it takes longer than one after another."""
+        """Combine objectives of networks of one shape, with equally many points, in torch.
+
+        The first axis of the arguments and results of `values` is then the batch. On a CPU this is
+        slower than one objective after another, since the batch does not fit into the cache.
+        """
         whole, first = cls.__new__(cls), objectives[0]
         names = first._parts
         stacks = {n: np.stack([objective._parts[n] for objective in objectives]) for n in names}
@@ -128,18 +130,18 @@ class Objective:
         return whole
 
     def __call__(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """The loss at weights theta (n,) and its gradient (n,)."""
-        with np.errstate(all="ignore"):  # a trial step too long is told by a loss not finite
+        """Return the loss at weights theta (n,) and its gradient (n,)."""
+        with np.errstate(all="ignore"):  # the loss of too long a trial step is not finite
             loss, gradient = self.values(theta)
         return float(loss), gradient
 
     def values(self, theta: Array) -> tuple[Array, Array]:
-        """The losses (...) at weights theta (..., n) and their gradients (..., n)."""
+        """Return the losses (...) at weights theta (..., n) and their gradients (..., n)."""
         loss, *by_output = self._terms(*self._forward(theta))
         return loss, self._passes.reverse(*by_output)
 
     def terms(self, theta: np.ndarray) -> np.ndarray:
-        """The paper's three terms (3,) at weights theta (n,), in the system's own units."""
+        """Return the paper's three terms (3,) at weights theta (n,), in the system's units."""
         with np.errstate(all="ignore"):
             points, (xhat, rate, L) = self.points, self._forward(theta)
             innovation, residual = self._defects(xhat, rate, L)
@@ -149,14 +151,14 @@ class Objective:
         return np.array([initial @ initial, equation, output], dtype=float)
 
     def _forward(self, theta: Array) -> tuple[Array, Array, Array]:
-        """x̂ and dx̂/dt (..., num_points, nx), and L (..., num_points, nx, ny)."""
+        """Return x̂ and dx̂/dt (..., num_points, nx), and L (..., num_points, nx, ny)."""
         out, rate = self._passes.forward(theta)
         nx, ny = self.system.nx, self.system.ny
         L = out[..., nx:, :].mT
         return out[..., :nx, :].mT, rate.mT, L.reshape(*L.shape[:-1], nx, ny)
 
     def _defects(self, xhat: Array, rate: Array, L: Array) -> tuple[Array, Array]:
-        """Innovations (..., num_points, ny), zero where missing, and residuals
+        """Return the innovations (..., num_points, ny), zero for missing outputs, and the residuals
         (..., num_points, nx)."""
         points = self.points
         innovation = (points.y - self.system.h(points.t, xhat, points.u)) * points.present
@@ -164,15 +166,17 @@ class Objective:
         return innovation, rate - self.system.f(points.t, xhat, points.u) - correction
 
     def _terms(self, xhat: Array, rate: Array, L: Array) -> tuple[Array, Array, Array]:
-        """The losses (...), and their derivatives by the networks' outputs
+        """Return the losses (...), and their derivatives by the networks' outputs
         (..., nx + nx·ny, num_points) and by dx̂/dt (..., nx, num_points)."""
+        # The loss, and half its derivatives by the initial error, residual and innovation.
         points, system = self.points, self.system
         innovation, residual = self._defects(xhat, rate, L)
         initial = xhat[..., 0, :] - points.xhat0
-        by_initial, by_rate = self._initial * initial, self._equation * residual  # halves of them
+        by_initial, by_rate = self._initial * initial, self._equation * residual
         by_innovation = self._output * innovation
         loss = (by_initial * initial).sum(-1) + (by_rate * residual).sum((-2, -1))
         loss += (by_innovation * innovation).sum((-2, -1))
+        # Chain rule: the residual depends on L, the innovation and x̂; the innovation on x̂.
         by_innovation -= _through(by_rate, L)
         by_innovation *= points.present
         by_L = by_rate[..., None] * -innovation[..., None, :]
@@ -180,7 +184,7 @@ class Objective:
         A, H = system.f_jacobian(*at), system.h_jacobian(*at)
         by_xhat = _through(by_rate, -A) - _through(by_innovation, H)
         by_xhat[..., 0, :] += by_initial
-        if (lead := self.lead) is not None:
+        if (lead := self.lead) is not None:  # the penalty and half its derivatives
             for value, towards, weight, by, axes in (
                 (xhat, lead.xhat, lead.by_xhat, by_xhat, (-2, -1)),
                 (L, lead.L, lead.by_L, by_L, (-3, -2, -1)),
@@ -189,6 +193,7 @@ class Objective:
                 drawn = weight * departure
                 loss += (drawn * departure).sum(axes)
                 by += drawn
+        # Both outputs of the network in one array, and the factor 2 of all derivatives.
         xp, flat = array_namespace(loss), by_L.reshape(*by_L.shape[:-2], -1)
         by_out = xp.concat([by_xhat.mT, flat.mT], axis=-2)
         by_out *= 2
@@ -196,7 +201,7 @@ class Objective:
 
 
 def _through(by: Array, J: Array) -> Array:
-    """Derivatives by a function's value (..., m) taken through its Jacobian J (..., m, n)."""
+    """Multiply derivatives by a function's value (..., m) with its Jacobian J (..., m, n)."""
     out = by[..., :1] * J[..., 0, :]
     for i in range(1, J.shape[-2]):
         out += by[..., i : i + 1] * J[..., i, :]
@@ -204,6 +209,8 @@ def _through(by: Array, J: Array) -> Array:
 
 
 def _inner(array: np.ndarray) -> np.ndarray:
-    """The same numbers (num_points, ...), the points innermost in memory, so that arithmetic on few
-    components of many points is contiguous."""
+    """Return a copy of an array (num_points, ...) with the points innermost in memory.
+
+    Arithmetic on few components of many points is then contiguous.
+    """
     return np.ascontiguousarray(array.T).T

@@ -21,7 +21,7 @@ from trainers.pinn_obs.recipe import Recipe
 
 
 class PaperRecipe(Recipe):
-    """Adam on all training samples at once, the terms' weights those of the config."""
+    """Adam on all training samples at once, with the config's weights of the loss terms."""
 
     def __init__(
         self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
@@ -29,14 +29,15 @@ class PaperRecipe(Recipe):
         self.config, self.system, self.record = config, system, record
         sizes = (system.nx, system.ny, config.depth, config.width)
         self.architecture = Architecture(*sizes, config.activation, config.dtype)
+        # A random split of the samples into training and validation.
         order = np.random.default_rng(config.seed).permutation(record.num_samples)
         count = max(1, round(config.train_fraction * len(order)))
         self.objective = self._loss_on(order[:count])
-        left = order[count:]
-        self._held_out = self._loss_on(left) if len(left) else None
+        held_out = order[count:]
+        self._held_out = self._loss_on(held_out) if len(held_out) else None
 
     def _loss_on(self, samples: np.ndarray) -> Objective:
-        """The paper's loss on samples of these indices (num_samples,)."""
+        """Return the paper's loss on the samples of these indices (num_samples,)."""
         config, nx, ny = self.config, self.system.nx, self.system.ny
         each = np.full(nx, config.w0), np.full(nx, config.w_ode), np.full(ny, config.w_y)
         points = samples_of(self.system, self.record, samples)

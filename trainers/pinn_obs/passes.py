@@ -1,9 +1,9 @@
-"""A network and its time derivative, forward and in reverse, written out by hand.
+"""Forward and reverse passes of a network and its time derivative, derived by hand.
 
-At a few thousand points and twenty neurons torch spends its time on overhead and on arrays made
-anew; the same sums in NumPy with the derivative carried forward through the layers, one reverse
-pass and arrays that are used again take a fraction. On a GPU the same lines run many networks at
-once in torch.
+At a few thousand points and twenty neurons torch spends most of its time on overhead and on the
+allocation of arrays. NumPy is several times faster here: the time derivative is propagated forward
+with the values, one reverse pass gives the gradient, and arrays are reused. On a GPU the same code
+evaluates many networks at once in torch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.simulation.system import Array
 
 _CHUNK = 2000
-"""Columns of a matrix product whose result is small; more of them fall out of the cache."""
+"""Columns per block of a matrix product with a small result, so that blocks fit into the cache."""
 
 
 def _tanh(z: Array, value: Array, slope: Array, bend: Array) -> None:
@@ -57,14 +57,15 @@ _ACTIVATIONS: dict[str, Callable[[Array, Array, Array, Array], None]] = {
     "sigmoid": _sigmoid,
     "relu": _relu,
 }
-"""Each activation at z, written with its first and second derivative into the other three."""
+"""Activations by name; each writes its value and its first and second derivative at z into the
+other arguments."""
 
 
 def draw_layers(
     architecture: Architecture, generator: torch.Generator
 ) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Random weights (fan_out, fan_in), drawn as Glorot & Bengio (2010) propose for tanh ("Xavier",
-    normal), and biases (fan_out,) of zero, layer by layer."""
+    """Draw initial layers: weights (fan_out, fan_in) by Glorot & Bengio (2010, "Xavier" normal),
+    and zero biases (fan_out,)."""
     dtype, layers = architecture.torch_dtype, []
     for fan_out, fan_in in architecture.shapes:
         weight = torch.empty(fan_out, fan_in, dtype=dtype)
@@ -74,28 +75,30 @@ def draw_layers(
 
 
 def flattened(layers: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> np.ndarray:
-    """All weights of a network in one vector (n,): layer by layer the rows of its weights, each
-    with its bias at the end."""
+    """Flatten the layers of a network to one vector (n,).
+
+    It holds, layer by layer, the rows of the weights, each followed by its bias.
+    """
     rows = [torch.cat([W, b[:, None]], dim=1).flatten() for W, b in layers]
     return torch.cat(rows).detach().numpy()
 
 
 def unflattened(architecture: Architecture, theta: np.ndarray) -> Layers:
-    """Copies of the weights and biases of each layer in theta (n,), as estimators hold them."""
+    """Return copies of the weights and biases of each layer in theta (n,)."""
     parts = _layers(architecture, theta)
     return tuple((part[:, :-1].copy(), part[:, -1].copy()) for part in parts)
 
 
 def inputs_of(architecture: Architecture, t: np.ndarray) -> np.ndarray:
-    """What the first layer sees at times t (num_points,) in s, and the derivatives of that per s,
-    side by side: shape (num_features, 2 · num_points)."""
+    """Return the inputs of the first layer at times t (num_points,) in s, and then their time
+    derivatives; shape (num_features, 2 · num_points)."""
     value, rate = architecture.features(t.astype(architecture.dtype))
     return np.concatenate([value.T, rate.T], axis=1)
 
 
 def _layers(architecture: Architecture, theta: Array) -> list[Array]:
-    """Views (..., out, in + 1) of theta (..., n): a layer's weights, and its biases as the last
-    column."""
+    """Return views (..., fan_out, fan_in + 1) of theta (..., n): each layer's weights, with its
+    biases as the last column."""
     layers, place = [], 0
     for out, fan_in in architecture.shapes:
         size = out * (fan_in + 1)
@@ -106,16 +109,17 @@ def _layers(architecture: Architecture, theta: Array) -> list[Array]:
 
 
 class Passes:
-    """The two passes at fixed times, of one network or of a batch (...) of them at once.
+    """Forward and reverse pass at fixed times, of one network or of a batch (...) of networks.
 
-    Values and time derivatives lie side by side, (..., neurons, 2 · num_points), and under them a
-    row of one and zero, which the biases multiply. What a pass returns is overwritten by the next.
+    Values and time derivatives are the two halves of arrays (..., neurons, 2 · num_points). Below
+    them is a row of ones and zeros, by which the biases are multiplied. The result of a pass is
+    overwritten by the next pass.
 
     Args:
-        architecture: of the networks; its own times and scale are not looked at.
-        inputs: see `inputs_of`, shape (..., num_features, 2 · num_points), in the library, the
-            precision and on the device of everything else.
-        scale: what the networks' outputs are multiplied by, shape (..., nx + nx·ny).
+        architecture: architecture of the networks; its times and scale are ignored.
+        inputs: see `inputs_of`, shape (..., num_features, 2 · num_points); they determine the
+            library, precision and device.
+        scale: factors of the networks' outputs, shape (..., nx + nx·ny).
     """
 
     def __init__(self, architecture: Architecture, inputs: Array, scale: Array) -> None:
@@ -138,8 +142,8 @@ class Passes:
         self._out = empty(shapes[-1][0], points)
 
     def forward(self, theta: Array) -> tuple[Array, Array]:
-        """The networks' outputs (..., nx + nx·ny, num_points) at weights theta (..., n), and the
-        time derivatives of the first nx of them (..., nx, num_points)."""
+        """Return the networks' outputs (..., nx + nx·ny, num_points) at weights theta (..., n), and
+        the time derivatives of the first nx outputs (..., nx, num_points)."""
         n, nx, xp = self._num_points, self._architecture.nx, array_namespace(theta)
         self._weights = _layers(self._architecture, theta)
         z = self._work[0]
@@ -147,15 +151,21 @@ class Passes:
             xp.matmul(weights, self._seen[k], out=z)
             above, slope, bend = self._seen[k + 1][..., :-1, :], self._slopes[k], self._bends[k]
             self._activation(z[..., :n], above[..., :n], slope, bend)
-            xp.multiply(slope, z[..., n:], out=above[..., n:])
-            bend *= z[..., n:]
+            xp.multiply(slope, z[..., n:], out=above[..., n:])  # chain rule in time
+            bend *= z[..., n:]  # derivative of the rate by z, for the reverse pass
         out = xp.matmul(self._weights[-1], self._seen[-1], out=self._out)
         out *= self._scale
         return out[..., :n], out[..., :nx, n:]
 
     def reverse(self, by_out: Array, by_rate: Array) -> Array:
-        """The gradient (..., n) of what has these derivatives by what `forward` returned last."""
+        """Return the gradient (..., n) of a loss by the weights.
+
+        Args:
+            by_out: derivatives of the loss by the first result of the last `forward`.
+            by_rate: derivatives by its second result.
+        """
         n, nx, xp = self._num_points, self._architecture.nx, array_namespace(by_out)
+        # Derivatives by the last layer; the rates of the gains do not enter the loss.
         by_z = self._out
         by_z[..., :n], by_z[..., :nx, n:], by_z[..., nx:, n:] = by_out, by_rate, 0
         by_z *= self._scale
@@ -164,6 +174,8 @@ class Passes:
         gradient = xp.empty(shape, dtype=by_z.dtype, device=device(by_z))
         parts = _layers(self._architecture, gradient)
         for k in range(len(parts) - 1, 0, -1):
+            # By the weights of layer k, by its inputs, and through the activation below, whose
+            # slope depends on z, too.
             _outer(by_z, self._seen[k], parts[k])
             by_a = self._work[k % 2]
             xp.matmul(self._weights[k][..., :-1].mT, by_z, out=by_a)
@@ -178,7 +190,7 @@ class Passes:
 
 
 def _outer(by_z: Array, seen: Array, out: Array) -> None:
-    """by_z · seenᵀ, summed chunk by chunk."""
+    """Compute by_z · seenᵀ in blocks of columns."""
     out[...] = by_z[..., :_CHUNK] @ seen[..., :_CHUNK].mT
     for start in range(_CHUNK, seen.shape[-1], _CHUNK):
         out += by_z[..., start : start + _CHUNK] @ seen[..., start : start + _CHUNK].mT

@@ -1,4 +1,4 @@
-"""Pictures of a trained PINN-Obs."""
+"""Figures of a trained PINN-Obs."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def figures(system: System, trained: TrainedNetwork) -> dict[str, Figure]:
-    """The estimates (``states``) and the ``gain`` over the record's times."""
+    """Return the figures of the estimates (``states``) and the ``gain`` over the record's times."""
     title = f"PINN-Obs on {trained.system}, loss {trained.loss:.3g}"
     states = state_figure(system, trained.t, trained.xhat(trained.t), y=trained.y, title=title)
     return {"states": states, "gain": gain_figure(trained.t, trained.gain(trained.t))}
 
 
 def gain_figure(t: np.ndarray, L: np.ndarray) -> Figure:
-    """A picture of gains L (num_samples, nx, ny) over times t (num_samples,) in s: a panel per
-    state, a line per output."""
+    """Plot gains L (num_samples, nx, ny) over times t (num_samples,) in s, with a panel per state
+    and a line per output."""
     from matplotlib.figure import Figure
 
     nx, ny = L.shape[1:]

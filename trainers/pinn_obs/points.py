@@ -1,4 +1,4 @@
-"""Where a loss looks at a record, and the sizes by which the fast recipe counts."""
+"""The points of the loss in a record, and the output scales of the fast recipe."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.objective import Points
 
 _FIRST = 30
-"""Samples at the beginning of which all are looked at."""
+"""Number of samples at the beginning, all of which are taken."""
 _APART = 100
-"""Samples that lie ever further apart."""
+"""Number of samples at geometrically increasing distances."""
 _LAYER = (0.02, 2.0, 24)
 """First and last of the points right after t₀, over the first interval, and their number."""
 _LOOKS = 9
-"""Samples whose times and inputs tell how large the outputs' Jacobian is."""
+"""Number of samples at which the outputs' Jacobian is evaluated."""
 _PERIODS = 20
-"""Periods in a record over which a frequency becomes an input of the network."""
+"""Number of periods in a record above which a frequency becomes an input of the network."""
 
 
 def points_of(system: System, record: Record, most: int) -> tuple[Points, Record]:
-    """Where the loss looks at a record of one episode, and the samples among it as a record.
+    """Choose the points of the loss in a record of one episode.
 
-    The samples are the first thirty, a hundred that lie ever further apart, and at most that many
-    evenly chosen; the points are these, and others within the first two intervals.
+    The samples are the first thirty, a hundred at geometrically increasing distances, and at most
+    ``most`` at equal distances. The points are these, and others within the first two intervals.
+
+    Returns:
+        The points, and the chosen samples as a record.
     """
     t, number = record.t, record.num_samples
     apart = np.geomspace(1, number - 1, min(number, _APART))
@@ -35,6 +38,7 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
     times = np.unique(np.concatenate([t[chosen], layer]))
     y = on_lines(times, t, record.y[0])
     present = ~np.isnan(y)
+    # Weights of the trapezoidal rule.
     halves = np.diff(times) / (t[-1] - t[0]) / 2
     weights = np.append(halves, 0.0) + np.append(0.0, halves)
     output = weights[:, None] * present
@@ -53,10 +57,10 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
 
 
 def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:
-    """Samples of a record of one episode, of these indices (num_samples,), as points of one weight.
+    """Return the samples with these indices (num_samples,) of a record of one episode as points.
 
-    The first sample comes along, with no weight if it is not among them. The means of the outputs
-    are over those that are there, times ny.
+    All samples have the same weight. The first sample is included, with zero weight if it is not
+    chosen. The weights of the outputs that are present sum to ny.
     """
     indices = np.union1d([0], chosen)
     t, y = record.t[indices], record.y[0, indices]
@@ -76,8 +80,8 @@ def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:
 
 
 def on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (num_samples, ...) at t, joined by straight lines, at times within; NaN along lines
-    that begin or end in it."""
+    """Interpolate values (num_samples, ...) at t linearly at given times within; NaN between two
+    samples if either is NaN."""
     after = np.clip(np.searchsorted(t, times, side="left"), 1, len(t) - 1)
     part = (times - t[after - 1]) / (t[after] - t[after - 1])
     part = part.reshape(-1, *[1] * (values.ndim - 1))
@@ -86,8 +90,11 @@ def on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray
 
 
 def output_scale(system: System, record: Record) -> np.ndarray:
-    """The size of each output (ny,): what the states' scale does to it at some of the samples, or
-    else its own spread."""
+    """Return the scale of each output (ny,).
+
+    It is the largest change of the output by a state's scale, at some of the samples, or a
+    thousandth of the output's range if that is larger; 1 if both are zero.
+    """
     scale, mean = np.asarray(system.scale, float), record.prior.mean[0]
     x = mean + scale * np.array([[-1.0], [0.0], [1.0]])
     some = np.linspace(0, record.num_samples - 1, min(record.num_samples, _LOOKS)).astype(int)
@@ -100,8 +107,11 @@ def output_scale(system: System, record: Record) -> np.ndarray:
 
 
 def fast_frequencies(record: Record) -> tuple[float, ...]:
-    """The angular frequency (rad/s) of the highest peak in the outputs' spectrum, if more than
-    twenty of its periods lie in the record; without it a small network cannot follow them."""
+    """Return the angular frequency (rad/s) of the highest peak in the outputs' spectrum.
+
+    The result is empty unless more than twenty of its periods lie in the record. A small network
+    cannot fit so fast an oscillation without this input.
+    """
     t = record.t
     even = np.linspace(t[0], t[-1], len(t))
     power = np.zeros(len(t) // 2 + 1)
@@ -113,6 +123,7 @@ def fast_frequencies(record: Record) -> tuple[float, ...]:
     peak = int(np.argmax(power))
     if not _PERIODS < peak < len(power) - 1:
         return ()
+    # Refine the peak by a parabola through the logarithms of three bins.
     below, here, above = np.log(power[peak - 1 : peak + 2] + 1e-300)
     place = peak + 0.5 * (below - above) / (below - 2 * here + above)
     cycle = (t[-1] - t[0]) * len(t) / (len(t) - 1)

@@ -1,9 +1,9 @@
 """Self-scaled Broyden minimisation of smooth functions of up to a few thousand variables.
 
-The method of Al-Baali, in the form that Urbán, Stefanou & Pons ("Unveiling the optimization process
-of physics informed neural networks", 2025) found best for such networks (their SSBroyden): a member
-of Broyden's family chosen anew at each step between BFGS and beyond, its matrix scaled beforehand.
-The line search is that of Nocedal & Wright, "Numerical Optimization", algorithms 3.5 and 3.6.
+The method is Al-Baali's, in the form that Urbán, Stefanou & Pons ("Unveiling the optimization
+process of physics informed neural networks", 2025) found best for such networks (their SSBroyden).
+Each step chooses a member of Broyden's family, and scales the matrix before the update. The line
+search is that of Nocedal & Wright, "Numerical Optimization", algorithms 3.5 and 3.6.
 """
 
 from __future__ import annotations
@@ -24,32 +24,33 @@ SUFFICIENT_DECREASE = 1e-4
 CURVATURE = 0.9
 """c₂ of the strong Wolfe conditions."""
 _TRIALS = 25
+"""Largest number of trials of a line search."""
 _APART = 16
-"""Updates of the inverse Hessian that are added up at a time."""
+"""Number of updates of the inverse Hessian that are added to the matrix at a time."""
 Weights: TypeAlias = tuple[float, float, float, float]
-"""What an update divides H by, and its weights of ssᵀ, swᵀ + wsᵀ and wwᵀ."""
+"""Coefficients of an update: the divisor of H, and the weights of ssᵀ, swᵀ + wsᵀ and wwᵀ."""
 _symv, _syr2k = get_blas_funcs(("symv", "syr2k"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A place on the line x + a·d."""
+    """A point on the line x + a·d."""
 
     step: float
-    """a."""
+    """The step a."""
     f: float
-    """The function there."""
+    """The function at the point."""
     slope: float
     """Its derivative along d."""
     x: np.ndarray
-    """The place itself, shape (n,)."""
+    """The point, shape (n,)."""
     gradient: np.ndarray
-    """The gradient there, shape (n,)."""
+    """The gradient at the point, shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What a line search sees of a place on its line."""
+    """A trial of a line search: a step, and the function and its slope at that step."""
 
     step: float
     f: float
@@ -57,8 +58,8 @@ class Trial:
 
 
 Search: TypeAlias = Generator[float, tuple[float, float], bool]
-"""Yields steps to try, is sent the function and its slope there, and returns whether the last of
-them will do."""
+"""Yields trial steps, receives the function and its slope at each, and returns whether the last
+step is accepted."""
 
 
 def line_search(
@@ -68,15 +69,17 @@ def line_search(
     first: float = 1.0,
     curvature: float = CURVATURE,
 ) -> Point | None:
-    """A step along a direction of descent that satisfies the strong Wolfe conditions, or None if
-    rounding hides one; see `trials`.
+    """Find a point along a descent direction that satisfies the strong Wolfe conditions.
 
     Args:
-        objective: the function.
-        start: where the line begins, with ``step`` 0 and a negative slope.
+        objective: the function and its gradient.
+        start: first point of the line, with ``step`` 0 and a negative slope.
         direction: d, shape (n,).
-        first: the first step tried.
-        curvature: c₂; the smaller, the nearer to the minimum along the line.
+        first: first trial step.
+        curvature: c₂; smaller values give points nearer to the minimum along the line.
+
+    Returns:
+        The point, or None if the search fails, as it does where rounding dominates; see `trials`.
     """
     search, point = trials(start.f, start.slope, first, curvature), start
     step = next(search)
@@ -91,9 +94,15 @@ def line_search(
 
 
 def trials(f: float, slope: float, first: float, curvature: float) -> Search:
-    """A search for a step a that satisfies the strong Wolfe conditions
+    """Search for a step a that satisfies the strong Wolfe conditions.
 
-    f(a) ≤ f(0) + c₁·a·f'(0) and abs f'(a) ≤ c₂·abs f'(0), from f(0) and f'(0) < 0.
+    They are f(a) ≤ f(0) + c₁·a·f'(0) and abs f'(a) ≤ c₂·abs f'(0).
+
+    Args:
+        f: f(0).
+        slope: f'(0), negative.
+        first: first trial step.
+        curvature: c₂.
     """
     start = Trial(0.0, f, slope)
 
@@ -104,6 +113,7 @@ def trials(f: float, slope: float, first: float, curvature: float) -> Search:
     for _ in range(_TRIALS):
         f, slope = yield step
         trial = Trial(step, f if math.isfinite(f) else math.inf, slope)
+        # Shrink the bracket; low has the least f so far that satisfies the first condition.
         if not decreases(trial) or trial.f >= low.f:
             high = trial
         elif abs(trial.slope) <= -curvature * start.slope:
@@ -113,6 +123,7 @@ def trials(f: float, slope: float, first: float, curvature: float) -> Search:
             if trial.slope * (end - trial.step if high is None else end - low.step) >= 0:
                 high = low
             low = trial
+        # Without a bracket extrapolate; else interpolate, until rounding dominates.
         if high is None:
             step = min(10 * low.step, max(2 * low.step, _minimiser(start, low, math.inf)))
         elif abs(high.step - low.step) <= 1e-14 * max(abs(low.step), abs(high.step)):
@@ -123,7 +134,7 @@ def trials(f: float, slope: float, first: float, curvature: float) -> Search:
 
 
 def _between(low: Trial, high: Trial) -> float:
-    """The next trial inside an interval: by interpolation, but not too near its ends."""
+    """Return the next trial step inside a bracket, by interpolation, but not too near its ends."""
     width = high.step - low.step
     middle = low.step + width / 2
     guess = _minimiser(low, high, middle) if math.isfinite(high.f) else low.step + 0.1 * width
@@ -132,7 +143,8 @@ def _between(low: Trial, high: Trial) -> float:
 
 
 def _minimiser(one: Trial, other: Trial, otherwise: float) -> float:
-    """The minimiser of the cubic through two points with their slopes (Nocedal & Wright, 3.59)."""
+    """Return the minimiser of the cubic through two trials and their slopes (Nocedal & Wright,
+    3.59), or ``otherwise`` if it has none."""
     width = other.step - one.step
     d1 = one.slope + other.slope - 3 * (other.f - one.f) / width
     root = d1 * d1 - one.slope * other.slope
@@ -146,28 +158,29 @@ def _minimiser(one: Trial, other: Trial, otherwise: float) -> float:
 
 @dataclass(eq=False)
 class Inverse:
-    """The inverse Hessian's approximation: scale · matrix + vectors · middle · vectorsᵀ.
+    """Approximate inverse Hessian scale · matrix + vectors · middle · vectorsᵀ.
 
-    The last updates stay apart: to multiply by them is cheap, and to add many at once takes little
-    more than to add one, for which the whole matrix goes through memory just the same.
+    The latest updates are kept as low-rank factors, whose products are cheap. Adding many of them
+    to the matrix at once takes little longer than adding one, because the cost is that of passing
+    the matrix through memory.
     """
 
     matrix: np.ndarray = field(repr=False)
-    """Shape (n, n), in Fortran's order; its lower triangle counts."""
+    """Shape (n, n), in Fortran order; only its lower triangle is used."""
     scale: float
     vectors: np.ndarray = field(repr=False)
-    """Shape (n, 2k), two for each of k updates."""
+    """Shape (n, 2k), two columns for each of k updates."""
     middle: np.ndarray = field(repr=False)
     """Shape (2k, 2k)."""
 
     @staticmethod
     def identity(n: int, scale: float) -> Inverse:
-        """A multiple of the identity."""
+        """Return a multiple of the identity."""
         matrix = np.asfortranarray(np.eye(n))
         return Inverse(matrix, scale, np.empty((n, 0), order="F"), np.empty((0, 0)))
 
     def times(self, x: np.ndarray) -> np.ndarray:
-        """The product with x (n,)."""
+        """Return the product with x (n,)."""
         by_vectors = self.middle @ (self.vectors.T @ x)
         return _symv(self.scale, self.matrix, x, lower=1) + self.vectors @ by_vectors
 
@@ -177,7 +190,7 @@ class Inverse:
         self.scale /= tau
         self.vectors = np.asfortranarray(np.column_stack([self.vectors, s, w]))
         self.middle = np.asarray(block_diag(self.middle / tau, [[ss, sw], [sw, ww]]))
-        if self.vectors.shape[1] >= 2 * _APART:
+        if self.vectors.shape[1] >= 2 * _APART:  # add the low-rank part to the matrix
             half = np.asfortranarray(self.vectors @ (self.middle / 2))
             args = self.vectors, half, self.scale, self.matrix
             self.matrix = _syr2k(1.0, *args, lower=1, overwrite_c=1)
@@ -186,43 +199,43 @@ class Inverse:
 
     @property
     def whole(self) -> bool:
-        """Whether no update stands apart."""
+        """Whether all updates are added to the matrix."""
         return self.vectors.shape[1] == 0
 
 
 @dataclass(eq=False)
 class QuasiNewton:
-    """A minimisation in progress: all that changes from one step to the next."""
+    """A minimisation in progress."""
 
     x: np.ndarray
-    """Where it stands, shape (n,)."""
+    """Current point, shape (n,)."""
     f: float
-    """The function there."""
+    """The function at x."""
     gradient: np.ndarray
-    """The gradient there, shape (n,)."""
+    """The gradient at x, shape (n,)."""
     H: Inverse | None = field(default=None, repr=False)
-    """The inverse Hessian's approximation; the identity if None."""
+    """Approximate inverse Hessian; the identity if None."""
     direction: np.ndarray | None = field(default=None, repr=False)
-    """−H∇f, shape (n,), if it is known."""
+    """−H∇f, shape (n,), if already computed."""
     curvature: float = CURVATURE
     """c₂ of the line search."""
     first: float = 1.0
-    """The first step tried along a quasi-Newton direction."""
+    """First trial step along a quasi-Newton direction."""
 
     @staticmethod
     def start(
         objective: Objective, x: np.ndarray, curvature: float = CURVATURE, first: float = 1.0
     ) -> QuasiNewton:
-        """A minimisation that begins at x (n,)."""
+        """Begin a minimisation at x (n,)."""
         x = np.array(x, dtype=float)
         f, gradient = objective(x)
         return QuasiNewton(x, float(f), gradient, curvature=curvature, first=first)
 
     def step(self, objective: Objective) -> bool:
-        """One iteration; False if no lower value can be found, and nothing has changed but H.
+        """Make one iteration; return False, and leave x unchanged, if no lower value is found.
 
-        If the search fails along the quasi-Newton direction, the matrix is forgotten and the
-        steepest descent tried.
+        If the line search along the quasi-Newton direction fails, H is reset to the identity, and
+        steepest descent is tried.
         """
         while True:
             direction = self.direction
@@ -231,40 +244,41 @@ class QuasiNewton:
             slope = float(self.gradient @ direction)
             here = Point(0.0, self.f, slope, self.x, self.gradient)
             first = self.first if self.H is not None else first_step(slope)
-            found = None
+            point = None
             if slope < 0:
-                found = line_search(objective, here, direction, first, self.curvature)
-            if found is not None or self.H is None:
+                point = line_search(objective, here, direction, first, self.curvature)
+            if point is not None or self.H is None:
                 break
             self.H = self.direction = None
-        if found is None:
+        if point is None:
             return False
-        self._update(found, direction)
-        self.x, self.f, self.gradient = found.x, found.f, found.gradient
+        self._update(point, direction)
+        self.x, self.f, self.gradient = point.x, point.f, point.gradient
         return True
 
-    def _update(self, found: Point, direction: np.ndarray) -> None:
-        """The new H: (H − wwᵀ/yᵀw + φ·vvᵀ)/τ + ssᵀ/sᵀy with w = Hy and
-        v = √(yᵀw)·(s/sᵀy − w/yᵀw), written out in ssᵀ, swᵀ + wsᵀ and wwᵀ.
+    def _update(self, point: Point, direction: np.ndarray) -> None:
+        """Update H after a step, and compute the next direction.
 
-        With it comes the new direction, from that of the step and w; it is multiplied out anew
-        whenever the updates are added up, so that rounding does not gather in it.
+        H becomes (H − wwᵀ/yᵀw + φ·vvᵀ)/τ + ssᵀ/sᵀy with w = Hy and v = √(yᵀw)·(s/sᵀy − w/yᵀw),
+        expanded in ssᵀ, swᵀ + wsᵀ and wwᵀ. The next direction follows from the last one and w. It
+        is computed afresh whenever updates are added to the matrix, so that rounding errors do not
+        accumulate.
         """
-        s, y, g = found.x - self.x, found.gradient - self.gradient, found.gradient
+        s, y, g = point.x - self.x, point.gradient - self.gradient, point.gradient
         sy = float(s @ y)
         self.direction = None
-        if not curved(sy, float(s @ s), float(y @ y)):
+        if not curved(sy, float(s @ s), float(y @ y)):  # skip the update
             return
-        if self.H is None:  # Nocedal & Wright, 6.20
+        if self.H is None:  # initial scale, Nocedal & Wright, 6.20
             scale = sy / float(y @ y)
             self.H = Inverse.identity(len(s), scale)
             sBs, along = float(s @ s) / scale, scale * self.gradient
         else:
-            sBs, along = -found.step * float(s @ self.gradient), -direction
+            sBs, along = -point.step * float(s @ self.gradient), -direction
         w = self.H.times(y)
         weights = update_weights(sBs, float(y @ w), sy, len(s))
         self.H.update(s, w, weights)
-        if not self.H.whole:
+        if not self.H.whole:  # −H∇f from products that are already known
             tau, ss, sw, ww = weights
             sg, wg = float(s @ g), float(w @ g)
             product = (along + w) / tau + (ss * sg + sw * wg) * s + (sw * sg + ww * wg) * w
@@ -272,24 +286,34 @@ class QuasiNewton:
 
 
 def first_step(slope: float) -> float:
-    """The first step tried along the steepest descent, of this slope."""
+    """Return the first trial step along the steepest descent, for its slope."""
     return min(1.0, 1 / math.sqrt(max(-slope, 1e-300)))
 
 
 def curved(sy: float, ss: float, yy: float) -> bool:
-    """Whether sᵀy, which the curvature condition makes positive, is more than rounding."""
+    """Return whether sᵀy, which the curvature condition makes positive, exceeds rounding errors."""
     return sy > 1e-14 * math.sqrt(ss * yy)
 
 
 def update_weights(sBs: float, yw: float, sy: float, n: int) -> Weights:
-    """What the update divides H by, and its weights of ssᵀ, swᵀ + wsᵀ and wwᵀ."""
+    """Return the coefficients of an update of H.
+
+    Args:
+        sBs: sᵀBs, where B is the inverse of H.
+        yw: yᵀw = yᵀHy.
+        sy: sᵀy.
+        n: number of variables.
+    """
     phi, tau = _scaled_broyden(sBs / sy, yw / sy, n)
     return tau, phi * yw / (sy * sy) / tau + 1 / sy, -phi / sy / tau, (phi - 1) / yw / tau
 
 
 def _scaled_broyden(b: float, h: float, n: int) -> tuple[float, float]:
-    """φ, the member of the family, and τ, the scale, from b = sᵀBs/sᵀy and h = yᵀHy/sᵀy."""
-    a = max(h * b - 1, 1e-12)  # zero where s and Hy are parallel: all members agree
+    """Return φ, the member of Broyden's family, and τ, the scale.
+
+    The arguments are b = sᵀBs/sᵀy, h = yᵀHy/sᵀy and the number of variables n.
+    """
+    a = max(h * b - 1, 1e-12)  # zero if s and Hy are parallel, where all members agree
     rho = min(1.0, h * (1 - math.sqrt(a / (a + 1))))
     theta = max((rho - 1) / a, min(1 / rho, (1 - b) / b))
     sigma = 1 + a * theta
@@ -311,9 +335,9 @@ def minimise(
 
     Args:
         objective: the function and its gradient.
-        x: where to begin.
-        iterations: most iterations.
-        tolerance: largest component of the gradient that counts as zero.
+        x: initial point.
+        iterations: largest number of iterations.
+        tolerance: tolerance of the gradient's components.
         curvature: c₂ of the line search.
         watch: called after each iteration.
     """

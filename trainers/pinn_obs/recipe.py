@@ -1,4 +1,4 @@
-"""What the paper's recipe and the fast one differ in."""
+"""The interface of the paper's and the fast recipe."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from trainers.pinn_obs.objective import Objective
 
 
 class Recipe(ABC):
-    """How a network is made, what is minimised, and by which method.
+    """Base class of recipes: a network, an objective and a minimiser.
 
     Args:
         system: the model.
         config: the settings.
-        record: of one episode.
+        record: record of one episode.
         noise_std: standard deviation of the output noise, shape (ny,), in output units.
     """
 
     architecture: Architecture
-    """The network's sizes."""
+    """Architecture of the network."""
     objective: Objective
-    """What is minimised, of a network's weights."""
+    """The minimised loss as a function of the network's weights."""
 
     @abstractmethod
     def __init__(
@@ -40,26 +40,26 @@ class Recipe(ABC):
 
     @abstractmethod
     def draw(self, generator: torch.Generator) -> np.ndarray:
-        """Random weights (n,)."""
+        """Draw initial weights (n,)."""
 
     @abstractmethod
     def begin(self, theta: np.ndarray) -> Minimiser:
-        """The minimisation from weights theta (n,)."""
+        """Begin the minimisation at weights theta (n,)."""
 
     @abstractmethod
     def held_out(self, theta: np.ndarray) -> float | None:
-        """The paper's loss on samples that are not trained on, if there are any."""
+        """Return the paper's loss on held-out samples; None if there are none."""
 
     @abstractmethod
     def covariance(self, theta: np.ndarray) -> Covariance | None:
-        """Covariances of the estimates of the network with weights theta (n,), if they are
-        known."""
+        """Return the covariances of the estimates of the network with weights theta (n,); None if
+        they are unknown."""
 
     @abstractmethod
     def method_state(self, method: Minimiser) -> dict[str, Any]:
-        """All that `load_method` needs to go on exactly: arrays and plain values."""
+        """Return all that `load_method` needs to resume exactly: arrays and plain values."""
 
     @abstractmethod
     def load_method(self, state: Mapping[str, Any], best: tuple[np.ndarray, float]) -> Minimiser:
-        """The minimisation that goes on from what `method_state` gave; ``best`` are the best
-        weights (n,) and their loss."""
+        """Restore the minimisation from the result of `method_state`; ``best`` are the best weights
+        (n,) and their loss."""

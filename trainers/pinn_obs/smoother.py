@@ -1,6 +1,6 @@
-"""The iterated Kalman smoother, as the guide needs it.
+"""The iterated Kalman smoother of the guide.
 
-Its process noise and settling are those that make a network follow; see
+The process noise and the tolerance are chosen so that a network can follow the result; see
 `pinnobs_gym.estimation.smoother.iterated`.
 """
 
@@ -21,16 +21,15 @@ _SETTLED = 1e-4
 
 
 def smooth(system: System, record: Record, noise: np.ndarray, caution: float) -> Path:
-    """The iterated Kalman smoother, begun with the estimates of an extended Kalman smoother.
+    """Run the iterated Kalman smoother, from the estimates of an extended Kalman smoother.
 
-    If its passes do not settle, it begins again with more process noise, which it then takes away
-    again pass by pass.
+    If the passes do not converge, the process noise is raised and then lowered again pass by pass.
 
     Args:
         system: the model.
         record: the samples.
         noise: standard deviations of the output noise, shape (ny,), in output units; positive.
-        caution: see `pinnobs_gym.estimation.smoother.forward`; of the first pass.
+        caution: see `pinnobs_gym.estimation.smoother.forward`; it applies to the first pass.
     """
     narrowed = _WIDE * _NARROWING ** np.arange(2 * _PASSES)
     drifts = (*[DRIFT] * (1 + _PASSES), *np.maximum(narrowed, DRIFT))
@@ -48,20 +47,20 @@ def forward(
     drift: float = DRIFT,
     caution: float = 0.0,
 ) -> Filtered:
-    """`pinnobs_gym.estimation.smoother.forward`, told standard deviations.
+    """Run `pinnobs_gym.estimation.smoother.forward` with noises given as standard deviations.
 
     Args:
         system: the model.
         record: the samples.
-        noise: of the output noise, shape (ny,), in output units; positive.
-        about: states (num_samples, batch, nx) about which the model is linearised.
-        drift: of the process noise per sample, over the scale.
-        caution: which part of HPHᵀ is added to the noise.
+        noise: standard deviations of the output noise, shape (ny,), in output units; positive.
+        about: states (num_samples, batch, nx) of linearisation; the filter's own if None.
+        drift: standard deviation of the process noise per sample, over the scale.
+        caution: fraction of HPHᵀ that is added to the covariance of the output noise.
     """
     Q, R = _process_noise(system, drift), np.diag(noise**2)[..., None]
     return smoother.forward(system, record, Q, R, about, caution)
 
 
 def _process_noise(system: System, drift: float) -> np.ndarray:
-    """Q, (nx, nx, 1)."""
+    """Return the covariance Q of the process noise per sample, (nx, nx, 1)."""
     return np.diag((drift * vector(system.scale, system.nx, "scale")) ** 2)[..., None]

@@ -1,11 +1,11 @@
 """Many fast trainings at once in torch, for a GPU.
 
 Each round evaluates one trial point of every record in one batch. The line searches, a few scalars
-each, stay on the CPU, and no record waits for another's: one may be amid a search while the next
-begins its own. On a CPU this takes longer than one record after another, whose arrays then stay in
-the cache. There was no GPU to test this on: its tests run the same code in torch on a CPU, where it
-finds what single trainings find, and on torch's device without memory, which would refuse arrays of
-two devices.
+each, run on the CPU, and are independent: one record may be within a search while another begins
+its own. On a CPU this is slower than one record after another, whose arrays then stay in the cache.
+It has not been tested on a GPU. The tests run the same code in torch on a CPU, where the results
+agree with those of single trainings, and on torch's meta device, which refuses arrays of mixed
+devices.
 """
 
 from __future__ import annotations
@@ -34,14 +34,16 @@ if TYPE_CHECKING:
 
 
 def advance(trainers: Sequence[PinnObsTrainer], device: str, interrupt: Interrupt) -> None:
-    """Train all until each has ended, or Ctrl-C is pressed; those whose networks or points differ
-    in number go one batch after another.
+    """Train until every trainer has ended, or Ctrl-C is pressed.
 
-    One that has ended leaves its batch. The CPU seconds of each are those of its whole batch.
+    Trainers with networks of one shape and equally many points form a batch; batches are trained
+    one after another. A trainer that has ended leaves its batch. The CPU seconds of a trainer
+    include those of the others.
     """
     batches: dict[tuple, list[PinnObsTrainer]] = {}
     for trainer in trainers:
-        while not trainer.finished() and trainer.best is None:  # the first iteration; its restarts
+        # The first iteration of each, with restarts if its loss is not finite.
+        while not trainer.finished() and trainer.best is None:
             trainer.step()
         recipe = trainer.recipe
         sizes = (*recipe.architecture.shapes, len(recipe.objective.points.t))
@@ -65,13 +67,14 @@ def advance(trainers: Sequence[PinnObsTrainer], device: str, interrupt: Interrup
 
 
 class Minimisations:
-    """Self-scaled Broyden minimisations in progress, one per objective: what
-    `trainers.pinn_obs.quasi_newton.QuasiNewton` is for one.
+    """Self-scaled Broyden minimisations in progress, one per objective.
+
+    They are a batched version of `trainers.pinn_obs.quasi_newton.QuasiNewton`.
 
     Args:
-        objectives: of networks of one shape, at as many points each.
-        starts: where they begin, shape (batch, n).
-        device: torch's name of where they run.
+        objectives: objectives of networks of one shape, with equally many points.
+        starts: initial points, shape (batch, n).
+        device: torch name of the device.
     """
 
     def __init__(self, objectives: Sequence[Objective], starts: np.ndarray, device: str) -> None:
@@ -83,17 +86,17 @@ class Minimisations:
         self._direction, self._trial = -self._gradient, self._x
         batch, n = starts.shape
         self._H = torch.eye(n, dtype=self._x.dtype, device=device).repeat(batch, 1, 1)
-        self._fresh = [True] * batch  # where H is the identity, still without a scale
+        self._fresh = [True] * batch  # whether H is the unscaled identity
         self._slopes, self._steps = [0.0] * batch, [0.0] * batch
         self._searches: list[Search | None] = [None] * batch
 
     @property
     def x(self) -> np.ndarray:
-        """Where they stand, shape (batch, n)."""
+        """Current points, shape (batch, n)."""
         return self._x.cpu().numpy().copy()
 
     def keep(self, rows: Sequence[int]) -> None:
-        """Go on with these rows only."""
+        """Keep only these rows."""
         if not rows:
             return
         index = torch.as_tensor(list(rows), device=self._device)
@@ -104,7 +107,12 @@ class Minimisations:
         self._objective = Objective.stacked(self._objectives, self._device)
 
     def round(self) -> tuple[list[int], list[int]]:
-        """One trial of every row: which of them made a step with it, and which cannot make any."""
+        """Evaluate one trial of every row.
+
+        Returns:
+            The rows whose trial was accepted as a step, and the rows for which no step exists.
+        """
+        # Rows without a line search begin one; all trials are evaluated at once.
         ended = self._begin([i for i, search in enumerate(self._searches) if search is None])
         self._trial = self._x + self._column(self._steps) * self._direction
         loss, gradient = self._objective.values(self._trial)
@@ -117,7 +125,7 @@ class Minimisations:
                 continue
             try:
                 self._steps[i] = search.send((f, along))
-            except StopIteration as stop:
+            except StopIteration as stop:  # accepted, or failed: then retry from the identity
                 self._searches[i] = None
                 if stop.value:
                     made.append(i)
@@ -131,7 +139,7 @@ class Minimisations:
         return made, ended
 
     def _begin(self, rows: list[int]) -> list[int]:
-        """Begin the line searches of these rows; which of them have no way down."""
+        """Begin the line searches of these rows; return those without a descent direction."""
         if not rows:
             return []
         new = self._mask(rows)
@@ -140,7 +148,7 @@ class Minimisations:
         slopes = (self._gradient * self._direction).sum(-1).tolist()
         ended: list[int] = []
         for i in rows:
-            if not slopes[i] < 0 and not self._fresh[i]:
+            if not slopes[i] < 0 and not self._fresh[i]:  # steepest descent instead
                 self._forget(i)
                 self._direction[i] = -self._gradient[i]
                 slopes[i] = -float(self._gradient[i] @ self._gradient[i])
@@ -155,17 +163,18 @@ class Minimisations:
         return ended
 
     def _forget(self, row: int) -> None:
+        """Reset H of a row to the identity."""
         self._H[row] = torch.eye(self._H.shape[-1], dtype=self._H.dtype, device=self._device)
         self._fresh[row] = True
 
     def _update(self, made: list[int], gradient: Tensor) -> None:
-        """Move these rows to their trial points, and update their H as `QuasiNewton` does."""
+        """Move these rows to their trial points, and update their H as in `QuasiNewton`."""
         moved = self._mask(made)
         s = torch.where(moved, self._trial - self._x, 0.0)  # others' trials may not be finite
         y = torch.where(moved, gradient - self._gradient, 0.0)
         w = (self._H @ y[..., None])[..., 0]
         products = [(a * b).sum(-1) for a, b in ((s, y), (s, s), (y, y), (y, w))]
-        weights = np.tile([1.0, 1.0, 0.0, 0.0, 0.0], (len(self.f), 1))  # leaves H as it is
+        weights = np.tile([1.0, 1.0, 0.0, 0.0, 0.0], (len(self.f), 1))  # leaves H unchanged
         for i, (sy, ss, yy, yw) in enumerate(torch.stack(products, dim=-1).tolist()):
             if i not in made or not curved(sy, ss, yy):
                 continue
@@ -175,6 +184,7 @@ class Minimisations:
             )
             weights[i] = (size, *update_weights(sBs, size * yw, sy, s.shape[-1]))
             self._fresh[i] = False
+        # The update of rank two, on all rows at once.
         size, tau, ss, sw, ww = torch.as_tensor(weights, device=self._device).T[..., None]
         w = size * w
         left = torch.stack([s, w], dim=-1)
@@ -184,7 +194,7 @@ class Minimisations:
         self._gradient = torch.where(moved, gradient, self._gradient)
 
     def _mask(self, rows: list[int]) -> Tensor:
-        """Which rows these are, shape (batch, 1)."""
+        """Return a mask (batch, 1) of these rows."""
         mask = np.zeros((len(self.f), 1), bool)
         mask[rows] = True
         return torch.as_tensor(mask, device=self._device)

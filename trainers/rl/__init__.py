@@ -1,9 +1,9 @@
 """Agents trained by reinforcement learning with Stable-Baselines3.
 
-The agent plays episodes of the env and is rewarded by how near its estimates are to the true
-states, which no other trainer of ours sees. With gains and corrections the reward is the
-``improvement`` on the model's prediction, and the discount is zero, so that learning a gain is a
-regression of the prediction's error on the innovation: what Kalman's gain is.
+The agent plays episodes of the env. The reward depends on the error of its estimates, and hence on
+the true states, which no other trainer of this package uses. With gains and corrections the reward
+is the ``improvement`` on the model's prediction, and the default discount is zero. Learning a gain
+is then a regression of the prediction error on the innovation, whose solution is the Kalman gain.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HELD_OUT = 500_000
-"""From the first seed of the training to that of the episodes held out."""
+"""Offset of the first validation seed from the first training seed."""
 RESUMED = 10**9
-"""From the first seed of a training to those of episodes that are played after a resumption."""
+"""Offset of the seeds after a resumption from the first training seed."""
 _STATISTICS = ("mean", "var", "count")
 
 
 class RLTrainer(Trainer[RLConfig, TrainedAgent]):
-    """Trains an agent on episodes that it plays itself.
+    """Train an agent on episodes that it plays itself.
 
-    The agent of the least error on episodes held out is kept. The measure is the geometric mean of
-    two medians over these episodes, of the NRMSE over the whole and over the last quarter, states
-    that no output tells apart counting as one; episodes that left the finite numbers count as
-    infinite. A training that is resumed plays new episodes, and fills replay buffers anew.
+    The agent with the least validation loss is kept. The loss is the geometric mean of two medians
+    over the held-out episodes: of the NRMSE over the whole episode and over its last quarter, both
+    modulo indistinguishable states. A diverged episode counts as infinite. A resumed training
+    plays new episodes and starts with an empty replay buffer.
     """
 
     name = "rl"
@@ -61,21 +61,21 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
 
     @property
     def steps(self) -> int:
-        """Steps so far, those of all rows together."""
+        """Number of steps so far, over all rows."""
         return self.agent.num_timesteps
 
     @property
     def whole(self) -> int:
-        """All steps of the training: as many whole rollouts as the config's steps hold."""
+        """Total number of steps of the training, in whole rollouts."""
         return max(1, self.config.steps // self.rollout) * self.rollout
 
     def step(self) -> None:
-        """Play one rollout and improve the agent by it."""
+        """Play one rollout and update the agent."""
         rate = learning_rate(self.config, (self.steps + self.rollout) / self.whole)
         self.agent.lr_schedule = lambda _: rate
         first = not self.steps
-        look = _EachStep(self._validate_if_due)
-        self.agent.learn(self.rollout, callback=look, reset_num_timesteps=first)
+        validate = _EachStep(self._validate_if_due)
+        self.agent.learn(self.rollout, callback=validate, reset_num_timesteps=first)
         self.iteration += 1
 
     def _validate_if_due(self) -> None:
@@ -83,7 +83,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
             self._validate()
 
     def _validate(self) -> None:
-        """Score the agent as it is on the episodes held out, and keep it if it is the best."""
+        """Compute the agent's validation loss, and keep the agent if it is the best so far."""
         self._validated = self.steps
         estimator = Sb3(
             self.system, tuple(self.noise_std.tolist()), trained=self._trained(math.nan)
@@ -101,7 +101,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
         self._logged["held_out/best"] = self.best.loss
 
     def _trained(self, loss: float) -> TrainedAgent:
-        """What an estimator needs of the agent as it is now."""
+        """Return the trained object of the current agent."""
         layers, squash, recurrent = policy_layers(self.agent.policy)
         statistics: Any = self.env.obs_rms
         return TrainedAgent(
@@ -141,8 +141,8 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
             "parameters": self.agent.get_parameters(),
             "variables": {name: getattr(self.agent, name).detach() for name in names},
             "statistics": {
-                what: {name: getattr(each, name) for name in _STATISTICS}
-                for what, each in statistics.items()
+                kind: {name: getattr(each, name) for name in _STATISTICS}
+                for kind, each in statistics.items()
             },
             "best": content_of(self.best),
         }
@@ -152,17 +152,17 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
         self.agent.set_parameters(with_tensors(state["parameters"]), device="cpu")
         for name, value in with_tensors(state["variables"]).items():
             getattr(self.agent, name).data.copy_(value)
-        found: Any = self.env.obs_rms, self.env.ret_rms
-        for each, what in zip(found, ("features", "returns"), strict=True):
+        statistics: Any = self.env.obs_rms, self.env.ret_rms
+        for each, kind in zip(statistics, ("features", "returns"), strict=True):
             for name in _STATISTICS:
-                setattr(each, name, state["statistics"][what][name])
+                setattr(each, name, state["statistics"][kind][name])
         if state["best"] is not None:
             self.best = from_content(TrainedAgent, state["best"])
-        # Other episodes than those played so far: the state of the env is not kept.
+        # The state of the env is not saved; new seeds avoid repeating the episodes so far.
         self.env.seed(first_seed(self.config, self.episode + RESUMED + self.steps))
 
     def result(self) -> TrainedAgent:
-        """The best agent, with what all of the training took."""
+        """Return the best agent, with the metadata of the whole training."""
         if self.best is None or self._validated != self.steps:
             self._validate()
         assert self.best is not None
@@ -174,7 +174,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
 
 
 class _EachStep(BaseCallback):
-    """Calls a function after each step of the rows."""
+    """Callback that calls a function after each step of the env."""
 
     def __init__(self, call: Callable[[], None]) -> None:
         super().__init__()
@@ -186,7 +186,7 @@ class _EachStep(BaseCallback):
 
 
 class _Values(KVWriter):
-    """Keeps the latest numbers that SB3 logs."""
+    """Writer that keeps the latest numbers logged by SB3."""
 
     def __init__(self, values: dict[str, float]) -> None:
         self._values = values
@@ -203,4 +203,4 @@ class _Values(KVWriter):
         }
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing; no file is open."""

@@ -1,4 +1,4 @@
-"""SB3's agent and its env, and the layers of its policy."""
+"""The agent of Stable-Baselines3 (SB3), its env, and the layers of its policy."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from pinnobs_gym.estimators.sb3 import Layer
 from trainers.rl.config import RLConfig
 
 SEEDS_APART = 1000
-"""From the first seed of an agent's episodes to that of the agent trained with the next seed."""
+"""Offset between the first episode seeds of agents trained with consecutive seeds."""
 LAST_RATE = 0.02
-"""The learning rate in the end, over that at first."""
+"""Final learning rate over the initial one."""
 
 
 def make_agent(config: RLConfig, env: VecNormalize) -> BaseAlgorithm:
-    """SB3's agent that knows nothing, and plays an env.
+    """Create an untrained SB3 agent for an env.
 
     Raises:
-        ValueError: in one line, if recurrent_ppo is wanted without sb3-contrib.
+        ValueError: in one line, if the algorithm is recurrent_ppo and sb3-contrib is not installed.
     """
     shape: Any = env.action_space.shape
     policy = "MlpLstmPolicy" if config.algorithm == "recurrent_ppo" else "MlpPolicy"
@@ -40,7 +40,7 @@ def make_agent(config: RLConfig, env: VecNormalize) -> BaseAlgorithm:
 
 
 def make_env(config: RLConfig, game: Game, episode: int) -> VecNormalize:
-    """The rows that are played, of seeds from ``episode`` on, with normalised features."""
+    """Create the vector env, with seeds from ``episode`` on and normalised observations."""
     learns_gain = config.action_mode != "normalized"
     rows = game.vector_env(
         config.rows,
@@ -54,17 +54,17 @@ def make_env(config: RLConfig, game: Game, episode: int) -> VecNormalize:
 
 
 def first_seed(config: RLConfig, episode: int) -> int:
-    """Seed of the first episode that an agent plays."""
+    """Return the seed of the first episode that an agent plays."""
     return episode + SEEDS_APART * config.seed
 
 
 def learning_rate(config: RLConfig, done: float) -> float:
-    """Step of Adam when a part from 0 to 1 of the training is done."""
+    """Return Adam's learning rate when a fraction ``done`` of the training is finished."""
     return config.learning_rate * (1 - done * (1 - LAST_RATE))
 
 
 def _algorithm(config: RLConfig) -> Any:
-    """SB3's class."""
+    """Return the SB3 class of the config's algorithm."""
     if config.algorithm != "recurrent_ppo":
         return getattr(stable_baselines3, config.algorithm.upper())
     try:
@@ -76,7 +76,7 @@ def _algorithm(config: RLConfig) -> Any:
 
 
 def options(config: RLConfig, actions: int) -> dict[str, Any]:
-    """A config in SB3's words, for actions of so many numbers."""
+    """Return the keyword arguments of the SB3 class, for actions of ``actions`` components."""
     c: Any = config
     policy: dict[str, Any] = {"net_arch": [c.width, c.width], "activation_fn": nn.Tanh}
     common = {"learning_rate": c.learning_rate, "batch_size": c.batch, "gamma": c.gamma}
@@ -86,18 +86,18 @@ def options(config: RLConfig, actions: int) -> dict[str, Any]:
             policy["lstm_hidden_size"] = c.width
         rollout = {"n_steps": c.rollout, "n_epochs": c.epochs, "gae_lambda": 0.0}
         return {**common, **rollout, "policy_kwargs": policy}
-    kept = {"train_freq": c.rollout, "gradient_steps": c.epochs, "buffer_size": c.buffer}
-    found = {**common, **kept, "tau": 0.02, "learning_starts": 5000}
+    schedule = {"train_freq": c.rollout, "gradient_steps": c.epochs, "buffer_size": c.buffer}
+    off_policy = {**common, **schedule, "tau": 0.02, "learning_starts": 5000}
     if c.algorithm == "td3":
         spread = np.full(actions, math.exp(c.log_std))
         noise = NormalActionNoise(np.zeros(actions), spread)
-        return {**found, "policy_kwargs": policy, "action_noise": noise}
+        return {**off_policy, "policy_kwargs": policy, "action_noise": noise}
     policy["log_std_init"] = c.log_std
-    return {**found, "policy_kwargs": policy}
+    return {**off_policy, "policy_kwargs": policy}
 
 
 def policy_layers(policy: Any) -> tuple[tuple[Layer, ...], bool, tuple[Layer, Layer] | None]:
-    """The layers of SB3's policy, whether its action is squashed, and its recurrent layer."""
+    """Return the layers of an SB3 policy, whether it squashes actions, and its recurrent layer."""
     if not isinstance(policy, ActorCriticPolicy):  # off-policy
         actor = policy.actor
         parts = [actor.mu] if isinstance(actor.mu, nn.Sequential) else [actor.latent_pi, actor.mu]
@@ -111,8 +111,8 @@ def policy_layers(policy: Any) -> tuple[tuple[Layer, ...], bool, tuple[Layer, La
 
 
 def _linear(parts: Sequence[nn.Module]) -> tuple[Layer, ...]:
-    found = [m for part in parts for m in part.modules() if isinstance(m, nn.Linear)]
-    return tuple((_array(m.weight), _array(m.bias)) for m in found)
+    layers = [m for part in parts for m in part.modules() if isinstance(m, nn.Linear)]
+    return tuple((_array(m.weight), _array(m.bias)) for m in layers)
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

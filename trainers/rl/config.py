@@ -1,4 +1,4 @@
-"""The settings of the trainer of agents, and its presets."""
+"""Settings and presets of the trainer of agents."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ _ON_POLICY = ("ppo", "recurrent_ppo")
 
 @dataclass(frozen=True)
 class RLConfig(TrainingConfig):
-    """How an agent is trained: by PPO that chooses gains, unless its settings are changed. Those of
-    PPO with gains were tuned, on episodes that are not scored; the other presets begin there."""
+    """Settings of the training of an agent; by default PPO with gains as actions.
+
+    The defaults were tuned for PPO with gains, on episodes that are not scored; the other presets
+    are derived from them.
+    """
 
     may_change = (
         *("steps", "rows", "learning_rate", "rollout", "batch", "epochs", "gamma", "log_std"),
@@ -25,40 +28,39 @@ class RLConfig(TrainingConfig):
     )
 
     algorithm: Algorithm = "ppo"
-    """The algorithm; recurrent_ppo needs the extra ``rl``. See the preset of its name."""
+    """The algorithm, see the preset of its name; recurrent_ppo needs the extra ``rl``."""
     action_mode: Mode = "gain"
-    """What the agent's actions mean; see `pinnobs_gym.envs.actions`."""
+    """Meaning of the agent's actions; see `pinnobs_gym.envs.actions`."""
     steps: int = 300_000
-    """Most steps of training, those of all rows together; only whole rollouts are made."""
+    """Largest number of training steps over all rows, rounded down to whole rollouts."""
     rows: int = 64
-    """Episodes that are played side by side."""
+    """Number of episodes that are played in parallel."""
     learning_rate: float = 1e-3
-    """Step of Adam at first; it falls to nearly zero in a straight line over the steps."""
+    """Initial step size of Adam, which decays linearly to nearly zero."""
     rollout: int = 64
-    """Steps of each row from one improvement of the agent to the next: an iteration."""
+    """Steps of each row between updates of the agent, that is, per iteration."""
     batch: int = 512
-    """Samples of a gradient."""
+    """Mini-batch size of a gradient."""
     epochs: int = 10
-    """Passes through a rollout's samples; off-policy, gradients after each rollout."""
+    """Passes through a rollout's samples; off-policy, gradient steps after each rollout."""
     gamma: float = 0.0
-    """Discount. An estimate never acts on the plant: with 0 each action is judged by what it does
-    to the error at its own sample."""
+    """Discount factor; with 0 an action is judged by the error at its own sample alone."""
     width: int = 32
-    """Neurons in each of two hidden layers, and in the recurrent one."""
+    """Neurons in each of the two hidden layers, and in the recurrent layer."""
     log_std: float = -1.0
-    """Logarithm of the exploration's standard deviation, in actions, at first (td3: always)."""
+    """Logarithm of the exploration noise's initial standard deviation (td3: constant)."""
     buffer: int = 0
-    """Samples that off-policy algorithms keep; 0 on-policy."""
+    """Size of the replay buffer of off-policy algorithms; 0 on-policy."""
     stack: int = 1
-    """How many of the last outputs the agent sees, with ``normalized``."""
+    """Number of the latest outputs that are observed, with ``normalized``."""
     held_out: int = 32
-    """Episodes that only decide which agent is kept."""
+    """Number of episodes held out for validation."""
     check_every: int = 30_000
-    """Steps from one look at these to the next."""
+    """Steps between validations."""
     checkpoint_every: int = 8
-    """Iterations from one checkpoint to the next."""
+    """Iterations between checkpoints."""
     log_every: int = 1
-    """Iterations from one point of the logged curves to the next."""
+    """Iterations between points of the logged curves."""
 
     @property
     def records(self) -> int:
@@ -106,33 +108,33 @@ def sac() -> RLConfig:
 
 
 def td3() -> RLConfig:
-    """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018) with gains as
+    """Twin delayed deep deterministic policy gradient (TD3, Fujimoto et al. 2018) with gains as
     actions."""
     return replace(sac(), algorithm="td3")
 
 
 def recurrent_ppo() -> RLConfig:
-    """PPO with a long short-term memory, with gains as actions; needs the extra ``rl``."""
+    """PPO with a long short-term memory and gains as actions; needs the extra ``rl``."""
     return RLConfig(algorithm="recurrent_ppo")
 
 
 def ppo_normalized() -> RLConfig:
-    """PPO that gives estimates themselves, and sees the last outputs."""
+    """PPO with estimates as actions, which observes the latest outputs."""
     return replace(ppo(), action_mode="normalized", stack=8, width=64)
 
 
 def sac_normalized() -> RLConfig:
-    """Soft actor-critic that gives estimates themselves, and sees the last outputs."""
+    """Soft actor-critic with estimates as actions, which observes the latest outputs."""
     return replace(sac(), action_mode="normalized", stack=8, width=64)
 
 
 def td3_normalized() -> RLConfig:
-    """TD3 that gives estimates themselves, and sees the last outputs."""
+    """TD3 with estimates as actions, which observes the latest outputs."""
     return replace(td3(), action_mode="normalized", stack=8, width=64)
 
 
 def recurrent_ppo_normalized() -> RLConfig:
-    """PPO with a long short-term memory that gives estimates themselves."""
+    """PPO with a long short-term memory and estimates as actions."""
     return replace(recurrent_ppo(), action_mode="normalized", width=64)
 
 

@@ -1,1 +1,1 @@
-"""What learned estimators share: networks, their files, the dynamics and maps of KKL observers."""
+"""Networks of learned estimators, their files, and the dynamics and maps of KKL observers."""

@@ -1,4 +1,4 @@
-"""What the learned gains compute, in the array API, for NumPy online and torch in training."""
+"""The networks of learned gains, in the array API: NumPy online, torch in training."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from pinnobs_gym.simulation.system import Array
 Variant: TypeAlias = Literal["kalman", "gru"]
 
 LARGEST_FACTOR = 8.0
-"""What a Kalman gain can be multiplied or divided by."""
+"""Largest factor by which a Kalman gain is multiplied or divided."""
 LARGEST_SHIFT = 1.0
-"""Largest gain beside the Kalman one, in standard deviations of the state per one of the
-innovation."""
+"""Largest gain added to the Kalman gain, in standard deviations of the state per standard deviation
+of the innovation."""
 LARGEST_GAIN = 2.0
 """Largest gain of the recurrent network, in scales of state and output."""
 FADE = 0.75
-"""Power of the share of P in S with which corrections fade."""
+"""Exponent of the share of HPHᵀ in S, by which corrections are damped."""
 _NIS_RATE = 0.1
 """Weight of the latest sample in the moving average of squared normalised innovations."""
 _LARGEST_NIS = 100.0
-"""Where a squared normalised innovation is cut off in that average."""
+"""Upper bound of a squared normalised innovation in that average."""
 _TINY = 1e-12
 
 
 def shapes(variant: Variant, nx: int, ny: int, width: int) -> list[tuple[int, int]]:
-    """Rows and columns of each weight matrix; each has a bias of as many rows beside it."""
+    """Return the rows and columns of each weight matrix; its bias has as many entries as rows."""
     if variant == "kalman":
         inputs = 2 * nx + 3 * ny + nx * (nx - 1) // 2
         return [(width, inputs), (width, width), (2 * nx * ny, width)]
@@ -38,7 +38,7 @@ def shapes(variant: Variant, nx: int, ny: int, width: int) -> list[tuple[int, in
 
 
 def memory_size(variant: Variant, ny: int, width: int) -> int:
-    """How many numbers per row the network remembers from one sample to the next."""
+    """Return the size of the network's memory per row of a batch."""
     return ny if variant == "kalman" else width
 
 
@@ -53,24 +53,24 @@ def corrected_gain(
     share: Array,
     memory: Array,
 ) -> Array:
-    """Kalman gains as a small network corrects them, (nx, ny, batch).
+    """Return Kalman gains corrected by a network, (nx, ny, batch).
 
-    K·f(o₁s) + g(o₂s)·σ_P/√S, where f lies between 1/`LARGEST_FACTOR` and `LARGEST_FACTOR`, g
-    between ±`LARGEST_SHIFT`, o₁ and o₂ are the network's outputs and s is the share of P in S to
-    the power `FADE`. A network whose last layer is zero changes nothing, and every correction fades
-    as P shrinks.
+    They are K·f(o₁s) + g(o₂s)·σ_P/√S, where f lies between 1/`LARGEST_FACTOR` and `LARGEST_FACTOR`,
+    g between ±`LARGEST_SHIFT`, o₁ and o₂ are the network's outputs, and s is ``share`` to the power
+    `FADE`. A network whose last layer is zero changes nothing, and every correction vanishes with
+    P.
 
-    All arrays have the batch last.
+    The batch is the last axis of all arrays.
 
     Args:
         layers: weights and biases of a tanh network, see `shapes`.
-        scale: the system's, shape (nx, 1).
+        scale: the system's scale, shape (nx, 1).
         xhat: predictions, shape (nx, batch).
-        P: their covariances, shape (nx, nx, batch).
+        P: covariances of the predictions, shape (nx, nx, batch).
         innovation: y − h(t, x̂, u), shape (ny, batch).
         S: variances of the innovations, shape (ny, batch).
         K: Kalman gains, shape (nx, ny, batch).
-        share: diagonal of HPHᵀ over that of S, shape (ny, batch); zero where y is missing.
+        share: diagonal of HPHᵀ over that of S, shape (ny, batch); zero for a missing output.
         memory: moving averages of squared normalised innovations, shape (ny, batch).
     """
     xp = array_namespace(xhat)
@@ -78,6 +78,7 @@ def corrected_gain(
     variance = _diagonal(P)
     sd = xp.sqrt(variance)
     root = xp.sqrt(share)
+    # Features: estimate, normalised innovations and their average, variances, share of HPHᵀ in S.
     features = [
         xhat / scale,
         xp.asinh(innovation / xp.sqrt(S)),
@@ -85,10 +86,11 @@ def corrected_gain(
         xp.log(variance / scale**2 + _TINY) / 6,
         root,
     ]
-    for i in range(1, nx):
+    for i in range(1, nx):  # correlations of the prediction errors
         features.append(P[i, :i] / (sd[i] * sd[:i] + _TINY * scale[i] * scale[:i]))
     outputs = perceptron(layers, "tanh", xp.concat(features, axis=0).T).T
     factor, shift = xp.reshape(outputs, (2, *K.shape)) * share**FADE
+    # A bounded factor of the Kalman gain, and a bounded gain added to it.
     largest = math.log(LARGEST_FACTOR)
     return K * xp.exp(largest * xp.tanh(factor)) + LARGEST_SHIFT * xp.tanh(shift) * (
         sd[:, None] / xp.sqrt(S)
@@ -96,7 +98,7 @@ def corrected_gain(
 
 
 def remembered(memory: Array, innovation: Array, S: Array, present: Array) -> Array:
-    """The moving averages after a sample, (ny, batch): of e²/S where an output is present."""
+    """Update the moving averages of e²/S, (ny, batch), at outputs that are present."""
     xp = array_namespace(innovation)
     nis = innovation * innovation / S
     nis = xp.where(nis > _LARGEST_NIS, _LARGEST_NIS, nis)
@@ -112,28 +114,35 @@ def recurrent_gain(
     std: Array,
     memory: Array,
 ) -> tuple[Array, Array]:
-    """Gains (nx, ny, batch) of a gated recurrent unit (Cho et al. 2014) and its next memory (width,
-    batch). It has no covariance; a network whose last layer is zero corrects nothing.
+    """Return the gains of a gated recurrent unit (Cho et al. 2014) and its next hidden state.
+
+    The unit uses no covariance. A network whose last layer is zero has zero gains.
 
     Args:
-        layers: of the input, of the memory and of the output, see `shapes`.
-        scale: the system's, shape (nx, 1).
-        output_scale: the outputs' scale, shape (ny, 1).
+        layers: weights and biases of the input, the hidden state and the output, see `shapes`.
+        scale: the system's scale, shape (nx, 1).
+        output_scale: scale of the outputs, shape (ny, 1).
         xhat: predictions, shape (nx, batch).
-        innovation: y − h(t, x̂, u), zero where y is missing, shape (ny, batch).
+        innovation: y − h(t, x̂, u), zero for a missing output, shape (ny, batch).
         std: standard deviation of the output noise, shape (ny, batch).
-        memory: shape (width, batch).
+        memory: hidden state, shape (width, batch).
+
+    Returns:
+        The gains (nx, ny, batch), and the next hidden state (width, batch).
     """
     xp = array_namespace(xhat)
     (W, b), (V, c), (out, d) = layers
     size = len(memory)
     features = [xhat / scale, xp.asinh(innovation / std) / 3, xp.log(std / output_scale) / 4]
-    given = W @ xp.concat(features, axis=0) + b[:, None]
-    kept = V @ memory + c[:, None]
-    gates = (1 + xp.tanh((given[: 2 * size] + kept[: 2 * size]) / 2)) / 2
+    # Reset and update gates, with the logistic function written as a tanh.
+    from_input = W @ xp.concat(features, axis=0) + b[:, None]
+    from_memory = V @ memory + c[:, None]
+    gates = (1 + xp.tanh((from_input[: 2 * size] + from_memory[: 2 * size]) / 2)) / 2
     reset, update = gates[:size], gates[size:]
-    new = xp.tanh(given[2 * size :] + reset * kept[2 * size :])
+    # Candidate state, and the interpolation between it and the old one.
+    new = xp.tanh(from_input[2 * size :] + reset * from_memory[2 * size :])
     memory = update * memory + (1 - update) * new
+    # Output layer; the tanh bounds the gains.
     o = xp.reshape(out @ memory + d[:, None], (len(scale), len(output_scale), -1))
     return LARGEST_GAIN * xp.tanh(o) * (scale[:, None] / output_scale), memory
 

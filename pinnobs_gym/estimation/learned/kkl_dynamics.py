@@ -1,4 +1,4 @@
-"""The linear dynamics of a KKL observer: the choice of (A, B) and the exact integration of z."""
+"""The linear dynamics of a KKL observer: design of (A, B) and exact integration of z."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from scipy.signal import besselap
 Design: TypeAlias = Literal["bessel", "niazi", "poles", "learned"]
 Mode: TypeAlias = Literal["continuous", "discrete"]
 Start: TypeAlias = Literal["output", "zero", "prior"]
-"""z before the first sample: at rest under y₀; 0; or T(x̂₀)."""
+"""Initial value of z: the steady state for the constant output y₀, zero, or T(x̂₀)."""
 
 _REACH = 1e-6
-"""Least singular value in Hautus's test, over the eigenvalue, of a mode within y's reach."""
+"""Smallest singular value in Hautus's test, over the eigenvalue, of a controllable mode."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """The system ż = Az + By, or its Euler step z⁺ = z + h(Az + By) in discrete time.
+    """The system ż = Az + By; in discrete time its Euler step z⁺ = z + h(Az + By).
 
     Raises:
         ValueError: in one line, if A is not Hurwitz or (A, B) is not controllable.
@@ -49,24 +49,28 @@ class Dynamics:
             )
 
     def _loses(self, value: complex) -> bool:
-        """Whether the mode of an eigenvalue is out of the output's reach (Hautus's test)."""
+        """Return whether the mode of an eigenvalue is uncontrollable (Hautus's test)."""
         size = abs(value)
         test = np.concatenate([value * np.eye(self.size) - self.A, self.B], axis=1) / size
         return float(np.linalg.svd(test, compute_uv=False)[-1]) < _REACH
 
     @property
     def size(self) -> int:
-        """How many components z has."""
+        """Number of components of z."""
         return len(self.A)
 
     @property
     def slowest(self) -> float:
-        """The smallest abs Re λ of A's eigenvalues, in 1/s."""
+        """Smallest abs Re λ of the eigenvalues λ of A, in 1/s."""
         return float(abs(np.linalg.eigvals(self.A).real).min())
 
     def step(self, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Φ (nz, nz), Γ₀ and Γ₁ (nz, ny) of z(t + h) = Φz(t) + Γ₀y(t) + Γ₁y(t + h), exact for an
-        output that is a straight line between the two.
+        """Return the matrices of a step of length h (s).
+
+        In continuous time the step is exact for an output that is linear in between.
+
+        Returns:
+            Φ (nz, nz), Γ₀ and Γ₁ (nz, ny) of z(t + h) = Φz(t) + Γ₀y(t) + Γ₁y(t + h).
 
         Raises:
             ValueError: in one line, in discrete time, if I + hA is not Schur.
@@ -74,17 +78,18 @@ class Dynamics:
         return _step(self.A.tobytes(), self.B.tobytes(), self.size, self.mode, h)
 
     def filtered(self, t: np.ndarray, y: np.ndarray, z0: np.ndarray | float = 0.0) -> np.ndarray:
-        """The z (num_samples, batch, nz) that outputs y (num_samples, batch, ny) at times t (s)
-        drive from z0 at the first of them."""
+        """Integrate z from z0 at the first of the times t (s), driven by outputs y
+        (num_samples, batch, ny); shape (num_samples, batch, nz)."""
         z = np.empty((*y.shape[:2], self.size))
         z[0] = z0
-        for k, h in enumerate(np.round(np.diff(t), 12)):
+        for k, h in enumerate(np.round(np.diff(t), 12)):  # equal intervals share a cached step
             flow, before, after = self.step(float(h))
             z[k + 1] = z[k] @ flow.T + y[k] @ before.T + y[k + 1] @ after.T
         return z
 
     def flows(self, t: np.ndarray) -> np.ndarray:
-        """Φ from the first of the times t (num_samples,) in s to each, (num_samples, nz, nz)."""
+        """Return Φ from the first of the times t (num_samples,) in s to each of them,
+        (num_samples, nz, nz)."""
         nothing = np.zeros((len(t), self.size, self.B.shape[1]))
         return self.filtered(t, nothing, np.eye(self.size)).swapaxes(1, 2)
 
@@ -93,6 +98,7 @@ class Dynamics:
 def _step(
     A_bytes: bytes, B_bytes: bytes, size: int, mode: Mode, h: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the result of `Dynamics.step`; matrices are bytes, as cache keys have to be hashed."""
     A = np.frombuffer(A_bytes).reshape(size, size)
     B = np.frombuffer(B_bytes).reshape(size, -1)
     ny = B.shape[1]
@@ -105,7 +111,7 @@ def _step(
                 f"{largest:.4g}; expected all below 1"
             )
         return flow, h * B, np.zeros_like(B)
-    # The exponential that also integrates the input and its ramp (Van Loan 1978).
+    # Matrix exponential that also integrates a constant input and a ramp (Van Loan 1978).
     block = np.zeros((size + 2 * ny,) * 2)
     block[:size, :size], block[:size, size : size + ny] = h * A, h * B
     block[size : size + ny, size + ny :] = np.eye(ny)
@@ -115,15 +121,18 @@ def _step(
 
 
 def realised(poles: Sequence[complex], ny: int, mode: Mode = "continuous") -> Dynamics:
-    """One filter per output with these poles, each in real modal form with unit gain at rest.
+    """Realise one filter with the given poles per output, in real modal form.
+
+    The static gain of each mode has norm 1.
 
     Args:
-        poles: in 1/s, complex ones in conjugate pairs.
+        poles: poles in 1/s, complex ones in conjugate pairs.
         ny: number of outputs.
         mode: continuous or discrete time.
 
     Raises:
-        ValueError: in one line, if they are not stable, not in pairs, or repeated.
+        ValueError: in one line, if the poles are not finite, not stable, not in conjugate pairs, or
+            repeated.
     """
     values: Any = np.asarray(poles, dtype=complex)
     if not np.isfinite(values).all():
@@ -133,12 +142,13 @@ def realised(poles: Sequence[complex], ny: int, mode: Mode = "continuous") -> Dy
     if len(upper) != len(lower) or not np.allclose(upper, lower):
         raise ValueError(f"poles={list(poles)}; expected complex ones in conjugate pairs")
     blocks: list[tuple[np.ndarray, np.ndarray]] = []
-    for pole in np.sort(values[values.imag == 0].real)[::-1]:
+    for pole in np.sort(values[values.imag == 0].real)[::-1]:  # a 1x1 block per real pole
         blocks.append((np.array([[pole]]), np.array([abs(pole)])))
-    for pole in upper:
+    for pole in upper:  # a 2x2 block per conjugate pair
         a, b = pole.real, pole.imag
         turn = np.array([[a, b], [-b, a]])
         blocks.append((turn, np.array([abs(pole), 0.0])))
+    # Block diagonal for one output, repeated for each output.
     size = len(values)
     A, B = np.zeros((size, size)), np.zeros((size, 1))
     row = 0
@@ -151,21 +161,21 @@ def realised(poles: Sequence[complex], ny: int, mode: Mode = "continuous") -> Dy
 
 
 def bessel(order: int, cutoff: float) -> tuple[complex, ...]:
-    """The poles of Bessel's filter of an order with a cut-off in Hz (Ramos et al. 2020)."""
+    """Return the poles of a Bessel filter with a cut-off in Hz (Ramos et al. 2020)."""
     _, poles, _ = besselap(order, norm="mag")
     return tuple(2 * np.pi * cutoff * np.asarray(poles))
 
 
 def niazi(nx: int) -> tuple[complex, ...]:
-    """The poles −1, −2, ... of Niazi et al. (2023), 2nx + 1 of them."""
+    """Return the 2nx + 1 poles −1, −2, ... of Niazi et al. (2023)."""
     return tuple(complex(-k) for k in range(1, 2 * nx + 2))
 
 
 def enough(order: int, nx: int, ny: int) -> None:
-    """Whether filters of an order, one per output, can tell nx states apart.
+    """Check that filters of an order, one per output, suffice for nx states.
 
     Raises:
-        ValueError: in one line, if z has fewer components than a state and one more.
+        ValueError: in one line, if z has fewer than nx + 1 components.
     """
     if order * ny < nx + 1:
         raise ValueError(
@@ -175,7 +185,7 @@ def enough(order: int, nx: int, ny: int) -> None:
 
 
 def at_rest(dynamics: Dynamics, start: Start) -> np.ndarray:
-    """What z begins at over a constant output, (nz, ny)."""
+    """Return the initial z per unit of y₀, (nz, ny); zero unless z starts in the steady state."""
     if start == "output":
         return -np.linalg.solve(dynamics.A, dynamics.B)
     return np.zeros_like(dynamics.B)

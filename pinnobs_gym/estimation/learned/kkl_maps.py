@@ -1,4 +1,4 @@
-"""The maps T and T* as multilayer perceptrons, in torch for training and in NumPy online."""
+"""The maps T and T* as multilayer perceptrons: torch in training, NumPy online."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ Activation: TypeAlias = Literal["tanh", "silu", "relu"]
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Affine maps between what a network is given and returns, and numbers of size one."""
+    """Affine map that standardises the inputs or outputs of a network."""
 
     mean: np.ndarray
-    """Of the inputs, shape (num_inputs,)."""
+    """Mean of the values, shape (size,)."""
     root: np.ndarray
-    """Square root of their covariance, (num_inputs, num_inputs)."""
+    """Square root of their covariance, shape (size, size)."""
 
     @staticmethod
     def of(samples: np.ndarray) -> Scaling:
-        """That which makes samples (..., size) have mean zero and unit variance each."""
+        """Return the scaling to zero mean and unit variances of samples (..., size)."""
         flat = samples.reshape(int(np.prod(samples.shape[:-1])), samples.shape[-1])
         std = flat.std(axis=0)
         return Scaling(flat.mean(axis=0), np.diag(np.where(std > 0, std, 1.0)))
 
     @staticmethod
     def white(samples: np.ndarray, noise: np.ndarray) -> Scaling:
-        """That which makes samples (..., size) with independent noise (..., size) added to them
-        have mean zero and the identity as covariance."""
+        """Return the whitening of samples (..., size) with independent noise (..., size) added."""
         flat, other = (a.reshape(-1, a.shape[-1]) for a in (samples, noise))
         spread = np.cov(flat.T) + other.T @ other / len(other)
         spread = np.atleast_2d(spread)
@@ -42,11 +41,11 @@ class Scaling:
         return Scaling(flat.mean(axis=0), np.linalg.cholesky(spread))
 
     def scaled(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., size) in numbers of size one."""
+        """Standardise values (..., size)."""
         return (values - self.mean) @ np.linalg.inv(self.root).T
 
     def beside(self, other: Scaling) -> Scaling:
-        """That of both one after the other."""
+        """Return the scaling of this scaling's values followed by the other's."""
         n, m = len(self.mean), len(other.mean)
         root = np.zeros((n + m, n + m))
         root[:n, :n], root[n:, n:] = self.root, other.root
@@ -54,19 +53,19 @@ class Scaling:
 
 
 class Mlp:
-    """A multilayer perceptron between scaled numbers.
+    """Multilayer perceptron between scaled inputs and scaled outputs.
 
-    The weights are drawn as Glorot & Bengio (2010) propose, the biases begin at zero.
+    The initial weights are those of Glorot & Bengio (2010); the initial biases are zero.
 
     Args:
-        inputs: scaling of what it is given.
-        outputs: scaling of what it returns.
+        inputs: scaling of the inputs.
+        outputs: scaling of the outputs.
         depth: number of hidden layers.
-        width: neurons in each.
-        activation: of the hidden layers.
-        generator: where the weights are drawn from.
+        width: neurons in each hidden layer.
+        activation: activation of the hidden layers.
+        generator: random generator of the weights.
         dtype: precision.
-        device: where it lives.
+        device: device of the parameters.
     """
 
     def __init__(
@@ -91,13 +90,15 @@ class Mlp:
                 self.parameters.append(values.to(device, dtype).requires_grad_())
 
     def __call__(self, a: Tensor) -> Tensor:
-        """Scaled outputs (..., num_outputs) of scaled inputs (..., num_inputs)."""
+        """Return the scaled outputs (..., num_outputs) at scaled inputs (..., num_inputs)."""
         layers = list(zip(self.parameters[::2], self.parameters[1::2], strict=True))
         return perceptron(layers, self.activation, a)
 
     def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs and their directional derivative along da: a Jacobian-vector product that keeps
-        its gradient with respect to the weights."""
+        """Return the outputs and their directional derivative along da.
+
+        The Jacobian-vector product is differentiable with respect to the weights.
+        """
         act = ACTIVATIONS[self.activation]
         *hidden, (W, b) = zip(self.parameters[::2], self.parameters[1::2], strict=True)
         for weight, bias in hidden:
@@ -106,11 +107,12 @@ class Mlp:
         return linear(a, W, b), da @ W.T
 
     def jacobian(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs (batch, num_outputs) and their derivatives with respect to all weights and
-        biases, (batch, num_outputs, num_parameters), in the order of ``parameters``."""
+        """Return the outputs (batch, num_outputs) and their Jacobian by all weights and biases,
+        (batch, num_outputs, num_parameters), in the order of ``parameters``."""
         act = ACTIVATIONS[self.activation]
         weights = [p.detach() for p in self.parameters]
         *hidden, (W, b) = zip(weights[::2], weights[1::2], strict=True)
+        # Forward pass, with the activations and their slopes.
         seen, slopes = [a], []
         for weight, bias in hidden:
             pre = linear(seen[-1], weight, bias)
@@ -118,6 +120,7 @@ class Mlp:
             slopes.append(self._slope(pre)[:, None])
         out = linear(seen[-1], W, b)
         count, size = out.shape
+        # Backpropagation of all outputs at once, from the last layer to the first.
         back = torch.eye(size, dtype=a.dtype, device=a.device).expand(count, size, size)
         blocks: list[Tensor] = []
         for layer in reversed(range(len(hidden) + 1)):
@@ -130,7 +133,7 @@ class Mlp:
     def tangent_jacobian(
         self, a: Tensor, da: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """What `jacobian` returns, and its directional derivative along da."""
+        """Return the result of `jacobian`, and its directional derivative along da."""
         both: Any = torch.func.jvp(self.jacobian, (a,), (da,))
         return both
 
@@ -143,7 +146,8 @@ class Mlp:
         return (pre > 0).to(pre.dtype)
 
     def layers(self) -> Layers:
-        """A copy of the weights for `perceptron`, the scalings taken into the outer layers."""
+        """Return a copy of the weights for `perceptron`, with the scalings merged into the first
+        and last layer."""
         arrays = [p.detach().double().cpu().numpy().copy() for p in self.parameters]
         W, b = arrays[0], arrays[1]
         W = np.linalg.solve(self.inputs.root.T, W.T).T

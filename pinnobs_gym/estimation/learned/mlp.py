@@ -1,4 +1,4 @@
-"""The network of PINN-Obs: from a time to an estimate and an observer gain."""
+"""The network of PINN-Obs, which maps a time to an estimate and an observer gain."""
 
 from __future__ import annotations
 
@@ -30,21 +30,22 @@ class Architecture:
     depth: int = 9
     """Number of hidden layers."""
     width: int = 20
-    """Neurons in each."""
+    """Neurons in each hidden layer."""
     activation: Activation = "tanh"
-    """Of the hidden layers; the last layer is linear."""
+    """Activation of the hidden layers; the last layer is linear."""
     dtype: Precision = "float32"
     """Precision of the weights and of everything computed with them."""
     span: tuple[float, float] | None = None
-    """First and last time in s, which the network sees as −1 and 1; None feeds it the time in s as
-    it is, as in the paper."""
+    """First and last time in s, which are scaled to −1 and 1; if None, the input is the time in s,
+    as in the paper."""
     decays: tuple[float, ...] = ()
-    """Time constants τ in s of further inputs exp(−(t − t₀)/τ), t₀ the first time of the span."""
+    """Time constants τ in s of additional inputs exp(−(t − t₀)/τ), with t₀ the first time of the
+    span."""
     frequencies: tuple[float, ...] = ()
-    """Angular frequencies ω in rad/s of further inputs cos ω(t − t₀) and sin ω(t − t₀)."""
+    """Angular frequencies ω in rad/s of additional inputs cos ω(t − t₀) and sin ω(t − t₀)."""
     scale: tuple[float, ...] | None = None
-    """What the network's outputs are multiplied by, shape (nx + nx·ny,): x̂ in state units, then L
-    row by row; None for one."""
+    """Factors of the network's outputs, shape (nx + nx·ny,): x̂ in state units, then L row by row;
+    None for 1."""
 
     def __post_init__(self) -> None:
         if self.span is None and (self.decays or self.frequencies):
@@ -62,19 +63,19 @@ class Architecture:
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """``dtype`` as torch names it."""
+        """The torch dtype of ``dtype``."""
         return _DTYPES[self.dtype]
 
     @property
     def shapes(self) -> list[tuple[int, int]]:
-        """Neurons and inputs of each layer, the last one included."""
+        """Numbers of neurons and of inputs of each layer, including the last."""
         inputs = 1 + len(self.decays) + 2 * len(self.frequencies)
         sizes = [inputs] + [self.width] * self.depth + [self.nx * (1 + self.ny)]
         return [(fan_out, fan_in) for fan_in, fan_out in pairwise(sizes)]
 
     def features(self, t: Array) -> tuple[Array, Array]:
-        """What the first layer sees at times t (...) in s, and its derivative per s, both
-        (..., num_features), in t's own library."""
+        """Return the inputs of the first layer at times t (...) in s, and their time derivatives,
+        (..., num_features) each, as arrays of t's library."""
         xp = array_namespace(t)
         if self.span is None:
             return t[..., None], xp.ones_like(t)[..., None]
@@ -94,11 +95,10 @@ class Architecture:
 def evaluate(
     architecture: Architecture, layers: Layers, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimates x̂ (..., nx) in state units and gains L (..., nx, ny) at times t (...) in s (Farkane
-    et al., PINN-Obs, "Proposed Adaptive PINN-Based Model"), computed in float64.
+    """Return x̂ (..., nx) in state units and L (..., nx, ny) at times t (...) in s, in float64
+    (Farkane et al., PINN-Obs, "Proposed Adaptive PINN-Based Model").
 
-    The network's input is the time in s as it is, as in the paper, unless the architecture says
-    otherwise.
+    As in the paper, the network's input is the time in s, unless the architecture has a ``span``.
     """
     features, _ = architecture.features(np.asarray(t, dtype=float))
     out = perceptron(layers, architecture.activation, features)

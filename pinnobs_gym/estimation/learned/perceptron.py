@@ -1,5 +1,4 @@
-"""The multilayer perceptron that learned estimators and their trainers evaluate, in NumPy and
-torch."""
+"""The multilayer perceptron of learned estimators and their trainers, in NumPy and torch."""
 
 from __future__ import annotations
 
@@ -42,15 +41,15 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "silu": _silu,
     "relu": _relu,
 }
-"""What neurons make of their input, by name."""
+"""Activation functions by name."""
 
 
 def perceptron(layers: Sequence[tuple[Array, Array]], activation: str, a: Array) -> Array:
-    """The outputs (..., num_outputs) of inputs a (..., num_inputs).
+    """Return the outputs (..., num_outputs) at inputs a (..., num_inputs).
 
     Args:
         layers: weights (fan_out, fan_in) and biases (fan_out,) of each layer, of the library of a.
-        activation: of all layers but the last, which is linear.
+        activation: activation of all layers but the last, which is linear.
         a: inputs.
     """
     *hidden, last = layers
@@ -60,10 +59,10 @@ def perceptron(layers: Sequence[tuple[Array, Array]], activation: str, a: Array)
 
 
 def linear(a: Array, W: Array, b: Array) -> Array:
-    """Waᵀ + b for each row of a (..., fan_in): shape (..., fan_out)."""
+    """Return Wa + b for each row of a (..., fan_in), shape (..., fan_out)."""
     if isinstance(a, np.ndarray):
         out = a @ W.T
-        out += b
+        out += b  # in place, without another array
         return out
     import torch
 

@@ -1,4 +1,4 @@
-"""What trainers make and estimators load: weights, with the facts of their training."""
+"""Trained objects, which trainers return and estimators load: weights and training metadata."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from pinnobs_gym.estimation.learned.trained_file import (
 from pinnobs_gym.simulation.system import System
 
 Ending: TypeAlias = Literal["running", "finished", "budget", "interrupted"]
-"""Why a training ended: by itself, its budget of CPU seconds, or Ctrl-C."""
+"""How a training ended: by itself, by its budget of CPU seconds, or by Ctrl-C; or not yet."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trained(ABC):
-    """What all trained objects have in common: how their training went, and their file.
+    """Base class of trained objects: training metadata, saving and loading.
 
-    A subclass adds fields of arrays, plain values, tuples of these, or further dataclasses of them;
-    all are saved.
+    A subclass adds fields, all of which are saved: arrays, plain values, tuples of these, or
+    dataclasses of them.
     """
 
     trainer: str
@@ -35,37 +35,37 @@ class Trained(ABC):
     system: str
     """Class name of the system."""
     parameters: Mapping[str, Any]
-    """The system's physical parameters, as JSON holds them."""
+    """The system's physical parameters, as JSON values."""
     noise_std: tuple[float, ...]
-    """Standard deviations of the output noise that training was given, in output units."""
+    """Standard deviations of the output noise given to the trainer, in output units."""
     config: Mapping[str, Any]
-    """The trainer's settings, as JSON holds them."""
+    """The trainer's settings, as JSON values."""
     seed: int
-    """What the weights were drawn from; not the config's if training had to begin again."""
+    """Seed of the initial weights; it differs from the config's if training was restarted."""
     loss: float
     """The least loss; see the trainer."""
     iterations: int
-    """Iterations made, of which the best is one."""
+    """Number of iterations of the training."""
     seconds: float
-    """CPU time in s that they took."""
+    """CPU time of the training in s."""
     ending: Ending
-    """Why the training ended."""
+    """How the training ended."""
 
     @abstractmethod
     def check_fits(self, path: str | Path, system: System) -> None:
-        """Check that the weights belong to a system of this size.
+        """Check that the sizes of the weights fit a system.
 
         Raises:
-            ValueError: in one line, naming the file, what was found and expected.
+            ValueError: in one line, with the file, the value found and the value expected.
         """
 
     @property
     def notes(self) -> Mapping[str, Any]:
-        """What else rows say of the training."""
+        """Further training metadata for rows of results."""
         return {}
 
     def save(self, path: str | Path) -> None:
-        """Write it to one file of tensors and plain values. The file holds no code.
+        """Write the object to a file of tensors and plain values, without code.
 
         Raises:
             ValueError: in one line, if the file cannot be written.
@@ -74,16 +74,16 @@ class Trained(ABC):
 
     @classmethod
     def load(cls, path: str | Path, system: System, trainer: str | None = None) -> Self:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Args:
-            path: of the file.
-            system: that it was trained for.
-            trainer: that it was trained by; any if None.
+            path: path of the file.
+            system: the system it has to be trained for.
+            trainer: name of the trainer it has to come from; any if None.
 
         Raises:
-            ValueError: in one line, if there is no such file, if it is something else or damaged,
-                or if it belongs to another system, other parameters, sizes or another trainer.
+            ValueError: in one line, if the file does not exist, is damaged or of another kind, or
+                belongs to another system, other parameters or sizes, or another trainer.
         """
         saved = with_arrays(read(path))
         try:
@@ -102,32 +102,33 @@ class Trained(ABC):
 
 
 def content_of(value: Any) -> Any:
-    """A trained object, or any dataclass, as a dict of its fields, those within as well; anything
-    else as it is."""
+    """Convert a dataclass to a dict of its fields, recursively; return other values unchanged."""
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: content_of(getattr(value, f.name)) for f in fields(value)}
     return value
 
 
 def from_content(kind: type, content: Mapping[str, Any]) -> Any:
-    """The object of a dataclass whose `content_of` this is."""
+    """Create an object of a dataclass from its `content_of`."""
     hints = get_type_hints(kind)
-    found = {}
+    values = {}
     for field in fields(kind):
         value = content[field.name]
-        within = (hints[field.name], *get_args(hints[field.name]))  # of an optional one as well
+        within = (hints[field.name], *get_args(hints[field.name]))  # also within an optional type
         kinds = [hint for hint in within if isinstance(hint, type) and is_dataclass(hint)]
         if kinds and value is not None:
             value = from_content(kinds[0], value)
         elif isinstance(value, list) and any(get_origin(hint) is tuple for hint in within):
             value = tuple(value)  # JSON has lists only
-        found[field.name] = value
-    return kind(**found)
+        values[field.name] = value
+    return kind(**values)
 
 
 class LearnedEstimator(ABC):
-    """What estimators share that are trained beforehand: they hold what was trained, and load and
-    save it. Their field ``trained`` is declared as the `Trained` that it holds."""
+    """Base class of learned estimators, which hold, load and save a trained object.
+
+    The annotation of the field ``trained`` names its class, a subclass of `Trained`.
+    """
 
     needs_training: ClassVar[str | None]
     knows: ClassVar[tuple[str, ...]]
@@ -135,8 +136,10 @@ class LearnedEstimator(ABC):
 
     @classmethod
     def load(cls, path: str | Path, system: System) -> Self:
-        """The estimator with what is in a file, told the noise of its training if it makes use of
-        that; see `Trained.load`."""
+        """Load the estimator from a file; see `Trained.load`.
+
+        If it uses the output noise, that given to its trainer is taken.
+        """
         kind: type[Trained] = get_type_hints(cls)["trained"]
         trained = kind.load(path, system, cls.needs_training)
         made: Any = cls
@@ -144,11 +147,11 @@ class LearnedEstimator(ABC):
         return made(system, noise_std, trained=trained)
 
     def save(self, path: str | Path) -> None:
-        """Write what was trained to a file; see `Trained.save`."""
+        """Write the trained object to a file; see `Trained.save`."""
         self.trained.save(path)
 
     @property
     def training(self) -> dict[str, Any]:
-        """How it was trained, for rows."""
+        """Training metadata for rows of results."""
         names = ("trainer", "seed", "loss", "iterations", "seconds", "ending", "config")
         return {**{name: getattr(self.trained, name) for name in names}, **self.trained.notes}

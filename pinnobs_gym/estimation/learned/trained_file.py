@@ -1,6 +1,6 @@
-"""Files of trained weights: written whole or not at all, read without running code, and checked.
+"""Files of trained weights: written atomically, read without running code, and checked.
 
-Torch is imported when a file is read or written: what merely names a trained object needs none.
+Torch is imported only when a file is read or written, so that importing this module is cheap.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pinnobs_gym.simulation.system import System
 
 
 def identity(system: System) -> dict[str, Any]:
-    """What a file of weights must agree with: the system's class name, parameters and sizes."""
+    """Return the facts by which files identify a system: class name, parameters and sizes."""
     name = type(system).__name__
     return {
         "system": name,
@@ -31,7 +31,7 @@ def identity(system: System) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON holds it: lists for tuples and arrays."""
+    """Convert a value to JSON values; tuples and arrays become lists."""
     return json.loads(json.dumps(value, default=_as_json))
 
 
@@ -40,7 +40,7 @@ def _as_json(value: Any) -> Any:
 
 
 def with_tensors(value: Any) -> Any:
-    """The same nested value with tensors for NumPy arrays, as `write` takes it."""
+    """Replace NumPy arrays by tensors in a nested value, for `write`."""
     import torch
 
     if isinstance(value, np.ndarray):
@@ -55,7 +55,7 @@ def with_tensors(value: Any) -> Any:
 
 
 def with_arrays(value: Any) -> Any:
-    """The same nested value with NumPy arrays for tensors."""
+    """Replace tensors by NumPy arrays in a nested value."""
     import torch
 
     if isinstance(value, torch.Tensor):
@@ -68,22 +68,22 @@ def with_arrays(value: Any) -> Any:
 
 
 def check_same(path: str | Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Compare what a file holds with what was expected of it, entry by entry.
+    """Check that a file's entries have the expected values.
 
     Raises:
-        ValueError: in one line, naming the first entry that differs, what was found and expected.
+        ValueError: in one line, with the first entry that differs, its value and the expected one.
     """
     for name, value in expected.items():
         other = found.get(name)
         if isinstance(value, Mapping) and isinstance(other, Mapping):
             names = {**value, **other}
             check_same(path, {n: other.get(n) for n in names}, {n: value.get(n) for n in names})
-        elif other != value and json.dumps(other) != json.dumps(value):  # there NaN equals itself
+        elif other != value and json.dumps(other) != json.dumps(value):  # in JSON NaN equals itself
             raise ValueError(f"{path} was trained with {name}={other!r}; expected {value!r}")
 
 
 def write(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write tensors and plain values to a file: all of it or, if interrupted, nothing.
+    """Write tensors and plain values to a file atomically.
 
     Raises:
         ValueError: in one line, if the file cannot be written.
@@ -106,10 +106,10 @@ def write(path: str | Path, content: Mapping[str, Any]) -> None:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Read what `write` wrote, without ever running code from the file.
+    """Read a file that `write` wrote, without running code from it.
 
     Raises:
-        ValueError: in one line, if there is no such file or it is something else or damaged.
+        ValueError: in one line, if the file does not exist, is damaged or of another kind.
     """
     import torch
 
