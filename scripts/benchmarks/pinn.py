@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from plain_network import Network
 
 from benchmarks import Figure, at_most, cpu_seconds
-from benchmarks.plain_network import Network
 from pinnobs_gym.envs.episodes import EpisodeSource, Stream
 from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, TrainedNetwork

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from array_api_compat import array_namespace
-from benchmarks.plain_network import Network
+from plain_network import Network
 
 from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimation.learned.trained_file import identity

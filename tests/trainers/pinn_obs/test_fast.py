@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.plain_network import Network
+from plain_network import Network
 from small_trainings import (
     Failing,
     Interrupting,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.plain_network import Network
+from plain_network import Network
 from small_trainings import train_pinn_obs
 
 from pinnobs_gym import Setup, System

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.plain_network import Network
+from plain_network import Network
 from scipy.integrate import solve_ivp
 from small_trainings import (
     Failing,
