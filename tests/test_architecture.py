@@ -10,6 +10,7 @@ import pytest
 from waiting import PATIENCE
 
 import pinnobs_gym
+from pinnobs_gym.estimators import ESTIMATORS
 
 ROOT = Path(pinnobs_gym.__file__).parent
 
@@ -53,17 +54,22 @@ def test_importing_the_package_imports_no_system() -> None:
     assert not loaded("import pinnobs_gym", "pinnobs_gym.simulation.system", "numpy.polynomial")
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf", "luenberger", "mhe"])
+@pytest.mark.parametrize("name", ESTIMATORS.sources)
 def test_an_estimator_is_resolved_alone(name: str) -> None:
     """Neither the others nor what they need are imported."""
     code = f"from pinnobs_gym.estimators import ESTIMATORS\nESTIMATORS.resolve({name!r})"
-    others = {f"pinnobs_gym.estimators.{path.stem}" for path in (ROOT / "estimators").glob("*.py")}
-    assert not loaded(code, *HEAVY, *others - {f"pinnobs_gym.estimators.{name}"})
+    source = ESTIMATORS.sources[name]
+    others = {each.module for each in ESTIMATORS.sources.values()} - {source.module}
+    learns = {"needs_training", "trains_on_record"} & set(source.constants)
+    assert others
+    assert not loaded(code, *(() if learns else HEAVY), *others)
 
 
-@pytest.mark.parametrize("name", ["standings_table", "ranks_table", "board"])
-def test_tables_load_no_statistics_before_they_are_computed(name: str) -> None:
-    assert not loaded(f"import pinnobs_gym.leaderboard.{name}", *HEAVY)
+def test_the_leaderboard_loads_no_statistics_before_they_are_computed() -> None:
+    paths = [path.relative_to(ROOT.parent) for path in (ROOT / "leaderboard").rglob("*.py")]
+    names = [".".join(path.with_suffix("").parts) for path in paths]
+    assert {"pinnobs_gym.leaderboard.ranks", "pinnobs_gym.leaderboard.site.page"} < set(names)
+    assert not loaded("\n".join(f"import {name}" for name in names), *HEAVY)
 
 
 def test_evaluating_a_filter_loads_neither_torch_nor_statistics(tmp_path) -> None:

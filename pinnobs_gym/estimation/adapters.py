@@ -36,6 +36,8 @@ class PerEpisode(Estimator):
     title: str = field(default="per_episode", kw_only=True)
     """Name in tables."""
 
+    exempt_from = {"model_alone": "what it adapts may know neither the model nor the prior"}
+
     @property
     def label(self) -> str:
         return self.title

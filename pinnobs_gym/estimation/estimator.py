@@ -91,6 +91,9 @@ class BaseEstimator(ABC):
     """Which of its settings are searched by ``pinnobs tune``, and where."""
     recipe: ClassVar[Mapping[str, Any]] = {}
     """Choices in that trainer's Config that are made for it unless others are."""
+    exempt_from: ClassVar[Mapping[str, str]] = {}
+    """Checks of `pinnobs_gym.estimation.checks.check_estimator` that it is not held to, by name,
+    and why not, in a line each."""
     equations: ClassVar[str] = ""
     """Its equations in LaTeX for its page, one below the other as in an ``aligned`` environment;
     φ is the model's flow from the sample before, and a raised minus marks what precedes y_k."""
@@ -188,6 +191,14 @@ class OfflineEstimator(BaseEstimator):
     alone."""
 
     track = "offline"
+    exempt_from: ClassVar[Mapping[str, str]] = {
+        "causality": "it sees the whole record first",
+        "run_equals_updates": "it has no update",
+        "missing_samples": "it may need every sample",
+        "irregular_times": "it may need equal steps",
+        "diverging_row": "it may refuse a record that is not finite",
+        "model_alone": "it may need outputs",
+    }
 
 
 def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:

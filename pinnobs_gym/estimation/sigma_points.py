@@ -41,6 +41,7 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     `kalman.JITTER` of each of its variances is added, and reported in the state's memory.
     """
 
+    exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
     equations = r"""
 \chi_i^- &= \varphi(\hat x_{k-1} + \sqrt{P_{k-1}}\, \xi_i), \qquad
 \hat x_k^- = \sum_i w_i \chi_i^- \\

@@ -35,6 +35,9 @@ class BatchLeastSquares(OfflineEstimator):
     """Samples of the first stretch."""
 
     name = "batch_least_squares"
+    exempt_from = {
+        name: OfflineEstimator.exempt_from[name] for name in ("causality", "run_equals_updates")
+    }
     equations = r"""
 \hat x_{0|n} &= \arg\min_x \; (x - \hat x_0)^\top P_0^{-1} (x - \hat x_0)
 + \sum_{k=0}^{n} \bigl\| y_k - h(t_k, \varphi_k(x), u_k) \bigr\|^2_{R^{-1}} \\

@@ -54,6 +54,7 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """Of the random numbers."""
 
     name = "enkf"
+    exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
     equations = r"""
 \chi_i &= \varphi(x_{k-1}^i), \qquad \bar\chi = \tfrac1N \sum_i \chi_i \\
 x_k^{i-} &= \bar\chi + \lambda\, (\chi_i - \bar\chi) + w_i, \qquad w_i \sim \mathcal N(0, Q) \\

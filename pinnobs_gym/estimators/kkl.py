@@ -113,6 +113,7 @@ class KKL(LearnedEstimator, Estimator):
     """The trained observer."""
 
     knows = ("model", "noise", "simulated true states")
+    exempt_from = {"model_alone": "its estimate is a function of z, which knows no prior"}
     equations = r"""
 \dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
 \hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial t} + \tfrac{\partial T}{\partial x}\,

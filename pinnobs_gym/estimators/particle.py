@@ -61,6 +61,7 @@ class ParticleFilter(RecursiveEstimator):
     """Of the random numbers."""
 
     name = "particle"
+    exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
     equations = r"""
 x_i &:= \varphi(x_i) \\
 w_i &:\propto w_i \exp\bigl( -\tfrac12 e_i^\top R^{-1} e_i \bigr), \qquad

@@ -197,6 +197,13 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
 (\hat x(t), L(t)) &= \text{network}(t), \text{ of least loss on this record; see pinn\_obs}
 """
     knows = ("model", "prior")
+    exempt_from = {
+        **OfflineEstimator.exempt_from,
+        **dict.fromkeys(
+            ("shapes", "rows_independent", "purity", "save_load"),
+            "it takes no record but that of its training",
+        ),
+    }
     needs_training = "pinn_obs"
 
     def run(self, record: Record) -> Estimates:
@@ -240,6 +247,11 @@ class PinnObs(OfflineEstimator):
 & + w_{\mathrm{guide}} \operatorname{mean} \| \hat x - x^{\mathrm{smoother}} \|^2
 + w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2
 """
+    exempt_from = {
+        name: reason
+        for name, reason in OfflineEstimator.exempt_from.items()
+        if name != "irregular_times"
+    }
     trains_on_record = "pinn_obs"
 
     @property

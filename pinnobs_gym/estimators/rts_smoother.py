@@ -26,6 +26,9 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
     """
 
     name = "rts_smoother"
+    exempt_from = {
+        name: OfflineEstimator.exempt_from[name] for name in ("causality", "run_equals_updates")
+    }
     equations = r"""
 C_k &= P_k F_k^\top (P_{k+1}^-)^{-1} \\
 \hat x_k^s &= \hat x_k + C_k (\hat x_{k+1}^s - \hat x_{k+1}^-) \\

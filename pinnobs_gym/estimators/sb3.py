@@ -132,6 +132,7 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 """
     needs_training = "rl"
     knows = ("model", "prior", "noise", "true states in training")
+    exempt_from = {"model_alone": "an agent's action may move the estimate at any time"}
 
     @cached_property
     def _form(self) -> Form:

@@ -80,7 +80,7 @@ class Comparison:
 
     def protocol(self) -> list[str]:
         """Return the paragraphs that describe how the figures are obtained."""
-        source = _source()
+        source = compared()
         setup = source.setup
         return [
             f"Ours: ReverseDuffing without noise, {self.records} initial states of the benchmark's "
@@ -101,13 +101,14 @@ class Comparison:
         ]
 
 
-def _source() -> EpisodeSource:
+def compared() -> EpisodeSource:
+    """Where the records that are compared come from."""
     return EpisodeSource("ReverseDuffing", noise_std=0.0)
 
 
 def played(records: int) -> tuple[Record, np.ndarray]:
     """Return the records, and their true states (records, num_samples, nx)."""
-    source = _source()
+    source = compared()
     streams = [Stream(np.random.SeedSequence(seed)) for seed in range(records)]
     episodes = source.play(source.draw(streams))
     record = source.record(episodes)
@@ -118,7 +119,7 @@ def run(comparison: Comparison, results: Path, known: set[str]) -> Iterator[str]
     """Train and score the missing cases, store each row at once, and yield progress messages."""
     torch.set_num_threads(1)
     record, x = played(comparison.records)
-    system = _source().system
+    system = compared().system
     for method, trainer in METHODS.items():
         config = comparison.config(method)
         keys = [comparison.key(method, i) for i in range(comparison.records)]

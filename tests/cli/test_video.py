@@ -3,18 +3,16 @@ import subprocess
 import sys
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from linear import Linear
 
-from pinnobs_gym.cli import main, video
+from pinnobs_gym.cli import main
 from pinnobs_gym.cli.video import Pace, write_video
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring import rows
-
-ffmpeg = pytest.importorskip("imageio_ffmpeg")
-pytest.importorskip("moviepy")
 
 CLOCK = """
 from pinnobs_gym import Estimator, State
@@ -30,7 +28,16 @@ class Clock(Estimator):
 
 def read(path, size):
     """The frames per second of a video, and its frames (number, height, width, 3)."""
-    command = [ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-i",
+        str(path),
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
     run = subprocess.run(command, capture_output=True, check=True)
     fps = re.search(rb"([\d.]+) fps", run.stderr)
     found = re.search(rb" (\d+)x(\d+)[ ,]", run.stderr)
@@ -141,7 +148,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(folder, capsys, monke
     def full(frames, place, **options):
         raise OSError("[Errno 28] No space left on device\n\nMoviePy error: FFMPEG ...")
 
-    monkeypatch.setattr(video, "_recorder", lambda: full)
+    monkeypatch.setattr("gymnasium.utils.save_video.save_video", full)
     (folder / "out.mp4").write_text("of an earlier run")
     assert evaluate("--video", "out.mp4", "--condition", "dt5") == 2
     told = capsys.readouterr().err

@@ -16,6 +16,7 @@ from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.scoring.rows import JOB, KEY
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems import SYSTEMS
@@ -50,7 +51,7 @@ def test_everything_that_is_found_has_a_page(generated):
         assert f"| `{name}` " in texts["conditions.md"]
     for name in (*SCORES, *OPTIONAL_SCORES, "diverged"):
         assert re.search(rf"``?{name}``?", texts["metrics.md"]), name
-    for name in ("env_id", "config_hash", "us_per_step"):
+    for name in (*KEY, *JOB):
         assert f"``{name}``" in texts["row_schema.txt"]
 
 
@@ -162,7 +163,7 @@ def test_the_site_builds_without_a_warning_and_shows_what_it_ran(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "docs", "site"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
-    site = tmp_path / "site"
+    site, seen = tmp_path / "site", 0
     tutorial = (site / "tutorial.html").read_text(encoding="utf-8")
     assert tutorial.count('src="_images/') == 2  # the pictures of its episodes
     assert "mine is better than the EKF in" in tutorial
@@ -172,3 +173,5 @@ def test_the_site_builds_without_a_warning_and_shows_what_it_ran(tmp_path):
             r'(?:href|src)="(?!https?:|#|data:|mailto:)([^"#?]+)', path.read_text()
         ):
             assert (path.parent / link).exists(), f"{path.relative_to(site)}: {link}"
+            seen += 1
+    assert seen > 1000

@@ -13,14 +13,14 @@ from gymnasium.utils.env_checker import check_env
 from linear import Linear
 from made_envs import ALLOWED_WARNINGS, DUFFING, IDS, MOTOR, make, make_vec, short
 
-from pinnobs_gym.envs.actions import FORMS, OUTSIDE, Gain, form_of, typical
+from pinnobs_gym.envs.actions import FORMS, OUTSIDE, Gain, PredictionForm, form_of, typical
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.systems import SYSTEMS
 
-OTHERS = ("normalized", "gain", "correction")
+OTHERS = [name for name in FORMS if name != "estimate"]  # which test_env has
 
 
 @pytest.mark.parametrize("name", IDS.values())
@@ -44,11 +44,13 @@ def test_conforms(name: str, mode: str, checker: str) -> None:
 def test_spaces(name: str) -> None:
     system = SYSTEMS.resolve(name)()
     nx, ny, nu = system.nx, system.ny, system.nu
-    for mode, actions, features in (
-        ("normalized", nx, ny + nu + 1),
-        ("gain", nx * ny, ny + nx + nu + 1),
-        ("correction", nx, ny + nx + nu + 1),
-    ):
+    sizes = {
+        "normalized": (nx, ny + nu + 1),
+        "gain": (nx * ny, ny + nx + nu + 1),
+        "correction": (nx, ny + nx + nu + 1),
+    }
+    assert set(sizes) == set(OTHERS)
+    for mode, (actions, features) in sizes.items():
         env = make(IDS[name], action_mode=mode)
         assert env.action_space == gymnasium.spaces.Box(-1, 1, (actions,), np.float32)
         assert env.observation_space.shape == (features,)
@@ -217,7 +219,7 @@ def test_improvement() -> None:
 @pytest.mark.parametrize("name", ["Satellite", "InductionMotor"])
 def test_row_of_vector_env_is_the_single_env(name: str, mode: str) -> None:
     """Over three episodes whose rows begin together."""
-    learns = mode in ("gain", "correction")
+    learns = issubclass(FORMS[mode], PredictionForm)
     arguments: dict[str, Any] = {"reward": "improvement"} if learns else {"stack_outputs": 3}
     arguments |= {"action_mode": mode}
     envs = make_vec(IDS[name], 2, **short(name), **arguments)

@@ -39,19 +39,21 @@ def test_its_episodes_are_those_of_the_env_and_its_scores_the_rewards(name):
     for i, seed in enumerate(seeds):
         env = make(IDS[name], condition="dropout30", **SHORT)
         observation, info = env.reset(seed=seed)
-        total = 0.0
+        total, squares = 0.0, []
         for k, xhat in enumerate(played.estimates.xhat[i]):
             # In a batch of another size products round differently.
             np.testing.assert_allclose(info["state"], played.truth[i, k], rtol=1e-12, atol=1e-12)
             y = played.record.y[i, k]
             np.testing.assert_allclose(observation[: len(y)], y, rtol=1e-6, atol=1e-7)
+            errors = ((xhat - info["state"]) / played.system.scale) ** 2
             observation, reward, _, over, info = env.step(xhat)
             total += reward
+            squares.append(errors)
         assert over
-        everything = played.system.observable(played.truth[i]).all()
-        if everything:  # errors that no output can tell of are not scored
-            mean_square = -total / played.record.num_samples
-            np.testing.assert_allclose(played.scores.nrmse[i], np.sqrt(mean_square), rtol=1e-9)
+        assert total == pytest.approx(-np.mean(squares, axis=1).sum(), rel=1e-9)
+        scored = played.system.observable(played.truth[i])  # errors no output tells of are not
+        mean_square = np.mean(np.array(squares)[scored])
+        np.testing.assert_allclose(played.scores.nrmse[i], np.sqrt(mean_square), rtol=1e-9)
 
 
 def test_its_record_is_that_of_the_vectorised_env():

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from array_api_compat import array_namespace
+from kinds import untrained
 
 from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator
@@ -26,15 +27,6 @@ ON = ("ReverseDuffing", "HarmonicOscillator", "InductionMotor")
 """Two and three states, and five with inputs and two outputs."""
 
 
-def untrained() -> dict[str, type[Estimator]]:
-    """The estimators that need no trainer, neither beforehand nor on every record."""
-    return {
-        name: cls
-        for name, cls in ESTIMATORS.classes().items()
-        if getattr(cls, "needs_training", None) is None and cls.trains_on_record is None
-    }
-
-
 @pytest.mark.parametrize("check", SYSTEM_CHECKS)
 @pytest.mark.parametrize("system", SYSTEMS.classes())
 def test_system_conforms(system: str, check: str) -> None:
@@ -47,7 +39,11 @@ def test_system_conforms(system: str, check: str) -> None:
 def test_estimator_conforms(estimator: str, system: str, check: str) -> None:
     plant = SYSTEMS.resolve(system)
     made = ESTIMATORS.resolve(estimator).for_setup(plant(), plant.setups["benchmark"])
-    ESTIMATOR_CHECKS[check](made)
+    if check in made.exempt_from:  # which says why, and has to be so
+        with pytest.raises(CheckFailed):
+            ESTIMATOR_CHECKS[check](made)
+    else:
+        ESTIMATOR_CHECKS[check](made)
 
 
 @dataclass(frozen=True)
@@ -408,6 +404,41 @@ class Forgetful(EKF):
         return cls(system)
 
 
+@dataclass(frozen=True)
+class LosesCovariance(EKF):
+    def run(self, record: Record) -> Estimates:
+        found = super().run(record)
+        return replace(found, P=found.P + 0.0 * record.y.sum(axis=-1)[..., None, None])
+
+
+@dataclass(frozen=True)
+class Standing(OpenLoop):
+    """Stays where the prior is, whatever the model says."""
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        return State(state.xhat, t, u)
+
+
+@dataclass(frozen=True)
+class Exempt(Standing):
+    exempt_from: ClassVar = {"model_alone": "it has no model"}
+
+
+@dataclass(frozen=True)
+class ExemptFromNothing(EKF):
+    exempt_from: ClassVar = {"modell_alone": "it has no model"}
+
+
+@dataclass(frozen=True)
+class ExemptWithoutReason(EKF):
+    exempt_from: ClassVar = {"model_alone": " "}
+
+
+@dataclass(frozen=True)
+class ExemptFromSayingSo(EKF):
+    exempt_from: ClassVar = {"exemptions": "it is free"}
+
+
 class Mutable(EKF):
     pass
 
@@ -454,8 +485,8 @@ class Remembers(CopiesOutput):
 
 @pytest.mark.parametrize(
     "make",
-    [EKF, OpenLoop, Offline, lambda system: PerEpisode(system, make=CopiesOutput)],
-    ids=["ekf", "open_loop", "offline", "per_episode"],
+    [EKF, OpenLoop, Offline, Exempt, lambda system: PerEpisode(system, make=CopiesOutput)],
+    ids=["ekf", "open_loop", "offline", "exempt", "per_episode"],
 )
 def test_sound_estimator_passes(make: Callable[[System], Estimator]) -> None:
     check_estimator(make(QuickPendulum()))
@@ -467,6 +498,19 @@ def test_sound_estimator_passes(make: Callable[[System], Estimator]) -> None:
         (LooksAhead, "causality", "the estimate at sample 0 changes with outputs from sample 1 on"),
         (WholeRecordMean, "causality", "the estimate at sample 0 changes"),
         (Sticky, "missing_samples", "at sample 0 of row 0 not finite"),
+        (LosesCovariance, "missing_samples", "make the covariance at sample .* not finite"),
+        (
+            Standing,
+            "model_alone",
+            "without any output, the estimate at sample 1 and what the model",
+        ),
+        (ExemptFromNothing, "exemptions", "exempt_from names 'modell_alone'; known are immutable,"),
+        (ExemptWithoutReason, "exemptions", r"exempt_from\['model_alone'\]=' '; expected a reason"),
+        (
+            ExemptFromSayingSo,
+            "exemptions",
+            "exempt_from names 'exemptions'; known are immutable, s",
+        ),
         (Coupled, "rows_independent", "row 0 in a batch and alone differ"),
         (ResetsAll, "diverging_row", "other rows with and without outputs of 1e\\+300"),
         (Raises, "diverging_row", "FloatingPointError: diverged"),
@@ -494,6 +538,11 @@ def test_broken_estimator_fails(make: Callable[[System], Estimator], check: str,
     assert "\n" not in str(failure.value)
     with pytest.raises(CheckFailed, match=rf"(?m)^{check}: "):
         check_estimator(estimator)
+
+
+def test_a_check_by_name_knows_of_no_exemption() -> None:
+    with pytest.raises(CheckFailed, match=r"^model_alone: "):
+        ESTIMATOR_CHECKS["model_alone"](Exempt(QuickPendulum()))
 
 
 def test_checking_registers_nothing() -> None:

@@ -11,11 +11,9 @@ from pinnobs_gym.estimation.least_squares import linearised, root
 from pinnobs_gym.estimators.batch_least_squares import BatchLeastSquares
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
-from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.estimators.rts_smoother import RTSSmoother
 from pinnobs_gym.simulation.matrices import identity
 from pinnobs_gym.simulation.model import model_step
-from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.systems import SYSTEMS
 
 
@@ -154,16 +152,6 @@ def test_a_window_of_the_whole_record_ends_at_least_squares():
     np.testing.assert_allclose(own, fitted, atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", [BatchLeastSquares, RTSSmoother, MHE])
-def test_without_outputs_it_is_the_model_alone(kind):
-    source = EpisodeSource("ReverseDuffing", duration=1.0)
-    record = record_of(source, 2)
-    y = np.full(record.y.shape, np.nan)
-    empty = Record(record.t, y, record.u, record.prior)
-    expected = OpenLoop(source.system).run(empty).xhat
-    np.testing.assert_allclose(kind(source.system).run(empty).xhat, expected, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
@@ -176,11 +164,3 @@ def test_without_outputs_it_is_the_model_alone(kind):
 def test_settings_out_of_range_are_refused(kind, options, message):
     with pytest.raises(ValueError, match=message):
         kind(Linear(), **options)
-
-
-@pytest.mark.parametrize("kind", [BatchLeastSquares, RTSSmoother, MHE])
-def test_an_indefinite_prior_is_refused(kind):
-    record = linear_record(1)
-    wrong = Prior(record.prior.mean, np.diag([1.0, -1.0])[None])
-    with pytest.raises(ValueError, match="P0 of row 0 has eigenvalue -1"):
-        kind(Linear()).run(Record(record.t, record.y, record.u, wrong))

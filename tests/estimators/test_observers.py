@@ -248,14 +248,12 @@ def test_beyond_its_layer_sliding_mode_heeds_an_outlier_less():
 
 
 def test_an_lmi_finds_the_gain_of_a_linear_system():
-    pytest.importorskip("cvxpy")
     L = lmi_gain(Linear(), 1.0)
     assert np.linalg.eigvals(A - L @ H).real.max() < -0.99
 
 
 @pytest.mark.parametrize("name", ["ReverseDuffing", "HarmonicOscillator", "Satellite"])
 def test_an_lmi_without_a_solution_is_said_to_have_none(name):
-    pytest.importorskip("cvxpy")
     system = SYSTEMS.resolve(name)()
     with pytest.raises(ValueError, match=f"{name} has no constant gain and metric"):
         Luenberger(system, design="lmi").designed()

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kinds import untrained
 from linear import (
     FeedThrough,
     Linear,
@@ -33,11 +34,6 @@ from pinnobs_gym.simulation.system import System
 
 MEASURED = pytest.mark.parametrize("measured", [False, True], ids=["known", "measured"])
 STD = (0.1, 0.2)
-UNTRAINED = [
-    name
-    for name, cls in ESTIMATORS.classes().items()
-    if cls.needs_training is None and cls.trains_on_record is None
-]
 
 
 def modulated_record(measured):
@@ -142,7 +138,7 @@ def test_least_squares_are_the_normal_equations(measured):
 
 
 @MEASURED
-@pytest.mark.parametrize("name", UNTRAINED)
+@pytest.mark.parametrize("name", untrained())
 def test_a_known_part_of_the_outputs_changes_no_estimate(name, measured):
     """Every estimator, with missing outputs and with each row's own input."""
     plain = linear_record()
@@ -167,7 +163,7 @@ def test_the_jacobians_by_hand_are_those_of_automatic_differentiation():
             np.testing.assert_allclose(getattr(system, name)(t, x, u), expected, rtol=1e-14)
 
 
-@pytest.mark.parametrize("name", UNTRAINED)
+@pytest.mark.parametrize("name", untrained())
 def test_they_keep_to_the_rules(name):
     check_estimator(ESTIMATORS.resolve(name)(Modulated()))
 
@@ -175,8 +171,6 @@ def test_they_keep_to_the_rules(name):
 @pytest.mark.parametrize("design", ["poles", "lmi"])
 def test_gains_are_designed_on_the_output_then(design):
     """`Modulated` with its modulation is not `FeedThrough` with the same A."""
-    if design == "lmi":
-        pytest.importorskip("cvxpy")
     plain, modulated = (
         Luenberger(cls(), design=design, rate=1.0).designed() for cls in (FeedThrough, Modulated)
     )

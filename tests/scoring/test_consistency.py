@@ -108,18 +108,20 @@ def test_the_band_is_the_textbook_one():
     assert chi2.cdf(high * 100, 100) - chi2.cdf(low * 100, 100) == pytest.approx(0.95)
 
 
-@pytest.mark.parametrize("kind", [MHE, ParticleFilter])
-def test_covariances_of_innovations_are_the_kalman_filters(gaussian, kind):
+@pytest.mark.parametrize(
+    ("kind", "options", "tolerance"),
+    [
+        (MHE, {"process_noise": 0.0, "window": 4}, {"rtol": 1e-6, "atol": 1e-9}),
+        (ParticleFilter, {"particles": 20_000}, {"rtol": 0.15, "atol": 1e-3}),
+    ],
+)
+def test_covariances_of_innovations_are_the_kalman_filters(gaussian, kind, options, tolerance):
     """Without process noise, which neither has within its window or at all."""
     record = gaussian[1].rows(slice(0, 5))
     record = replace(record, t=record.t[:8], y=record.y[:, :8], u=record.u[:, :8])
     expected = EKF(Linear(), NOISE, process_noise=0.0).run(record).S
-    if kind is MHE:
-        found = MHE(Linear(), NOISE, process_noise=0.0, window=4).run(record).S
-        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
-    else:
-        found = ParticleFilter(Linear(), NOISE, particles=20_000).run(record).S
-        np.testing.assert_allclose(found, expected, rtol=0.15, atol=1e-3)
+    found = kind(Linear(), NOISE, **options).run(record).S
+    np.testing.assert_allclose(found, expected, **tolerance)
 
 
 def test_rows_have_them_where_they_apply():

@@ -134,17 +134,25 @@ class WideModulated(Modulated):
     setups = WideLinear.setups
 
 
-@pytest.mark.parametrize("cls", [WideLinear, WideModulated])
-def test_on_a_linear_system_exact_bayes_is_least_squares(cls):
+def plain(record):
+    """C, and the outputs, of `WideLinear`."""
+    return np.repeat(H[None], record.num_samples, axis=0), record.y
+
+
+def demodulated(record):
+    """C, and the outputs less what is known of them, of `WideModulated`."""
+    sine = 0.5 * np.stack([np.sin(3 * record.t), 0 * record.t], axis=-1)
+    C = jacobians(WideModulated(), record.t, record.u[0])
+    return C, record.y - record.u * (0.7, -1.1) - sine
+
+
+@pytest.mark.parametrize(("cls", "outputs"), [(WideLinear, plain), (WideModulated, demodulated)])
+def test_on_a_linear_system_exact_bayes_is_least_squares(cls, outputs):
     """With a uniform prior much wider than what one output leaves open."""
     record = record_of(EpisodeSource(cls), 3)
     setup: Setup = cls.setups["benchmark"]
     posterior = exact_bayes(cls(), setup, record, np.full(2, 0.01), draws=4000)
-    C, y = np.repeat(H[None], record.num_samples, axis=0), record.y
-    if cls is WideModulated:
-        C = jacobians(cls(), record.t, record.u[0])
-        sine = 0.5 * np.stack([np.sin(3 * record.t), 0 * record.t], axis=-1)
-        y = y - record.u * (0.7, -1.1) - sine
+    C, y = outputs(record)
     assert posterior.ess[:, 2:].min() > 400
     F, Phi = runge_kutta_matrix(0.1), np.eye(2)
     information, right = np.zeros((2, 2)), np.zeros((2, 3))

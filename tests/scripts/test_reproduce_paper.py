@@ -275,7 +275,7 @@ def test_the_comparison_keeps_what_is_there_and_shows_both(tmp_path, capsys, mon
 
     monkeypatch.setattr(comparison.Comparison, "config", fewer)
     source = EpisodeSource("ReverseDuffing", noise_std=0.0, dt=0.2)
-    monkeypatch.setattr(comparison, "_source", lambda: source)
+    monkeypatch.setattr(comparison, "compared", lambda: source)
     options = ["comparison", "--records", "2", "--budget", "none", "--out", str(tmp_path)]
     assert reproduce_paper.main(options) == 0
     shown = capsys.readouterr().out

@@ -79,7 +79,7 @@ def learn(
         noise = torch.randn(windows.shape, generator=generator, dtype=windows.dtype)
         windows = windows + std * noise
         # z at the end of each window, standardised over the batch, and the network's error.
-        z = torch.einsum("pw,bwo->bop", _response(logs, h, window), windows).reshape(_BATCH, -1)
+        z = torch.einsum("pw,bwo->bop", response(logs, h, window), windows).reshape(_BATCH, -1)
         z = (z - z.mean(0)) / z.std(0)
         loss = (net(z) - states[k, i]).square().mean()
         adam.zero_grad()
@@ -88,7 +88,7 @@ def learn(
     return tuple((-torch.exp(logs.detach())).tolist())
 
 
-def _response(logs: Tensor, h: float, window: int) -> Tensor:
+def response(logs: Tensor, h: float, window: int) -> Tensor:
     """Return the weights (poles, window + 1) of a window's outputs in z at its end.
 
     z is 0 at the window's first sample; the weights are exact for piecewise linear outputs.

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -165,9 +164,6 @@ def test_ctrl_c_in_a_training_of_this_process_scores_nothing(folder, started):
     assert rows.read(folder / "lb" / "rows.jsonl") == []
 
 
-needs_dask = pytest.mark.skipif(not find_spec("distributed"), reason="the extra dask is not here")
-
-
 @pytest.fixture
 def dask(folder, started):
     """A Dask scheduler, its address, and two workers."""
@@ -187,7 +183,6 @@ def dask(folder, started):
     return scheduler, address
 
 
-@needs_dask
 def test_a_killed_scheduler_and_then_another_run(folder, started, dask, undisturbed, capsys):
     scheduler, address = dask
     client = started(*COMMAND, "--backend", "dask", "--scheduler", address)
@@ -205,7 +200,6 @@ def test_a_killed_scheduler_and_then_another_run(folder, started, dask, undistur
     assert facts(path) == undisturbed
 
 
-@needs_dask
 def test_a_killed_dask_worker_ends_nothing(folder, started, dask, undisturbed):
     client = started(*COMMAND, "--backend", "dask", "--scheduler", dask[1])
     os.kill(held(folder), signal.SIGKILL)
@@ -215,7 +209,6 @@ def test_a_killed_dask_worker_ends_nothing(folder, started, dask, undisturbed):
     assert facts(folder / "lb" / "rows.jsonl") == undisturbed
 
 
-@needs_dask
 def test_no_scheduler_is_one_line(folder, monkeypatch, capsys):
     monkeypatch.setattr(cluster, "CONNECT", 0.3)
     with socket.socket() as free:

@@ -9,6 +9,7 @@ from page_rows import curves
 from pinnobs_gym.leaderboard import ranks, standings
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.site.model import page_model
+from pinnobs_gym.leaderboard.site.page import draw
 from pinnobs_gym.scoring.curves import save
 from pinnobs_gym.scoring.rows import Stored
 
@@ -70,8 +71,6 @@ def test_the_board_computes_an_interval_once_per_cell(counted):
 
 
 def test_drawing_needs_neither_rows_nor_curves(tmp_path, counted):
-    draw = pytest.importorskip("pinnobs_gym.leaderboard.site.page").draw
-
     def made():
         return Stored(scored(), [dict(FAILURE)])
 

@@ -6,6 +6,7 @@ import sys
 
 import altair as alt
 import pytest
+from playwright.sync_api import sync_playwright
 from waiting import PATIENCE
 
 from pinnobs_gym import evaluate
@@ -139,8 +140,7 @@ def test_charts_are_valid():
 def browser():
     if CHROMIUM is None:
         pytest.skip("no chromium here")
-    api = pytest.importorskip("playwright.sync_api")
-    with api.sync_playwright() as playwright:
+    with sync_playwright() as playwright:
         launch = playwright.chromium.launch
         browser = launch(executable_path=CHROMIUM, args=ARGUMENTS, timeout=1000 * PATIENCE)
         yield browser

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from small_trainings import (
 )
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimation.learned.mlp import Activation, Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.scoring import acceptance
 from pinnobs_gym.scoring.playing import play
@@ -51,7 +52,7 @@ def by_autograd(network, system, points, weights, lead):
 
 
 @pytest.mark.parametrize("samples", [30, 2500])
-@pytest.mark.parametrize("activation", ["tanh", "sine", "sigmoid", "relu"])
+@pytest.mark.parametrize("activation", get_args(Activation))
 def test_the_gradient_by_hand_is_that_of_autograd(activation, samples):
     system, rng = Mixer(), np.random.default_rng(0)
     record = random_record(system, samples)

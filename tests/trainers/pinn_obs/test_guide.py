@@ -1,6 +1,7 @@
 """The guide of the fast recipe: smoother, gain, and what they do for the network."""
 
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from small_trainings import train_pinn_obs
 
 from pinnobs_gym import Setup, System
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
+from pinnobs_gym.estimation.learned.mlp import Activation, Architecture, evaluate
 from pinnobs_gym.estimation.smoother import backward, flows
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.simulation.model import model_step_jacobian
@@ -130,7 +131,7 @@ def test_the_observers_gain_takes_away_what_the_filter_takes():
         np.testing.assert_allclose(L[k] / max(abs(L[k]).max(), 1e-30), ratio)
 
 
-@pytest.mark.parametrize("activation", ["tanh", "sine", "sigmoid", "relu"])
+@pytest.mark.parametrize("activation", get_args(Activation))
 def test_numpy_evaluates_the_network_as_torch_does(activation):
     options = {"span": (0.0, 2.0), "decays": (0.1,), "scale": (2.0, 3.0, 0.5, 0.25)}
     architecture = Architecture(2, 1, 3, 5, activation, "float64", **options)

@@ -2,6 +2,7 @@ import dataclasses
 import math
 import os
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from small_trainings import (
     trained_network,
 )
 
-from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimation.learned.mlp import Activation, Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
@@ -40,7 +41,7 @@ SMALL = replace(paper(), depth=2, width=8, iterations=60, log_every=10)
 # The network
 
 
-@pytest.mark.parametrize("activation", ["tanh", "sine", "sigmoid", "relu"])
+@pytest.mark.parametrize("activation", get_args(Activation))
 def test_the_rate_is_the_derivative_of_the_estimate(activation):
     generator = torch.Generator().manual_seed(1)
     network = Network(Architecture(3, 2, 3, 20, activation, "float64"), generator)

@@ -1,0 +1,17 @@
+"""Kinds of estimators, by what they declare."""
+
+from pinnobs_gym.estimators import ESTIMATORS
+
+
+def untrained():
+    """Names of those that need no trainer, neither beforehand nor on every record."""
+    return [
+        name
+        for name, cls in ESTIMATORS.classes().items()
+        if cls.needs_training is None and cls.trains_on_record is None
+    ]
+
+
+def trained():
+    """Names of the others."""
+    return sorted(set(ESTIMATORS.classes()) - set(untrained()))
