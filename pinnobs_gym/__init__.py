@@ -38,18 +38,21 @@ _HOMES = {
     "stack": "simulation.system",
     "evaluate": "scoring.evaluation",
 }
-"""The module below this package that each name of the face comes from."""
+"""Submodule that defines each lazily imported public name."""
 
 
 def register(cls: type) -> type:
-    """Make a system or an estimator of your own known by its name; usable as a decorator.
+    """Register your own system or estimator under its name; usable as a decorator.
 
-    A `System` becomes an env (``pinnobs/<class name>-v<version>``), and every estimator, trainer
-    and command takes it. An estimator is then found by its class attribute ``name``.
+    A `System` becomes an env (``pinnobs/<class name>-v<version>``) that every estimator, trainer
+    and command accepts. An estimator is registered under its class attribute ``name``.
+
+    Returns:
+        The class itself.
 
     Raises:
-        TypeError: in one line, if the class is neither or is not complete.
-        ValueError: if its name is taken.
+        TypeError: in one line, if the class is neither a `System` nor an estimator, or is abstract.
+        ValueError: if the name is taken.
     """
     from pinnobs_gym.estimation.estimator import BaseEstimator
     from pinnobs_gym.estimators import ESTIMATORS

@@ -1,1 +1,1 @@
-"""What an estimator is, and the mathematics that estimators share."""
+"""The interface of estimators, and the mathematics that they share."""

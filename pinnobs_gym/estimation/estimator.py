@@ -1,4 +1,4 @@
-"""The interface that every estimator has, and how one is run over records."""
+"""The interface of all estimators, and its application to whole records."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_sca
 
 @dataclass(frozen=True)
 class State:
-    """The running state of an estimator, for a batch of episodes. A row that has diverged carries
-    values that are not finite."""
+    """The running state of an estimator for a batch of episodes. The row of an episode whose
+    estimate has diverged contains non-finite values."""
 
     xhat: np.ndarray
     """Estimates x̂(k|k), shape (batch, nx)."""
@@ -25,94 +25,98 @@ class State:
     u: np.ndarray | None = None
     """Inputs at the last sample, shape (batch, nu); None before the first."""
     P: np.ndarray | None = None
-    """Covariances of the estimates, shape (batch, nx, nx), where the estimator has them."""
+    """Covariances of the estimates, shape (batch, nx, nx), if the estimator computes them."""
     innovation: np.ndarray | None = None
-    """y − h(t, x̂(k|k−1), u), shape (batch, ny), zero where y was missing."""
+    """Innovations y − h(t, x̂(k|k−1), u), shape (batch, ny); zero where y is missing."""
     S: np.ndarray | None = None
     """Covariances of the innovations, shape (batch, ny, ny)."""
     memory: Any = None
-    """Whatever else the estimator must remember."""
+    """Any further state of the estimator."""
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """What an estimator makes of a batch of records: x̂(k|k) at every sample, and the covariances
-    and innovations where it has them."""
+    """The estimates for a batch of records, with covariances and innovations if the estimator
+    computes them. The fields are those of `State`, at every sample."""
 
     xhat: np.ndarray
-    """Shape (batch, num_samples, nx)."""
+    """Estimates, shape (batch, num_samples, nx): x̂(k|k), or x̂(k|n) of an offline estimator."""
     P: np.ndarray | None = None
-    """Shape (batch, num_samples, nx, nx)."""
+    """Covariances of the estimates, shape (batch, num_samples, nx, nx)."""
     innovation: np.ndarray | None = None
-    """Shape (batch, num_samples, ny)."""
+    """Innovations, shape (batch, num_samples, ny)."""
     S: np.ndarray | None = None
-    """Shape (batch, num_samples, ny, ny)."""
+    """Covariances of the innovations, shape (batch, num_samples, ny, ny)."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """Where a setting is searched; whole numbers only if both bounds are."""
+    """The search range of a setting, in integers if both bounds are integers."""
 
     low: float
     high: float
     log: bool = False
-    """Whether by its logarithm."""
+    """Whether the search is over the logarithm of the setting."""
 
     @property
     def whole(self) -> bool:
-        """Whether it takes whole numbers only."""
+        """Whether the range consists of integers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
 
 @dataclass(frozen=True)
 class BaseEstimator(ABC):
-    """What estimators have in common, `Estimator` the online and `OfflineEstimator` the offline
-    ones.
+    """The base class of online estimators (`Estimator`) and offline ones (`OfflineEstimator`).
 
-    They are immutable. An estimator sees outputs, inputs and the model alone: the model may differ
-    from the true plant, and the state, the reward and an env's ``info`` are not shown to it.
+    Estimators are immutable. An estimator is given outputs, inputs, the prior, the noise level and
+    the model, which may differ from the true plant. It has no access to the true state, the reward
+    or an env's ``info``.
     """
 
     system: System
     """The model of the plant."""
     noise_std: Sequence[float] | float | None = None
-    """The standard deviation of the output noise that the estimator is told, in output units; the
-    benchmark's if None."""
+    """Standard deviation of the output noise known to the estimator, in output units; that of the
+    setup ``benchmark`` if None."""
 
     track: ClassVar[str]
-    """``online`` (causal) or ``offline`` (sees the whole record first); ranked apart."""
+    """``online`` (causal) or ``offline`` (uses the whole record); the two are ranked separately."""
     trains_on_record: ClassVar[str | None] = None
-    """The name of the trainer that it runs on every record it is given, if it does."""
+    """Name of the trainer that the estimator runs on every record, if any."""
     knows: ClassVar[tuple[str, ...]] = ("model", "prior", "noise")
-    """What it is told besides the outputs and inputs."""
+    """The information given to the estimator in addition to the outputs and inputs."""
     needs_training: ClassVar[str | None] = None
-    """Name of the trainer that must make it, if `for_setup` alone cannot."""
+    """Name of the trainer whose result the estimator requires, if any."""
     tunable: ClassVar[Mapping[str, Range]] = {}
-    """Which of its settings are searched by ``pinnobs tune``, and where."""
+    """Search ranges of the settings that ``pinnobs tune`` searches."""
     recipe: ClassVar[Mapping[str, Any]] = {}
-    """Choices in that trainer's Config that are made for it unless others are."""
+    """Default choices for this estimator in the Config of the trainer `needs_training`."""
     exempt_from: ClassVar[Mapping[str, str]] = {}
-    """Checks of `pinnobs_gym.estimation.checks.check_estimator` that it is not held to, by name,
-    and why not, in a line each."""
+    """Checks of `pinnobs_gym.estimation.checks.check_estimator` that do not apply to the estimator,
+    by name, with the reason in one line."""
     equations: ClassVar[str] = ""
-    """Its equations in LaTeX for its page, one below the other as in an ``aligned`` environment;
-    φ is the model's flow from the sample before, and a raised minus marks what precedes y_k."""
+    """The equations in LaTeX for the estimator's page, one per line as in an ``aligned``
+    environment. φ is the model's flow from the previous sample; a raised minus marks quantities
+    before the correction by y_k."""
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
-        """The estimator with default tuning for a model and what a setup says of the noise."""
+        """Return the estimator for a model, with a setup's noise level and the given settings."""
         return cls(system, noise_std=setup.noise_std, **options)
 
     @abstractmethod
     def run(self, record: Record) -> Estimates:
-        """The estimates over whole records."""
+        """Return the estimates for a batch of records."""
 
     @property
     def output_variance(self) -> np.ndarray:
         """Diagonal of R, shape (ny,), in squared output units.
 
-        Without noise it is not zero, which no filter takes, but (1e-3 of the output's scale)²; see
-        `output_scale`.
+        Each variance is at least (`NOISE_FLOOR`·`output_scale`)², because filters need a positive
+        definite R.
+
+        Raises:
+            ValueError: in one line, if the noise level is negative or not finite.
         """
         benchmark = self.system.setups["benchmark"].noise_std
         known_noise = benchmark if self.noise_std is None else self.noise_std
@@ -123,52 +127,52 @@ class BaseEstimator(ABC):
 
     @property
     def label(self) -> str:
-        """Its name in tables: the class attribute ``name``, or else the class's own."""
+        """Name in tables: the class attribute ``name`` or, without it, the name of the class."""
         return getattr(type(self), "name", type(self).__name__)
 
     @property
     def training(self) -> dict[str, Any]:
-        """How it was trained, in plain numbers and strings; empty for those that are not."""
+        """Description of the training in plain numbers and strings; empty without training."""
         return {}
 
     @property
     def options(self) -> dict[str, Any]:
-        """Its own settings by name, beyond the model and the noise."""
+        """The estimator's settings by name, without the model and the noise level."""
         own = {f.name for f in fields(BaseEstimator)}
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in own and f.repr}
 
 
 @dataclass(frozen=True)
 class Estimator(BaseEstimator):
-    """An online estimator: x̂(k|k) from y₀..y_k, for a batch of episodes at once.
+    """An online estimator: it computes x̂(k|k) from y₀..y_k for a batch of episodes.
 
-    Its running state is explicit: `reset` makes one from the prior, and each `update` makes the
-    next from one sample, the first of which is y₀.
+    The running state is an explicit value: `reset` returns the initial state from the prior, and
+    each `update` returns the next state from one sample. The first sample is y₀.
     """
 
     track = "online"
 
     @abstractmethod
     def reset(self, prior: Prior) -> State:
-        """The state before the first sample."""
+        """Return the state before the first sample."""
 
     @abstractmethod
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        """The state after the sample at time t (s).
+        """Return the state after the sample at time t.
 
         Args:
-            state: the state after the sample before, at an earlier time; steps may be irregular.
-            t: the time of this sample.
-            y: outputs, shape (batch, ny); NaN is a missing one.
+            state: the state after the previous sample, or that of `reset`.
+            t: time of the sample in s, later than ``state.t``; steps may be irregular.
+            y: outputs, shape (batch, ny); NaN marks a missing output.
             u: inputs, shape (batch, nu).
         """
 
     def run(self, record: Record) -> Estimates:
-        """The estimates over whole records: `update` in a loop."""
+        """Return the estimates for a batch of records, from one `update` per sample."""
         state = self._state_from("reset", self.reset(record.prior))
         columns: dict[str, np.ndarray] = {}
         y, u = np.moveaxis(record.y, 1, 0).copy(), np.moveaxis(record.u, 1, 0).copy()
-        with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
+        with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             for k, t in enumerate(record.t):
                 state = self._state_from("update", self.update(state, float(t), y[k], u[k]))
                 if k == 0:
@@ -178,7 +182,11 @@ class Estimator(BaseEstimator):
         return Estimates(**{name: np.moveaxis(c, 0, 1) for name, c in columns.items()})
 
     def _state_from(self, method: str, state: Any) -> State:
-        """What a method returned, if it is a state."""
+        """Return the result of a method, and check that it is a `State`.
+
+        Raises:
+            TypeError: in one line, if it is not.
+        """
         if not isinstance(state, State):
             name, kind = type(self).__name__, type(state).__name__
             raise TypeError(f"{name}.{method} returned {kind}; expected a State")
@@ -187,8 +195,8 @@ class Estimator(BaseEstimator):
 
 @dataclass(frozen=True)
 class OfflineEstimator(BaseEstimator):
-    """An estimator that sees an episode's whole record before it estimates any of it; it has `run`
-    alone."""
+    """An estimator that uses the whole record of an episode for each of its estimates. It has only
+    the method `run`."""
 
     track = "offline"
     exempt_from: ClassVar[Mapping[str, str]] = {
@@ -202,17 +210,19 @@ class OfflineEstimator(BaseEstimator):
 
 
 def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:
-    """Arrays (num_samples, batch, ...) for what the state has, laid out in memory as it is.
+    """Return empty arrays (num_samples, batch, ...) for the fields that the state has, in the
+    memory order of these fields.
 
-    They are parts of one, because only of large arrays the memory comes in large pages: without,
-    its first use took a tenth of the time of an extended Kalman filter.
+    The arrays are views of a single one, because only large arrays are allocated in large memory
+    pages. With separate arrays, the first access to their memory took a tenth of the run time of an
+    extended Kalman filter.
     """
-    held = {f.name: getattr(state, f.name) for f in fields(Estimates)}
-    held = {name: array for name, array in held.items() if array is not None}
-    room, used, columns = np.empty(num_samples * sum(a.size for a in held.values())), 0, {}
-    for name, array in held.items():
+    arrays = {f.name: getattr(state, f.name) for f in fields(Estimates)}
+    arrays = {name: array for name, array in arrays.items() if array is not None}
+    buffer, used, columns = np.empty(num_samples * sum(a.size for a in arrays.values())), 0, {}
+    for name, array in arrays.items():
         order = np.argsort([-stride for stride in array.strides], kind="stable")
-        part = room[used : used + num_samples * array.size]
+        part = buffer[used : used + num_samples * array.size]
         column = part.reshape(num_samples, *(array.shape[axis] for axis in order))
         columns[name] = column.transpose(0, *(1 + np.argsort(order)))
         used += part.size

@@ -1,4 +1,4 @@
-"""What estimators with a mean and a covariance share: tuning, checks, the prediction."""
+"""Tuning, checks and prediction shared by estimators with a mean and a covariance."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pinnobs_gym.simulation.system import System, vector
 
 @dataclass(frozen=True)
 class GaussianEstimator(BaseEstimator):
-    """The settings of estimators that carry a mean and a covariance.
+    """The settings of estimators with a mean and a covariance.
 
-    The same rule for all systems: x̂₀ and P₀ from the prior, R diagonal from the noise level they
-    are given (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)² per sample.
+    The tuning rule is the same for all systems: x̂₀ and P₀ are those of the prior, R is diagonal
+    with `BaseEstimator.output_variance`, and Q = diag(`process_noise`·scale)² per sample.
     """
 
     process_noise: float = 1e-4
-    """Standard deviation of the process noise per sample, over the state's scale."""
+    """Standard deviation of the process noise per sample, relative to the state's scale."""
 
     tunable = {"process_noise": Range(1e-7, 1e-1, log=True)}
 
@@ -30,7 +30,7 @@ class GaussianEstimator(BaseEstimator):
             raise ValueError(f"process_noise={self.process_noise}; expected a number of at least 0")
 
     def tuning(self, batch: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Q (nx, nx, batch) and R (ny, ny, batch), the same for all rows."""
+        """Return Q (nx, nx, batch) and R (ny, ny, batch), the same for all rows."""
         scale = vector(self.system.scale, self.system.nx, "scale")
         Q = np.diag((self.process_noise * scale) ** 2)
         R = np.diag(self.output_variance)
@@ -38,10 +38,10 @@ class GaussianEstimator(BaseEstimator):
 
 
 def checked(prior: Prior) -> Prior:
-    """The prior in double precision, if its covariances are such.
+    """Check the covariances of a prior, and return the prior in double precision.
 
     Raises:
-        ValueError: in one line, if one is not symmetric and positive semidefinite.
+        ValueError: in one line, if a covariance is not finite, symmetric and positive semidefinite.
     """
     P = np.asarray(prior.cov, dtype=float)
     size = abs(P).max(axis=(1, 2))
@@ -60,7 +60,11 @@ def checked(prior: Prior) -> Prior:
 
 
 def covariances(state: State) -> np.ndarray:
-    """The covariances of a state, shape (nx, nx, batch)."""
+    """Return the covariances of a state with the batch last, shape (nx, nx, batch).
+
+    Raises:
+        ValueError: in one line, if the state has none.
+    """
     if state.P is None:
         raise ValueError("the state has no covariance; begin with reset(prior)")
     return state.P.transpose(1, 2, 0)
@@ -69,18 +73,18 @@ def covariances(state: State) -> np.ndarray:
 def predicted(
     system: System, state: State, P: np.ndarray, Q: np.ndarray, t: float, u: np.ndarray
 ) -> State:
-    """The prediction x̂(k|k−1) at time t (s), and its covariance ΦPΦᵀ + Q, of a state after a
-    sample; see `RecursiveEstimator.predict`.
+    """Return the state with the prediction x̂(k|k−1) and its covariance ΦPΦᵀ + Q; see
+    `RecursiveEstimator.predict`.
 
     Args:
         system: the model.
-        state: after the sample before.
-        P: the covariances that are predicted, shape (nx, nx, batch).
-        Q: covariance of the process noise of a sample, shape (nx, nx, batch or 1).
+        state: the state after the previous sample.
+        P: covariances at that sample, shape (nx, nx, batch), in place of those of the state.
+        Q: covariance of the process noise per sample, shape (nx, nx, batch or 1).
         t: time of the next sample in s.
         u: inputs at the next sample, shape (batch, nu).
     """
-    assert state.t is not None  # before the first sample nothing is predicted
+    assert state.t is not None  # no prediction precedes the first sample
     xhat, P, _ = predict(system, (state.t, t), state.xhat, P, Q, (state.u, u))
     covariance = P.transpose(2, 0, 1)
     return State(xhat, state.t, state.u, covariance, state.innovation, None, state.memory)

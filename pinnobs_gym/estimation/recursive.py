@@ -1,4 +1,4 @@
-"""Estimators in two steps: the prediction between samples, and the correction at one."""
+"""Estimators with two steps: a prediction between samples and a correction at each sample."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from pinnobs_gym.estimation.estimator import Estimator, State
 
 @dataclass(frozen=True)
 class RecursiveEstimator(Estimator):
-    """An online estimator whose update is a prediction to the time of the sample, then a
-    correction by its outputs; at the first sample, which the prior stands for, the correction
-    alone."""
+    """An online estimator whose update is a prediction to the time of the sample, followed by a
+    correction with the outputs. At the first sample the prior serves as the prediction."""
 
     @abstractmethod
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        """The prediction x̂(k|k−1) at the time t (s) of the next sample, and its covariance.
+        """Return the state with the prediction for the next sample.
 
-        The other fields, time and inputs among them, stay those of the sample before.
+        Its ``xhat`` is x̂(k|k−1), and its ``P``, if the estimator computes it here, the covariance
+        of that. The time and the inputs stay those of the previous sample.
 
         Args:
-            state: the state after the sample before.
-            t: the time of the next sample in s.
+            state: the state after the previous sample.
+            t: time of the next sample in s.
             u: inputs at the next sample, shape (batch, nu).
         """
 
     @abstractmethod
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        """The state after the sample at time t (s).
+        """Return the state after the sample at time t.
 
         Args:
-            state: the prediction, whose `State.t` is the time of the sample before; at the first
-                sample the state of `reset`, whose time is None.
-            t: the time of this sample in s.
-            y: outputs, shape (batch, ny); NaN is a missing one.
+            state: the result of `predict`, whose ``t`` is the time of the previous sample; at the
+                first sample the result of `reset`, whose ``t`` is None.
+            t: time of the sample in s.
+            y: outputs, shape (batch, ny); NaN marks a missing output.
             u: inputs, shape (batch, nu).
         """
 

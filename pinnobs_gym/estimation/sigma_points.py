@@ -1,4 +1,4 @@
-"""What the sigma-point filters share: all but where they put their points."""
+"""The common part of the sigma-point filters, which differ only in the choice of their points."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from pinnobs_gym.simulation.record import Prior
 
 @dataclass(frozen=True)
 class SigmaPointMemory:
-    """What the filter keeps besides the state's own fields; the batch comes last."""
+    """The filter's memory in addition to the fields of `State`. The batch is the last axis."""
 
     Q: np.ndarray
     """Covariance of the process noise, shape (nx, nx, batch)."""
     R: np.ndarray
     """Covariance of the output noise, shape (ny, ny, batch)."""
     points: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """What `SigmaPointFilter.points` returns."""
+    """The result of `SigmaPointFilter.points`."""
     jitter: np.ndarray
-    """The largest part of a variance that had to be added so far, shape (batch,); zero if none."""
+    """Largest relative amount added to the variances so far, shape (batch,); zero if none was."""
 
 
 @dataclass(frozen=True)
 class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
-    """A Kalman filter whose moments come from points sent through the model.
+    """A Kalman filter that computes moments from points propagated through the model.
 
-    The points are drawn anew after the prediction, so that they know of Q. With the weighted
-    deviations X of the points, and Y of their outputs, K = XYᵀ(YYᵀ + R)⁻¹ and
-    P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ: Joseph's form, positive semidefinite whatever K is (Arasaratnam
-    & Haykin 2009, the square-root form of section VII). If a covariance has no Cholesky factor,
-    `kalman.JITTER` of each of its variances is added, and reported in the state's memory.
+    New points are generated after the prediction, so that their spread includes Q. With the
+    weighted deviations X of the points and Y of their outputs, the gain is K = XYᵀ(YYᵀ + R)⁻¹ and
+    the covariance P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ. This is Joseph's form, positive semidefinite for
+    any K (Arasaratnam & Haykin 2009, the square-root form of section VII). If a covariance has no
+    Cholesky factor, its variances are enlarged (`pinnobs_gym.simulation.matrices.JITTER`), and the
+    relative amount is reported in the state's memory.
     """
 
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -55,8 +56,8 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
 
     @abstractmethod
     def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The points of the standard normal distribution, (num_points, nx), and their weights in
-        means and in covariances, (num_points,), none negative."""
+        """Return the points for the standard normal distribution, (num_points, nx), and their
+        weights in means and in covariances, (num_points,) each. No weight is negative."""
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
@@ -71,7 +72,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         L, memory = _factor(covariances(state), memory)
         points = unit @ L  # (nx, num_points, batch)
         points += state.xhat.T[:, None]
-        # Each point through the model, then the moments of where they end.
+        # Propagate each point through the model; then compute mean and covariance.
         points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = mean_weights @ points  # (nx, batch)
@@ -85,7 +86,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         weights = np.sqrt(cov_weights)[:, None]
         xhat = state.xhat
         L, memory = _factor(covariances(state), memory)
-        # New points about the prediction, which know of Q, through h.
+        # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
         points = X + xhat.T[:, None]
         outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
@@ -97,6 +98,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
         K, S = gain_of_deviations(X, Y, memory.R)
+        # Covariance in Joseph's form, (X − KY)(X − KY)ᵀ + KRKᵀ.
         X -= product(K, Y)
         P = outer(X, X)
         P += sandwich(K, memory.R)
@@ -106,6 +108,6 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
 
 
 def _factor(P: np.ndarray, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:
-    """The Cholesky factors of P (nx, nx, batch), and the memory with what had to be added to it."""
+    """Return the Cholesky factors of P (nx, nx, batch), and the memory with the updated jitter."""
     L, jitter = factor(P, memory.jitter)
     return L, memory if jitter is memory.jitter else replace(memory, jitter=jitter)

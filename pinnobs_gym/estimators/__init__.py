@@ -1,4 +1,4 @@
-"""The estimators, one file each. A file put here is found, checked and ranked."""
+"""The estimators, one file each. Each file in this folder is registered, checked and ranked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Least squares over the initial state, on the whole record."""
+"""Least-squares estimation of the initial state from the whole record."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from pinnobs_gym.simulation.record import Record
 
 @dataclass(frozen=True)
 class BatchLeastSquares(OfflineEstimator):
-    """The model's trajectory nearest to all outputs of a record and to the prior.
+    """The model's trajectory that fits all outputs of a record and the prior best.
 
-    It minimises (x₀ − x̂₀)ᵀP₀⁻¹(x₀ − x̂₀) + Σ(y − h)ᵀR⁻¹(y − h) over x₀ by Levenberg and
-    Marquardt's method (Nocedal & Wright 2006, section 10.3), first over the beginning of the record
-    and then over stretches of twice the length, so that it follows an oscillation from the phase
-    that the prior knows. Where the model is exact this attains the Cramér–Rao bound. Covariances
-    are those of the smoothed states, Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ.
+    The cost (x₀ − x̂₀)ᵀP₀⁻¹(x₀ − x̂₀) + Σ(y − h)ᵀR⁻¹(y − h) is minimised over x₀ by the
+    Levenberg-Marquardt method (Nocedal & Wright 2006, section 10.3). The fit begins with a short
+    initial part of the record, whose length is doubled until it is the whole record. The phase of
+    an oscillation, known from the prior, is thus not lost. With an exact model the errors approach
+    the Cramér–Rao bound. Covariances are those of the smoothed states, Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`).
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and R follows from the
+    known noise level (`BaseEstimator.output_variance`).
     """
 
     max_iterations: int = 20
-    """Most evaluations of a record's trajectory over the whole of it."""
+    """Largest number of iterations on the whole record."""
     first_iterations: int = 10
-    """The same over each of the stretches before."""
+    """Largest number of iterations on each shorter part of the record."""
     shortest: int = 16
-    """Samples of the first stretch."""
+    """Largest number of samples in the first part of the record."""
 
     name = "batch_least_squares"
     exempt_from = {
@@ -52,7 +52,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
                 raise ValueError(f"{name}={getattr(self, name)}; expected at least 1")
 
     def run(self, record: Record) -> Estimates:
-        # The parameters are z with x₀ = x̂₀ + Lz, LLᵀ = P₀: standard normal by the prior.
+        # The parameters z, with x₀ = x̂₀ + Lz and LLᵀ = P₀, have a standard normal prior.
         record = replace(record, prior=checked(record.prior))
         L = root(record.prior.cov.transpose(1, 2, 0))
         z = np.zeros(record.prior.mean.T.shape)
@@ -60,6 +60,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
             for length in self._stretches(record.num_samples):
                 z = self._fitted(record, L, z, length)
             fit = self._evaluated(record, L, z, np.arange(record.batch), record.num_samples)
+            # Map the covariance of z at the optimum to the states along the trajectory.
             cov = np.linalg.inv(fit.information.transpose(2, 0, 1)).transpose(1, 2, 0)
             P = np.stack([sandwich(X, cov) for X in fit.X])
         return Estimates(fit.x.swapaxes(0, 1), P.transpose(3, 0, 1, 2))
@@ -73,7 +74,8 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
     def _evaluated(
         self, record: Record, L: np.ndarray, z: np.ndarray, rows: np.ndarray, length: int
     ) -> Fit:
-        """The fit at z (nx, rows) over the beginning of some of the records, prior included."""
+        """Return the fit at z (nx, rows) to the first samples of some of the records, including the
+        prior."""
         root_of = L[..., rows]
         x0 = record.prior.mean[rows] + np.einsum("ijb,jb->bi", root_of, z)
         y, u = record.y[rows, :length].swapaxes(0, 1), record.u[rows, :length].swapaxes(0, 1)
@@ -83,28 +85,32 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
         return Fit(fit.cost + (z**2).sum(axis=0), information, fit.right - z, fit.x, fit.X)
 
     def _fitted(self, record: Record, L: np.ndarray, z: np.ndarray, length: int) -> np.ndarray:
-        """The best z, from z on; a row is done when its next step would gain next to nothing."""
+        """Return the z that minimise the cost over the first ``length`` samples, starting from the
+        given z. A row is finished when the predicted decrease of its cost is negligible."""
         whole = length == record.num_samples
-        least_gain = 1e-8 if whole else 1e-2  # in units of cost, of which one is a standard error
+        least_gain = 1e-8 if whole else 1e-2  # a cost difference of 1 is one standard error
         z, rows = z.copy(), np.arange(record.batch)
         fit = self._evaluated(record, L, z, rows, length)
         cost, information, right = fit.cost, fit.information, fit.right
         damping = np.full(record.batch, 1e-4)
         for _ in range(self.max_iterations if whole else self.first_iterations):
+            # The step solves the normal equations with a damped diagonal (Marquardt's scaling).
             diagonal = np.einsum("iib->ib", information)
             step = solved(information + damping * (np.eye(len(z))[..., None] * diagonal), right)
             trial = z[:, rows] + step
             fit = self._evaluated(record, L, trial, rows, length)
-            better = fit.cost < cost
+            # Accept the step and reduce the damping where the cost decreases; else increase it.
+            accepted = fit.cost < cost
             gain = (step * right).sum(axis=0)
-            z[:, rows] = np.where(better, trial, z[:, rows])
-            cost = np.where(better, fit.cost, cost)
-            information = np.where(better, fit.information, information)
-            right = np.where(better, fit.right, right)
-            damping = np.where(better, damping / 10, damping * 10)
-            going = (gain > least_gain) & (damping < 1e8)
-            if not going.any():
+            z[:, rows] = np.where(accepted, trial, z[:, rows])
+            cost = np.where(accepted, fit.cost, cost)
+            information = np.where(accepted, fit.information, information)
+            right = np.where(accepted, fit.right, right)
+            damping = np.where(accepted, damping / 10, damping * 10)
+            # Continue with the rows that have not converged.
+            active = (gain > least_gain) & (damping < 1e8)
+            if not active.any():
                 break
-            rows, damping, cost = rows[going], damping[going], cost[going]
-            information, right = information[..., going], right[:, going]
+            rows, damping, cost = rows[active], damping[active], cost[active]
+            information, right = information[..., active], right[:, active]
         return z

@@ -11,11 +11,11 @@ from pinnobs_gym.estimation.sigma_points import SigmaPointFilter
 
 @dataclass(frozen=True)
 class CKF(SigmaPointFilter):
-    """The cubature Kalman filter of third degree (Arasaratnam & Haykin 2009): the 2·nx points
-    x̂ ± √nx·columns of √P, of equal weight.
+    """The cubature Kalman filter of third degree (Arasaratnam & Haykin 2009). Its 2·nx points
+    x̂ ± √nx·columns of √P have equal weights.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
     """
 
     name = "ckf"

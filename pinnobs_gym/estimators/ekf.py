@@ -17,43 +17,43 @@ from pinnobs_gym.simulation.system import vector
 
 @dataclass(frozen=True)
 class EKFMemory:
-    """What the filter keeps besides the state's own fields; the batch comes last."""
+    """The filter's memory in addition to the fields of `State`. The batch is the last axis."""
 
     Q: np.ndarray
     """Covariance of the process noise, shape (nx, nx, batch)."""
     R: np.ndarray
     """Covariance of the output noise, shape (ny, ny, batch)."""
     P_restart: np.ndarray
-    """Covariances that a filter that was wrong starts again with, shape (nx, nx, batch)."""
+    """Covariances with which the gate restarts the filter, shape (nx, nx, batch)."""
     bounds: np.ndarray
-    """The gate's bounds on the NIS of 0, 1, ... ny outputs."""
+    """The gate's bounds on the NIS of 0, 1, ... ny outputs, shape (ny + 1,)."""
     beyond: np.ndarray
-    """How many samples in a row were beyond the gate, shape (batch,)."""
+    """Number of successive samples beyond the gate, shape (batch,)."""
 
 
 @dataclass(frozen=True)
 class EKF(RecursiveEstimator, GaussianEstimator):
     """The continuous-discrete extended Kalman filter (Jazwinski 1970, section 8.3).
 
-    Between samples the state and the variational flow Φ' = A(x̂)Φ by the classical Runge-Kutta
-    method, P⁻ = ΦPΦᵀ + Q; at a sample the update in Joseph's form, which keeps P symmetric and
-    positive semidefinite. A missing output leaves its part of the update out.
+    Between samples, the state and the variational flow Φ' = A(x̂)Φ are integrated by the classical
+    Runge-Kutta method, and P⁻ = ΦPΦᵀ + Q. The update at a sample has Joseph's form, which keeps P
+    symmetric and positive semidefinite. A missing output is left out of the update.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
     """
 
     gate: float | None = None
-    """Probability of the χ² band that a normalised innovation squared (NIS) should be in, such as
-    0.9999 (Bar-Shalom, Li & Kirubarajan 2001, section 5.4). After `patience` samples in a row
-    beyond it the filter has locked on wrongly, and starts again from its estimate with the
-    covariance P₀ + diag(scale²). None never does."""
+    """Probability, such as 0.9999, that the χ² bound on the normalised innovation squared (NIS)
+    holds for a consistent filter (Bar-Shalom, Li & Kirubarajan 2001, section 5.4). After `patience`
+    successive samples beyond the bound, the covariance is reset to P₀ + diag(scale²); never if
+    None."""
     patience: int = 15
     """How many samples in a row may be beyond the gate."""
     huber: float | None = None
-    """Innovations beyond so many standard deviations count less, as in Huber's M-estimate: the
-    noise variance of such an output is enlarged by the excess, for this sample (one reweighting;
-    Huber 1964; Karlgaard & Schaub 2007). 1.345 is 95 % efficient on Gaussian noise. None: never."""
+    """Number of standard deviations beyond which an innovation is down-weighted as in Huber's
+    M-estimate, by enlarging the noise variance (one reweighting per sample; Huber 1964; Karlgaard &
+    Schaub 2007); never if None. The value 1.345 is 95 % efficient on Gaussian noise."""
 
     name = "ekf"
     equations = r"""
@@ -104,7 +104,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         return State(xhat, t, u, covariance, innovation, S, memory)
 
     def _gate_bounds(self) -> np.ndarray:
-        """The gate's bounds on the NIS of 0, 1, ... ny outputs, quantiles of χ²."""
+        """Return the gate's bounds on the NIS of 0, 1, ... ny outputs, which are χ² quantiles."""
         if self.gate is None:
             return np.full(self.system.ny + 1, np.inf)
         from scipy.special import gammaincinv
@@ -115,8 +115,8 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
     def _gated(
         self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, memory: EKFMemory
     ) -> tuple[np.ndarray, EKFMemory]:
-        """P, widened where the filter starts again."""
-        present = H.any(axis=1).sum(axis=0)  # outputs that are not missing
+        """Return P, reset where the gate restarts the filter, and the updated memory."""
+        present = H.any(axis=1).sum(axis=0)  # number of outputs that are not missing
         nis = squared_size(innovation, sandwich(H, P) + memory.R)
         beyond = ~(nis <= memory.bounds[present])
         count = np.where(present > 0, np.where(beyond, memory.beyond + 1, 0), memory.beyond)
@@ -127,7 +127,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
     def _reweighted(
         self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, R: np.ndarray
     ) -> np.ndarray:
-        """R (ny, ny, batch) with the variances of outputs enlarged whose innovation is large."""
+        """Return R (ny, ny, batch) with enlarged variances for outputs with large innovations."""
         assert self.huber is not None
         std = np.sqrt(np.einsum("iib->ib", sandwich(H, P) + R))
         excess = np.maximum(abs(innovation.T) / (self.huber * std), 1.0)

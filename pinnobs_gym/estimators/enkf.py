@@ -18,7 +18,7 @@ from pinnobs_gym.simulation.record import Prior
 
 @dataclass(frozen=True)
 class EnsembleMemory:
-    """The ensemble, and what made it."""
+    """The ensemble, and the noise that perturbs it."""
 
     members: np.ndarray
     """States, shape (num_members, batch, nx)."""
@@ -30,28 +30,28 @@ class EnsembleMemory:
     """Standard normal numbers for the noise of states and outputs at this sample, shape
     (num_members, 1, nx + ny)."""
     sample: int = 0
-    """How many samples there were."""
+    """Number of samples processed so far."""
 
 
 @dataclass(frozen=True)
 class EnKF(RecursiveEstimator, GaussianEstimator):
     """The ensemble Kalman filter with perturbed outputs (Evensen 1994; Burgers, van Leeuwen &
-    Evensen 1998), its ensemble inflated about its mean at every sample (Anderson & Anderson 1999).
+    Evensen 1998) and multiplicative inflation of the ensemble (Anderson & Anderson 1999).
 
-    Random numbers depend on the seed and the sample alone, and all episodes of a batch share them:
-    results are reproducible, and an episode's does not depend on those estimated with it. Their
-    mean over the ensemble is removed.
+    Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
+    Results are therefore reproducible, and the result of an episode does not depend on the others
+    in its batch. The numbers have mean zero and unit variance over the ensemble.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
     """
 
     members: int = 50
     """Size of the ensemble."""
     inflation: float = 1.01
-    """What deviations from the ensemble's mean are multiplied with at every sample."""
+    """Factor of the deviations from the ensemble mean in each prediction."""
     seed: int = 0
-    """Of the random numbers."""
+    """Seed of the random numbers."""
 
     name = "enkf"
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -86,11 +86,13 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         assert state.t is not None
         memory: EnsembleMemory = state.memory
         members = model_step(self.system, state.t, t, memory.members, state.u, u)
+        # Inflate the deviations from the ensemble mean, and add the process noise.
         mean = members.mean(axis=0)
         noise = self._noise(memory.sample)
         moved = memory.Q_std * noise[..., : self.system.nx]
         members = mean + self.inflation * (members - mean) + moved
-        return replace(state, memory=replace(memory, members=members, noise=noise))
+        memory = replace(memory, members=members, noise=noise)
+        return State(members.mean(axis=0), state.t, state.u, memory=memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: EnsembleMemory = state.memory
@@ -104,6 +106,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         missing = np.isnan(y)
         Y = np.where(missing.T[:, None], 0.0, Y)
         K, S = gain_of_deviations(X, Y, np.diag(memory.R_std**2)[..., None])
+        # Correct each member with its own perturbed output.
         errors = np.where(missing, 0.0, y + noise - outputs)
         members = members + np.einsum("ipb,mbp->mbi", K, errors)
         xhat = members.mean(axis=0)
@@ -113,12 +116,13 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
 
     def _noise(self, sample: int) -> np.ndarray:
-        """Standard normal numbers (members, 1, nx + ny) for the noise of state and outputs after
-        so many samples."""
+        """Return standard normal numbers (members, 1, nx + ny) for the noise of states and outputs
+        in the step that follows this number of samples."""
         return self._draws(sample + 1, self.system.nx + self.system.ny)[:, None]
 
     def _draws(self, sample: int, size: int) -> np.ndarray:
-        """Standard normal numbers (members, size) of a sample, of mean zero and unit variance."""
+        """Return normal numbers (members, size) with mean zero and unit variance over the
+        ensemble, from the random stream of a sample."""
         draws = np.random.default_rng([self.seed, sample]).standard_normal((self.members, size))
         draws -= draws.mean(axis=0)
         return draws / draws.std(axis=0, ddof=1)

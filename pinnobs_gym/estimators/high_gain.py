@@ -19,19 +19,21 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     """The high-gain observer with exponential forgetting (Bornard, Couenne & Celle 1989; Deza et
     al. 1992): x̂' = f(t, x̂, u) + S⁻¹HᵀR⁻¹(y − h(t, x̂, u)), Ṡ = −θS − AᵀS − SA + HᵀR⁻¹H.
 
-    S⁻¹ = P is carried as a covariance: between samples ΦPΦᵀ·exp(θ·dt), at a sample the update in
-    Joseph's form. Old outputs are forgotten at the rate θ, instead of process noise. What no output
-    tells would grow without end: nothing is forgotten where P is larger than P₀ + diag(scale²), by
-    the sum of variances over scale².
+    S⁻¹ = P is propagated as a covariance: it becomes ΦPΦᵀ·exp(θ·dt) between samples, and the update
+    at a sample has Joseph's form. Forgetting of old outputs at the rate θ takes the place of
+    process noise. Without a limit, P would grow without bound in directions that the outputs do not
+    determine. The factor exp(θ·dt) is therefore omitted where it would make P larger than
+    P₀ + diag(scale²), as measured by the sum of the variances over scale².
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), θ by 20 time constants per benchmark episode.
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), and a benchmark episode lasts 20 time
+    constants 1/θ.
     """
 
     process_noise: float = 0.0
-    """Standard deviation of the process noise per sample, over the state's scale."""
+    """Standard deviation of the process noise per sample, relative to the state's scale."""
     theta: float | None = None
-    """θ in 1/s; 20 time constants per benchmark episode if None."""
+    """Forgetting rate θ in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "high_gain"
     equations = r"""
@@ -71,5 +73,5 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
         return State(xhat, t, u, P, innovation, S, state.memory)
 
     def _size(self, P: np.ndarray) -> np.ndarray:
-        """The sum of variances over scale² of P (nx, nx, batch)."""
+        """Return the sum of the variances in P (nx, nx, batch) over scale², shape (batch,)."""
         return np.einsum("iib,i->b", P, np.asarray(self.system.scale, dtype=float) ** -2)

@@ -1,4 +1,4 @@
-"""Learned KKL observers: what is trained, its file, and the three ways to train it."""
+"""Learned KKL observers: the trained networks and their file, and one estimator per trainer."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from pinnobs_gym.simulation.system import Array, System
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """What T and T* are told beside x or z where they depend on time: e^(−rt), t the time since the
-    first sample, and the input over its size."""
+    """Additional inputs of time-dependent maps T and T*: e^(−rt), with t the time since the first
+    sample, and the plant's input over its amplitude."""
 
     rates: tuple[float, ...] = ()
-    """r in 1/s."""
+    """Rates r in 1/s."""
     amplitudes: tuple[float, ...] = ()
-    """Sizes of the inputs; none if the plant has none."""
+    """Amplitudes of the plant's inputs; empty without inputs."""
 
     @property
     def size(self) -> int:
-        """How many numbers it tells."""
+        """Number of additional inputs."""
         return len(self.rates) + len(self.amplitudes)
 
     def __call__(self, t: Array, u: Array, xp: Any = np) -> Array:
-        """The numbers (..., size) at times t (...) since the first sample, inputs (..., nu)."""
+        """Return the additional inputs (..., size) at times t (...) since the first sample in s,
+        for the plant's inputs u (..., nu)."""
         inputs = [xp.exp(-rate * t) for rate in self.rates]
         inputs += [u[..., i] / size for i, size in enumerate(self.amplitudes)]
         return xp.stack(inputs, -1)
@@ -45,24 +46,24 @@ class Clock:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedKKL(Trained):
-    """A KKL observer; its loss is the mean squared scaled error of x̂ on episodes held out, noise
-    included, and its iterations are those for both networks."""
+    """A trained KKL observer. Its loss is the mean squared scaled error of x̂ on noisy held-out
+    episodes, and its iterations are those of both networks together."""
 
     A: np.ndarray
-    """Shape (nz, nz), in 1/s."""
+    """A_z, shape (nz, nz), in 1/s."""
     B: np.ndarray
-    """Shape (nz, ny)."""
+    """B_z, shape (nz, ny), in 1/s per output unit."""
     mode: Mode
     start: Start
     clock: Clock
-    """What T* is told beside z; T, too, if it changes with time."""
+    """Additional inputs of T*, and of T if it depends on time."""
     activation: Activation
     encoder: Layers
-    """T: from x (and the clock, if T changes with time) to z."""
+    """T: from x (and the additional inputs, if T depends on time) to z."""
     decoder: Layers
-    """T*: from z and the clock to x."""
+    """T*: from z and the additional inputs to x."""
     facts: Mapping[str, Any]
-    """What else is known of the training: initial states dropped, the error of T, a sweep."""
+    """Further facts of the training: dropped initial states, the error of T, a sweep."""
 
     @cached_property
     def dynamics(self) -> Dynamics:
@@ -71,12 +72,13 @@ class TrainedKKL(Trained):
 
     @cached_property
     def rest(self) -> np.ndarray:
-        """What z begins at over a constant output, (nz, ny); zero unless it begins at rest."""
+        """Initial z per constant output, (nz, ny): the equilibrium if ``start`` is ``output``, else
+        zero."""
         return at_rest(self.dynamics, self.start)
 
     def T(self, x: np.ndarray, t: float = 0.0, u: np.ndarray | None = None) -> np.ndarray:
-        """What z is at states (..., nx), (..., nz); if T changes with time, at time t since the
-        first sample (s) and inputs u."""
+        """Return the z (..., nz) that T assigns to states x (..., nx). If T depends on time, t is
+        the time since the first sample in s, and u are the inputs (zero if None)."""
         if self.encoder[0][0].shape[1] > x.shape[-1]:
             u = np.zeros(len(self.clock.amplitudes)) if u is None else u
             inputs = self.clock(np.asarray(t), u)
@@ -84,7 +86,8 @@ class TrainedKKL(Trained):
         return perceptron(self.encoder, self.activation, x)
 
     def inverse(self, z: np.ndarray, t: float | np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Estimates (..., nx) at z (..., nz), times t since the first sample, inputs (..., nu)."""
+        """Return the estimates T*(z), shape (..., nx), for z (..., nz), times t since the first
+        sample in s, and inputs u (..., nu)."""
         if self.clock.size:
             shape = z.shape[:-1]
             t = np.broadcast_to(np.asarray(t, dtype=float), shape)
@@ -97,16 +100,17 @@ class TrainedKKL(Trained):
         return {name: self.facts[name] for name in ("dropped", "drawn")}
 
     def check_fits(self, path: str | Path, system: System) -> None:
-        found = {"nx": len(self.decoder[-1][1]), "ny": self.B.shape[1]}
-        check_same(path, found, {"nx": system.nx, "ny": system.ny})
+        sizes = {"nx": len(self.decoder[-1][1]), "ny": self.B.shape[1]}
+        check_same(path, sizes, {"nx": system.nx, "ny": system.ny})
 
 
 @dataclass(frozen=True)
 class KKL(LearnedEstimator, Estimator):
-    """What the learned KKL observers share: ż = A_z z + B_z y, exactly integrated for outputs that
-    are straight lines between samples, of any lengths, and x̂ = T*(z).
+    """The base class of the learned KKL observers, ż = A_z z + B_z y and x̂ = T*(z).
 
-    A missing output is replaced by h of the model's prediction from the last x̂.
+    In continuous mode z is integrated exactly for outputs that are linear between samples at any
+    times; in discrete mode by Euler steps. A missing output is replaced by h of the model's
+    prediction from the previous estimate.
     """
 
     trained: TrainedKKL = field(kw_only=True, repr=False)
@@ -130,10 +134,10 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
             z, first = self._begin(state.xhat, y), t
         else:
             before, first, y0 = state.memory
-            flow, held, now = trained.dynamics.step(round(t - state.t, 12))
+            flow, gamma0, gamma1 = trained.dynamics.step(round(t - state.t, 12))
             z = before @ flow.T
-            z += y0 @ held.T
-            z += y @ now.T
+            z += y0 @ gamma0.T
+            z += y @ gamma1.T
         return State(trained.inverse(z, t - first, u), t, u, memory=(z, first, y))
 
     def _begin(self, xhat: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -142,7 +146,7 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
         return y @ self.trained.rest.T
 
     def _complete(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Outputs with what the model predicts where it is missing."""
+        """Return the outputs, with predicted outputs of the model in place of missing ones."""
         missing = np.isnan(y)
         if not missing.any():
             return y
@@ -158,8 +162,8 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
 
 @dataclass(frozen=True)
 class KKLSupervised(KKL):
-    """A KKL observer, ż = A_z z + B_z y and x̂ = T*(z), whose T* is fitted to simulated pairs of
-    states and z (Ramos et al. 2020)."""
+    """The KKL observer ż = A_z z + B_z y, x̂ = T*(z), with T* fitted to simulated pairs of states
+    and z (Ramos et al. 2020)."""
 
     name = "kkl_supervised"
     equations = (
@@ -174,8 +178,8 @@ T^* : \; \min \textstyle\sum_i \| T^*(z_i) - x_i \|^2
 
 @dataclass(frozen=True)
 class KKLPinn(KKL):
-    """A KKL observer, ż = A_z z + B_z y and x̂ = T*(z), whose T is fitted to simulated pairs and to
-    its partial differential equation at other points (Niazi et al. 2023)."""
+    """The KKL observer ż = A_z z + B_z y, x̂ = T*(z), with T fitted to simulated pairs and to its
+    partial differential equation at further points (Niazi et al. 2023)."""
 
     name = "kkl_pinn"
     equations = (
@@ -193,8 +197,8 @@ T^* &: \; \min \textstyle\sum_i \| T^*(z_i) - x_i \|^2
 
 @dataclass(frozen=True)
 class KKLAutoencoder(KKL):
-    """A KKL observer, ż = A_z z + B_z y and x̂ = T*(z), whose T is fitted to its own equation over
-    several samples, and T* to T, without simulated z (Peralez & Nadri 2021)."""
+    """The KKL observer ż = A_z z + B_z y, x̂ = T*(z), with T fitted to its own equation over several
+    samples, and T* to T, without simulated z (Peralez & Nadri 2021)."""
 
     name = "kkl_autoencoder"
     equations = (

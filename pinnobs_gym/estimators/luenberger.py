@@ -1,4 +1,4 @@
-"""The Luenberger observer: a constant gain."""
+"""The Luenberger observer with a constant gain."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ class Luenberger(RecursiveEstimator):
     """The Luenberger observer x̂' = f(t, x̂, u) + L(y − h(t, x̂, u)) with a constant gain
     (Luenberger 1964).
 
-    Between samples the model alone; at a sample the correction over the time since the last, by
-    Euler's implicit method (`pinnobs_gym.estimation.observer_gains.injection`). A missing output
-    corrects nothing.
+    Between samples the observer integrates the model. At a sample it applies the correction over
+    the time since the previous sample, by Euler's implicit method
+    (`pinnobs_gym.estimation.observer_gains.injection`). A missing output contributes no correction.
 
-    Default tuning, the same rule for all systems: L places the poles of the model, linearised where
-    it is from x̂₀ after a quarter of a benchmark episode, to the left of −`rate`
-    (`pinnobs_gym.estimation.observer_gains.placed_gain`). That promises nothing far from there: if
-    less of it leaves a smaller error along the model's path from x̂₀, less is taken
-    (`pinnobs_gym.estimation.observer_gains.settling_gain`).
+    Default tuning is the same rule for all systems. The model is linearised at its state a quarter
+    of a benchmark episode after x̂₀, and L places the observer's poles to the left of −`rate`
+    (`pinnobs_gym.estimation.observer_gains.placed_gain`). This design is valid only near that
+    state. L is therefore reduced if a fraction of it leaves a smaller error at the end of the
+    model's trajectory from x̂₀ (`pinnobs_gym.estimation.observer_gains.settling_gain`).
     """
 
     gain: Sequence[Sequence[float]] | None = None
-    """L, nx rows of ny numbers, in state units per output unit and s; designed if None."""
+    """The gain L, nx rows of ny numbers, in state units per output unit and s; designed if None."""
     design: str = "poles"
-    """How it is designed: ``poles``, or ``lmi`` for one gain for the whole initial set
+    """Design of the gain: ``poles``, or ``lmi`` for one gain valid on the whole initial set
     (`pinnobs_gym.estimation.observer_gains.lmi_gain`; needs the extra lmi)."""
     poles: Sequence[complex] | None = None
-    """The poles to place, nx of them in 1/s; by the rate if None."""
+    """The nx poles to place, in 1/s; derived from the rate if None."""
     rate: float | None = None
-    """How fast errors should decay in 1/s; 20 time constants per benchmark episode if None."""
+    """Decay rate of errors in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "luenberger"
     equations = r"""
@@ -69,7 +69,7 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
             raise ValueError(f"gain has shape {np.shape(self.gain)}; expected (nx, ny)={shape}")
 
     def designed(self) -> np.ndarray:
-        """L, shape (nx, ny).
+        """Return the gain L, shape (nx, ny), in state units per output unit and s.
 
         Raises:
             ValueError: in one line, if the design has no solution.

@@ -16,47 +16,49 @@ from pinnobs_gym.simulation.record import Prior
 
 @dataclass(frozen=True)
 class WindowMemory:
-    """The window, and what is known of its start; in matrices the batch comes last."""
+    """The window and the prior of its first state. The batch is the last axis of matrices."""
 
     Q: np.ndarray
     """Covariance of the process noise, shape (nx, nx, 1)."""
     R: np.ndarray
     """Covariance of the output noise, shape (ny, ny, 1)."""
     arrival: np.ndarray
-    """x̄, the estimate of the window's first state from all samples before it, (batch, nx)."""
+    """x̄, the estimate of the window's first state from all samples before the window, shape
+    (batch, nx)."""
     P: np.ndarray
-    """Its covariance, shape (nx, nx, batch)."""
+    """P̄, the covariance of x̄, shape (nx, nx, batch)."""
     start: np.ndarray
-    """The window's first state as the samples in it correct it, shape (batch, nx)."""
+    """The current estimate of the window's first state, shape (batch, nx)."""
     t: tuple[float, ...] = ()
     """Times of the window's samples in s."""
     y: tuple[np.ndarray, ...] = ()
-    """Their outputs, (batch, ny) each."""
+    """Outputs at these samples, shape (batch, ny) each."""
     u: tuple[np.ndarray, ...] = ()
-    """Their inputs, (batch, nu) each."""
+    """Inputs at these samples, shape (batch, nu) each."""
 
 
 @dataclass(frozen=True)
 class MHE(Estimator, GaussianEstimator):
-    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the model's trajectory over the last
-    samples that is nearest to their outputs and to what was known before them.
+    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the model's trajectory that best fits
+    the outputs in a window of the latest samples and the estimate from the samples before.
 
-    At every sample some Gauss-Newton steps go down
-    (x − x̄)ᵀP̄⁻¹(x − x̄) + Σ(y − h)ᵀR⁻¹(y − h) over the window's first state x, from where the last
-    sample left it. When a sample leaves the window, x̄ and P̄ take it in as an extended Kalman filter
-    does that is linearised about x. Within the window the model is taken as exact. A window longer
-    than the record is the whole of it.
+    At each sample, Gauss-Newton steps decrease (x − x̄)ᵀP̄⁻¹(x − x̄) + Σ(y − h)ᵀR⁻¹(y − h) over the
+    window's first state x, starting from the result at the previous sample. When a sample leaves
+    the window, x̄ and P̄ are updated with it as in an extended Kalman filter linearised about x.
+    Within the window the model is assumed exact. A window longer than the record gives
+    full-information estimation.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)² between windows.
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), and Q = diag(`process_noise`·scale)² is
+    added to P̄ whenever the window moves.
     """
 
     process_noise: float = 2e-5
-    """Standard deviation of the process noise per sample, over the state's scale."""
+    """Standard deviation of the process noise per sample, relative to the state's scale."""
     window: int = 10
-    """Samples in the window."""
+    """Number of samples in the window."""
     steps: int = 1
-    """Gauss-Newton steps at every sample; one is the real-time iteration of Diehl et al. 2005."""
+    """Gauss-Newton steps per sample; one is the real-time iteration of Diehl et al. 2005."""
 
     name = "mhe"
     equations = r"""
@@ -87,12 +89,14 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
         start = memory.start
         fit = self._fit(memory, start)
+        # The trajectory from the previous first state ends at the prediction of this sample.
         innovation, H = observe(self.system, t, fit.x[-1], y, u)
         step, P = _step(fit, memory.P, memory.arrival - start)
         for _ in range(self.steps - 1):
             start = start + step
             fit = self._fit(memory, start)
             step, P = _step(fit, memory.P, memory.arrival - start)
+        # Map the last step to the latest sample to first order, without a new trajectory.
         start = start + step
         xhat = fit.x[-1] + np.einsum("ijb,bj->bi", fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
@@ -102,41 +106,55 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         return State(xhat, t, u, P, innovation, S, memory)
 
     def _fit(self, memory: WindowMemory, start: np.ndarray) -> Fit:
-        """The model's trajectory through the window from a state at its start."""
+        """Return the model's trajectory through the window from its first state, and the normal
+        equations of the outputs about it."""
         nx, batch = self.system.nx, len(start)
         X = identity(nx, batch)
         R = np.diagonal(memory.R[..., 0])
         return linearised(self.system, memory.t, memory.y, memory.u, start, X, R)
 
     def _moved(self, memory: WindowMemory, t: float, u: np.ndarray) -> WindowMemory:
-        """The window without its first sample, which x̄ and P̄ take in."""
+        """Return the memory without the window's first sample, with which x̄ and P̄ are updated. The
+        arguments t and u are those of the sample to be added."""
         start = memory.start
         innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])
-        ahead = memory.arrival - start
-        innovation = innovation - np.einsum("pib,bi->bp", H, ahead)
-        ahead, P, _ = joseph_update(ahead, memory.P, innovation, H, memory.R)
+        # Update x̄ − x and P̄ with the sample, with the output linearised about x.
+        offset = memory.arrival - start
+        innovation = innovation - np.einsum("pib,bi->bp", H, offset)
+        offset, P, _ = joseph_update(offset, memory.P, innovation, H, memory.R)
+        # Predict x, x̄ and P̄ to the next sample, which becomes the first of the window.
         second, u_second = (*memory.t, t)[1], (*memory.u, u)[1]
         times, inputs = (memory.t[0], second), (memory.u[0], u_second)
         start, P, F = predict(self.system, times, start, P, memory.Q, inputs)
-        arrival = start + product(F, ahead.T[:, None])[:, 0].T
+        arrival = start + product(F, offset.T[:, None])[:, 0].T
         memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
         return replace(memory, arrival=arrival, P=P, start=start)
 
 
 def _innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """S = HP⁻Hᵀ + R, (ny, ny, batch), of the covariance P after the update: R(R − HPHᵀ)⁻¹R."""
+    """Return S = HP⁻Hᵀ + R, shape (ny, ny, batch), computed as R(R − HPHᵀ)⁻¹R from the covariance P
+    after the update."""
     R = np.broadcast_to(R, (*R.shape[:2], P.shape[-1]))
     S = product(divide(R, R - sandwich(H, P)), R)
     return (S + S.transpose(1, 0, 2)) / 2
 
 
-def _step(fit: Fit, P: np.ndarray, ahead: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The Gauss-Newton step (batch, nx) of the window's first state, with x̄ so far ahead of it, and
-    the covariance (nx, nx, batch) of where it leads, (P̄⁻¹ + Λ)⁻¹ with Λ the information of the
-    window; without P̄⁻¹, because P̄ may be singular: what is known stays."""
+def _step(fit: Fit, P: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Gauss-Newton step (batch, nx) of the window's first state x, and the covariance
+    (P̄⁻¹ + Λ)⁻¹ (nx, nx, batch) of the result.
+
+    P̄ may be singular, so its inverse is avoided; components with zero variance in P̄ then follow x̄.
+
+    Args:
+        fit: the fit at x; Λ is its information.
+        P: P̄, shape (nx, nx, batch).
+        offset: x̄ − x, shape (batch, nx).
+    """
+    # With P̄ = LLᵀ, (P̄⁻¹ + Λ)⁻¹ = L(I + LᵀΛL)⁻¹Lᵀ.
     L = cholesky(P, semidefinite=True)
     L_transposed = L.transpose(1, 0, 2)
     inner = identity(len(P), P.shape[-1]) + product(product(L_transposed, fit.information), L)
     P = product(divide(L, inner), L_transposed)
-    right = fit.right - np.einsum("ijb,bj->ib", fit.information, ahead)
-    return ahead + np.einsum("ijb,jb->bi", P, right), P
+    # The step is that to x̄ plus the correction by the outputs from there.
+    right = fit.right - np.einsum("ijb,bj->ib", fit.information, offset)
+    return offset + np.einsum("ijb,jb->bi", P, right), P

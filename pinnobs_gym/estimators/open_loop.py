@@ -1,4 +1,4 @@
-"""The model alone, from the initial estimate: the row that everything must beat."""
+"""The model integrated from the initial estimate: the baseline for all estimators."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pinnobs_gym.simulation.record import Prior
 
 @dataclass(frozen=True)
 class OpenLoop(RecursiveEstimator):
-    """The model integrated from x̂₀ without looking at the output."""
+    """The model integrated from x̂₀, without use of the outputs."""
 
     name = "open_loop"
     equations = r"""
@@ -27,7 +27,8 @@ class OpenLoop(RecursiveEstimator):
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
-        return State(model_step(self.system, state.t, t, state.xhat, state.u, u))
+        xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
+        return State(xhat, state.t, state.u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         return State(state.xhat, t=t, u=u)

@@ -17,48 +17,51 @@ from pinnobs_gym.simulation.record import Prior
 _Sample = tuple[float, np.ndarray, np.ndarray]
 """Time in s, outputs (batch, ny) and inputs (batch, nu)."""
 _FEW = 10
-"""One particle in so many must be left, or the likelihood is taken in parts."""
+"""The likelihood is tempered if it would reduce the effective number of particles to less than
+their number over this."""
 _ROUNDS = 20
-"""Most such parts."""
+"""Largest number of tempering steps per sample."""
 _HALVINGS = 20
-"""Of the interval in which the power of a part is sought."""
+"""Number of bisection steps in the search of a tempering power."""
 
 
 @dataclass(frozen=True)
 class ParticleMemory:
-    """The particles."""
+    """The weighted particles."""
 
     particles: np.ndarray
     """States, shape (num_particles, batch, nx)."""
     log_weights: np.ndarray
-    """Logarithms of their weights, which sum to one, shape (num_particles, batch)."""
+    """Logarithms of the weights, shape (num_particles, batch); the weights sum to one."""
     sample: int = 0
-    """How many samples there were."""
+    """Number of samples processed so far."""
 
 
 @dataclass(frozen=True)
 class ParticleFilter(RecursiveEstimator):
     """A particle filter for plants without process noise (Liu & West 2001).
 
-    Particles move with the model and are weighted by the likelihood of the outputs. Where their
-    effective number falls below half, they are resampled systematically (Kitagawa 1996) and drawn
-    from Gaussians about them that are shrunk towards the mean, so that neither mean nor covariance
-    of the set changes: without that, few initial states would soon be left. A sample that would
-    leave less than a tenth is taken in parts (Neal 2001).
+    Particles are propagated by the model and weighted by the likelihood of the outputs. Where their
+    effective number falls below half of the particles, they are resampled systematically (Kitagawa
+    1996). New particles are drawn from Gaussians about the resampled ones, whose centres are shrunk
+    towards the mean so that the mean and the covariance of the set are preserved in expectation.
+    Without these Gaussians, few distinct particles would soon remain. The likelihood of a sample
+    that would reduce the effective number below a tenth is tempered (Neal 2001).
 
-    Random numbers depend on the seed and the sample alone, and all episodes of a batch share them:
-    results are reproducible, and an episode's does not depend on those estimated with it.
+    Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
+    Results are therefore reproducible, and the result of an episode does not depend on the others
+    in its batch.
 
-    Default tuning, the same rule for all systems: particles from the Gaussian prior, the likelihood
-    from the noise level it is given (`BaseEstimator.output_variance`).
+    Default tuning is the same rule for all systems: particles are drawn from the Gaussian prior,
+    and the likelihood follows from the known noise level (`BaseEstimator.output_variance`).
     """
 
     particles: int = 500
     """Number of particles."""
     discount: float = 0.95
-    """Liu and West's δ: Gaussians of variance 1 − ((3δ − 1)/2δ)² times that of the set."""
+    """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set."""
     seed: int = 0
-    """Of the random numbers."""
+    """Seed of the random numbers."""
 
     name = "particle"
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -95,18 +98,21 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         assert state.t is not None
         memory: ParticleMemory = state.memory
         x = model_step(self.system, state.t, t, memory.particles, state.u, u)
-        return replace(state, memory=replace(memory, particles=x))
+        xhat = np.einsum("mb,mbi->bi", np.exp(memory.log_weights), x)
+        return State(xhat, state.t, state.u, memory=replace(memory, particles=x))
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: ParticleMemory = state.memory
         x, log_weights = memory.particles, memory.log_weights
         missing = np.isnan(y)
+        # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
         yhat, S = _moments(np.exp(log_weights), outputs)
         S = S + np.diag(self.output_variance)
         x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
         weights = np.exp(log_weights)
         xhat, P = _moments(weights, x)
+        # Resample the episodes whose effective number of particles, 1/Σw², is below half.
         rows = np.flatnonzero((weights**2).sum(axis=0) > 2 / self.particles)
         if len(rows):
             x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
@@ -117,31 +123,35 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def _tempered(
         self, x: np.ndarray, log_weights: np.ndarray, seen: _Sample, sample: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Particles and the logarithms of their weights after a sample.
+        """Return the particles and the logarithms of their weights after the update with a sample.
 
-        Where these say so much that hardly a particle would be left, their likelihood is taken in
-        parts, each of a power of it that leaves a quarter, with a resampling between them.
+        Where the likelihood would leave too few effective particles, it is applied in several
+        factors. Each is a power of the likelihood that leaves effectively a quarter of the
+        particles, and is followed by resampling.
         """
         t, y, u = seen
-        left = np.ones(len(y))
+        remaining = np.ones(len(y))
         log_likelihood = self._log_likelihood(x, seen)
         for part_number in range(_ROUNDS):
-            trial = log_weights + left * log_likelihood
+            trial = log_weights + remaining * log_likelihood
             rows = np.flatnonzero(_effective(trial) < self.particles / _FEW)
             if not len(rows):
                 break
-            part = _power(log_weights[:, rows], log_likelihood[:, rows], left[rows], self.particles)
+            # Apply a power of the likelihood to these episodes, and resample them.
+            part = _power(
+                log_weights[:, rows], log_likelihood[:, rows], remaining[rows], self.particles
+            )
             log_weights = log_weights.copy()
             log_weights[:, rows] = _normalised(
                 log_weights[:, rows] + part * log_likelihood[:, rows]
             )
-            left[rows] -= part
+            remaining[rows] -= part
             x, log_weights = self._resampled(x, log_weights, rows, (sample, part_number))
             log_likelihood[:, rows] = self._log_likelihood(x[:, rows], (t, y[rows], u[rows]))
-        return x, _normalised(log_weights + left * log_likelihood)
+        return x, _normalised(log_weights + remaining * log_likelihood)
 
     def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
-        """Of the outputs, (num_particles, batch)."""
+        """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
         t, y, u = seen
         errors = np.nan_to_num(y - np.asarray(self.system.h(t, x, u)))
         return np.einsum("nbp,p->nb", errors**2, -0.5 / self.output_variance)
@@ -149,17 +159,20 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def _resampled(
         self, x: np.ndarray, log_weights: np.ndarray, rows: np.ndarray, stream: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The same with as many equally probable particles of the same mean and covariance in some
-        of the episodes. The stream tells the random numbers of one resampling from others'."""
+        """Resample the particles of the given episodes to equal weights, with their mean and
+        covariance preserved in expectation. The stream identifies the random numbers of this
+        resampling."""
         rng = np.random.default_rng([self.seed, 1, *stream])
         old, weights, count = x[:, rows], np.exp(log_weights[:, rows]), self.particles
         shrinkage = (3 * self.discount - 1) / (2 * self.discount)
         mean, P = _moments(weights, old)
+        # Systematic resampling: the number of copies of each particle.
         ends = np.clip(np.ceil(np.cumsum(weights, axis=0) * count - rng.random()), 0, count)
         ends[-1] = count
         copies = np.diff(ends, axis=0, prepend=0).astype(int)
-        kept = np.repeat(np.tile(np.arange(count), len(rows)), copies.T.ravel())
-        drawn = np.take_along_axis(old, kept.reshape(len(rows), count).T[..., None], axis=0)
+        ancestors = np.repeat(np.tile(np.arange(count), len(rows)), copies.T.ravel())
+        drawn = np.take_along_axis(old, ancestors.reshape(len(rows), count).T[..., None], axis=0)
+        # Shrink the copies towards the mean, and restore the covariance by Gaussian noise.
         L, _ = factor(P.transpose(1, 2, 0), np.zeros(len(rows)))
         L = np.sqrt(1 - shrinkage**2) * L
         noise = np.einsum("ijb,mj->mbi", L, rng.standard_normal((count, x.shape[-1])))
@@ -170,7 +183,8 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
 
 
 def _moments(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means (batch, nx) and covariances (batch, nx, nx) of x (num_particles, batch, nx)."""
+    """Return the weighted means (batch, nx) and covariances (batch, nx, nx) of x (num_particles,
+    batch, nx)."""
     mean = np.einsum("nb,nbi->bi", weights, x)
     deviations = (x - mean).transpose(2, 0, 1)
     P = np.einsum("inb,jnb->bij", weights * deviations, deviations)
@@ -178,23 +192,23 @@ def _moments(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _normalised(log_weights: np.ndarray) -> np.ndarray:
-    """The same, so that the weights sum to one."""
+    """Return the logarithms of the weights, normalised so that the weights sum to one."""
     log_weights = log_weights - log_weights.max(axis=0)
     return log_weights - np.log(np.exp(log_weights).sum(axis=0))
 
 
 def _effective(log_weights: np.ndarray) -> np.ndarray:
-    """The effective number of particles (batch,), (Σw)²/Σw²."""
+    """Return the effective number of particles, (Σw)²/Σw², shape (batch,)."""
     weights = np.exp(log_weights - log_weights.max(axis=0))
     return weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
 
 
 def _power(
-    log_weights: np.ndarray, log_likelihood: np.ndarray, left: np.ndarray, count: int
+    log_weights: np.ndarray, log_likelihood: np.ndarray, remaining: np.ndarray, count: int
 ) -> np.ndarray:
-    """The power (batch,), up to what is left, of the likelihood that leaves effectively a quarter
-    of the particles, by bisection."""
-    low, high = np.zeros_like(left), left
+    """Return the power of the likelihood, at most ``remaining``, that leaves effectively a quarter
+    of the particles, shape (batch,). It is found by bisection."""
+    low, high = np.zeros_like(remaining), remaining
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         enough = _effective(log_weights + middle * log_likelihood) > count / 4

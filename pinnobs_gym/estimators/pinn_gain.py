@@ -1,8 +1,9 @@
-"""A gain shared by all episodes, trained beforehand from outputs and equations alone."""
+"""A learned gain shared by all episodes, trained in advance on outputs and the model's equations
+only."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +30,17 @@ from pinnobs_gym.simulation.system import System, output_scale, vector
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedGain(Trained):
-    """A network that gives gains; its loss is the error on held-out episodes, over the EKF's."""
+    """A trained network for the gain. Its loss is the error on held-out episodes, relative to that
+    of the EKF."""
 
     layers: Layers
-    """Weights and biases; those of the least held-out loss."""
+    """Weights and biases with the least held-out loss."""
     variant: Variant
-    """``kalman`` corrects a Kalman gain; ``gru`` is a recurrent network alone."""
+    """``kalman`` corrects a Kalman gain; ``gru`` is a recurrent network without covariance."""
 
     @property
     def width(self) -> int:
-        """Neurons in a hidden layer."""
+        """Number of neurons per hidden layer."""
         return self.layers[-1][0].shape[1]
 
     def check_fits(self, path: str | Path, system: System) -> None:
@@ -49,19 +51,19 @@ class TrainedGain(Trained):
 
 @dataclass(frozen=True)
 class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
-    """A Kalman filter whose gain a small network corrects, one network for all episodes; it is
-    trained beforehand on outputs and the model's equations and never sees a true state.
+    """A Kalman filter whose gain is corrected by a small network, one for all episodes. The network
+    is trained in advance on outputs and the model's equations, without true states.
 
-    Prediction, default tuning and covariance are those of the `EKF`. At a sample the network sees
-    the prediction, its covariance, the innovation and how large innovations were of late, and
-    multiplies and shifts the Kalman gain, within bounds and less the smaller P
-    (`gain_network.corrected_gain`); P follows in Joseph's form with the gain that is used. The
-    network is told the noise through R, so that it can be run at another noise than it was trained
-    at. The form is near that of Recursive KalmanNet (Mortada et al. 2025) and KalmanNet (Revach et
-    al. 2022), which learn from true states.
+    Prediction, default tuning and covariance are those of the `EKF`. The inputs of the network at a
+    sample are the prediction, its covariance, the innovation and the size of recent innovations. It
+    scales and shifts the Kalman gain within bounds that shrink with P
+    (`pinnobs_gym.estimation.learned.gain_network.corrected_gain`), and P is updated in Joseph's
+    form with the corrected gain. The noise level enters through R, so that the network can be used
+    at another noise level than that of its training. The form resembles that of Recursive KalmanNet
+    (Mortada et al. 2025) and KalmanNet (Revach et al. 2022), which learn from true states.
 
-    The variant ``gru`` is a recurrent network that gives the gain of
-    x̂ = x̂⁻ + K(y − h(t, x̂⁻, u)) alone; it has no covariance.
+    The variant ``gru`` is a recurrent network for the gain in x̂ = x̂⁻ + K(y − h(t, x̂⁻, u)), without
+    a covariance.
     """
 
     trained: TrainedGain = field(kw_only=True, repr=False)
@@ -82,8 +84,8 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         return self.begin(checked(prior), self.output_variance[:, None])
 
     def begin(self, prior: Prior, variance: np.ndarray) -> State:
-        """What `reset` does, told variances of the output noise that may differ from row to row:
-        shape (ny, batch or 1)."""
+        """Return the state before the first sample, as `reset` does, for variances of the output
+        noise of shape (ny, batch or 1), which may differ between rows."""
         batch = len(prior.mean)
         scale = vector(self.system.scale, self.system.nx, "scale")[:, None]
         size = memory_size(self.trained.variant, self.system.ny, self.trained.width)
@@ -98,7 +100,7 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         if self.trained.variant == "gru":
             assert state.t is not None
             xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
-            return replace(state, xhat=xhat)
+            return State(xhat, state.t, state.u, memory=state.memory)
         (_, Q, _), _ = state.memory
         return predicted(self.system, state, covariances(state), Q, t, u)
 
@@ -121,7 +123,7 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         return State(xhat, t, u, P, innovation, S, (fixed, memory))
 
     def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        """`correct` by the recurrent network's gain, without a covariance."""
+        """Apply `correct` with the recurrent network's gain, without a covariance."""
         fixed, memory = state.memory
         scale, size, std = fixed
         xhat = state.xhat

@@ -1,4 +1,4 @@
-"""PINN-Obs once trained: the network's own estimates, and the observer with its learned gain."""
+"""Trained PINN-Obs: the network's own estimates, and the observer with its learned gain."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from pinnobs_gym.simulation.system import System
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariances of a network's estimates at some times."""
+    """Covariances of a network's estimates, interpolated between given times."""
 
     t: np.ndarray
     """Times in s, ascending, shape (num_times,)."""
     P: np.ndarray
-    """Shape (num_times, nx, nx), in products of state units."""
+    """Covariances at these times, shape (num_times, nx, nx), in products of state units."""
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
-        """At other times t (...) in s, (..., nx, nx): joined by straight lines."""
+        """Return covariances (..., nx, nx) at times t (...) in s, interpolated linearly and held
+        constant outside the given times."""
         after = np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1)
         part = np.clip((t - self.t[after - 1]) / (self.t[after] - self.t[after - 1]), 0, 1)
         part = part[..., None, None]
@@ -41,25 +42,25 @@ class Covariance:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedNetwork(Trained):
-    """A network trained on one record; its weights are those of the least training loss."""
+    """A network trained on one record, with the weights of the least training loss."""
 
     architecture: Architecture
     layers: Layers
     """Weights (fan_out, fan_in) and biases (fan_out,) of each layer."""
     t: np.ndarray
-    """Sample times in s of the record it was trained on, shape (num_samples,)."""
+    """Sample times in s of the training record, shape (num_samples,)."""
     y: np.ndarray
-    """Outputs of that record, shape (num_samples, ny)."""
+    """Outputs of the training record, shape (num_samples, ny)."""
     covariance: Covariance | None = None
-    """Covariances of its estimates, if the recipe gives them."""
+    """Covariances of the estimates, if the recipe computes them."""
 
     def xhat(self, t: np.ndarray) -> np.ndarray:
-        """The network's estimates, (..., nx) in state units, at times t (...) in s."""
+        """Return the network's estimates (..., nx), in state units, at times t (...) in s."""
         return self._evaluate(t)[0]
 
     def gain(self, t: np.ndarray) -> np.ndarray:
-        """The learned gains L, (..., nx, ny) in state units per s and output unit, at times t (...)
-        in s. Outside the record's times they are extrapolated."""
+        """Return the learned gains L (..., nx, ny), in state units per s and output unit, at times
+        t (...) in s. Outside the record's times they are extrapolated by the network."""
         return self._evaluate(t)[1]
 
     def check_fits(self, path: str | Path, system: System) -> None:
@@ -75,18 +76,21 @@ class TrainedNetwork(Trained):
 
 
 def estimates_of(rows: Sequence[TrainedNetwork], t: np.ndarray) -> Estimates:
-    """What networks, one per row, make of their records at times t (num_samples,) in s."""
+    """Return the estimates of one network per row at times t (num_samples,) in s, with covariances
+    if all networks have them."""
     xhat = np.stack([trained.xhat(t) for trained in rows])
-    known = [trained.covariance for trained in rows if trained.covariance is not None]
-    whole = len(known) == len(rows)
-    return Estimates(xhat, np.stack([covariance(t) for covariance in known]) if whole else None)
+    covariances = [trained.covariance for trained in rows if trained.covariance is not None]
+    complete = len(covariances) == len(rows)
+    return Estimates(
+        xhat, np.stack([covariance(t) for covariance in covariances]) if complete else None
+    )
 
 
 STEP = 0.7
-"""Longest step of the replay over the time constant of its gain; Runge-Kutta's method is stable
-up to 2.8."""
+"""Longest step of the replay, relative to the time constant of the gain; the Runge-Kutta method is
+stable up to 2.8."""
 MOST_STEPS = 200
-"""Most steps of the replay from one sample to the next that a gain asks for."""
+"""Largest number of steps between two samples that a gain can cause."""
 
 
 @dataclass(frozen=True)
@@ -95,14 +99,15 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     al., PINN-Obs, the time-varying observer of "Nonlinear State Observer", run as in "Neural
     Network Training and Testing").
 
-    Between samples by the classical Runge-Kutta method in equal steps of at most the system's
-    `System.model_step`, and of at most `STEP` over the largest eigenvalue of L(t)C. Outputs and
-    measured inputs are joined by straight lines from one sample to the next, so that x̂ at a sample
-    uses that sample and none after it. An output that is missing at either end of a line corrects
-    nothing along it. At the first sample x̂ is the prior's mean.
+    Between samples the observer is integrated by the classical Runge-Kutta method. The equal steps
+    are at most the system's `System.model_step`, and at most `STEP` over the largest eigenvalue of
+    L(t)C, C = ∂h/∂x. Outputs and measured inputs are interpolated linearly from one sample to the
+    next, so that x̂ at a sample uses that sample and none after it. An output that is missing at
+    either end of the interval contributes no correction in it. At the first sample x̂ is the prior
+    mean.
 
-    The gain was learned along one trajectory from one initial estimate; nothing in its training
-    makes the observer stable elsewhere.
+    The gain was learned along one trajectory from one initial estimate. Its training does not make
+    the observer stable along other trajectories.
     """
 
     trained: TrainedNetwork = field(kw_only=True, repr=False)
@@ -122,12 +127,13 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         xhat = state.xhat
         if state.t is not None:
-            with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
+            with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
                 xhat = self._step(state, t, y, u)
         return State(xhat, t, u, memory=y)
 
     def _step(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """x̂ (batch, nx) at time t, from that at the sample before: rows of equal steps together."""
+        """Return x̂ (batch, nx) at time t, integrated from the previous sample. Rows with equal step
+        limits are integrated together."""
         assert state.t is not None
         start, x, u0, y0 = state.t, state.xhat.copy(), state.u, state.memory
         fastest = np.broadcast_to(self._fastest(start, t, u0, u), len(x))
@@ -147,8 +153,15 @@ class PinnObsReplay(LearnedEstimator, Estimator):
         inputs: tuple[np.ndarray | None, np.ndarray],
         longest: float,
     ) -> np.ndarray:
-        """x̂ (batch, nx) at the later of two times, from x at the earlier, in steps of at most
-        ``longest`` (s); outputs (batch, ny) and inputs (batch, nu) are those at both."""
+        """Return x̂ (batch, nx) at the second of two times.
+
+        Args:
+            times: the two times in s.
+            x: x̂ at the first, shape (batch, nx).
+            outputs: outputs at both, shape (batch, ny) each.
+            inputs: inputs at both, shape (batch, nu) each.
+            longest: the longest step in s.
+        """
         (start, end), (y0, y) = times, outputs
         missing = np.isnan(y0) | np.isnan(y)
         y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, (y - y0) / (end - start))
@@ -159,7 +172,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
             def rate(
                 stage: int, x: np.ndarray, t: np.ndarray = t, u: np.ndarray = u, L: np.ndarray = L
             ) -> np.ndarray:
-                k = (0, 1, 1, 2)[stage]
+                k = (0, 1, 1, 2)[stage]  # index of the stage's time: start, midpoint or end
                 outputs = self.system.h(t[k], x, u[k])
                 innovation = np.where(missing, 0.0, y0 + (t[k] - start) * slope - outputs)
                 return self.system.f(t[k], x, u[k]) + innovation @ L[k].T
@@ -170,9 +183,12 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     def _fastest(
         self, start: float, end: float, u0: np.ndarray | None, u1: np.ndarray
     ) -> np.ndarray:
-        """The largest absolute eigenvalue of L(t)C (1/s) over three times from start to end (s),
-        C = ∂h/∂x at the network's own estimates; not over what would take too many steps. Shape
-        (batch,) if the input is measured, u0 and u1 (batch, nu) at both ends, and (1,) if not."""
+        """Return the largest absolute eigenvalue of L(t)C in 1/s at three times from start to end
+        (s), limited so that at most `MOST_STEPS` steps result.
+
+        C = ∂h/∂x is evaluated at the network's own estimates. The shape is (batch,) if the input is
+        measured, with values u0 and u1 (batch, nu) at both ends, and (1,) otherwise.
+        """
         t = np.linspace(start, end, 3)
         if self.system.measured_input and u0 is not None:
             u = u0 + np.array([0.0, 0.5, 1.0])[:, None, None] * (u1 - u0)
@@ -187,7 +203,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
 @dataclass(frozen=True)
 class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     """The network's own estimates x̂(t) (Farkane et al., PINN-Obs, "Proposed Adaptive PINN-Based
-    Model"), which mean something for the record that it was trained on alone."""
+    Model"), which are valid only for its training record."""
 
     trained: TrainedNetwork = field(kw_only=True, repr=False)
     """The trained network."""
@@ -207,10 +223,10 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     needs_training = "pinn_obs"
 
     def run(self, record: Record) -> Estimates:
-        """x̂ at every sample, with its covariance if the training gave one.
+        """Return x̂ at every sample, with its covariance if the training computed one.
 
         Raises:
-            ValueError: if the record is not the one that the network was trained on.
+            ValueError: in one line, if the record is not the network's training record.
         """
         known, given = (1, *self.trained.y.shape), record.y.shape
         if given != known:
@@ -229,13 +245,13 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
 
 @dataclass(frozen=True)
 class PinnObs(OfflineEstimator):
-    """PINN-Obs trained anew on every record it is given, and its network's x̂(t)."""
+    """PINN-Obs trained separately on every record, with the network's x̂(t) as estimates."""
 
     config: Any = field(default_factory=lambda: TRAINERS.resolve("pinn_obs").configured({}))
-    """The recipe; its seed is that of every row."""
+    """The recipe; all rows use its seed."""
     folder: Path | None = field(default=None, repr=False)
-    """Where a folder ``row-<i>`` per row goes, with its log, checkpoint and trained network; None
-    keeps nothing."""
+    """Folder for one subfolder ``row-<i>`` per row, with log, checkpoint and trained network;
+    nothing is stored if None."""
 
     name = "pinn_obs"
     equations = r"""
@@ -260,7 +276,7 @@ class PinnObs(OfflineEstimator):
         return {**facts, "config": asdict(self.config)}
 
     def fit(self, record: Record) -> list[TrainedNetwork]:
-        """Train on each row of the record; see `trainers.pinn_obs.PinnObsTrainer.train_rows`."""
+        """Train one network per row; see `trainers.pinn_obs.PinnObsTrainer.train_rows`."""
         trainer: Any = TRAINERS.resolve("pinn_obs")
         return trainer.train_rows(
             self.system, self.config, record=record, noise_std=self.noise_std, folder=self.folder

@@ -14,15 +14,15 @@ from pinnobs_gym.simulation.record import Record
 
 @dataclass(frozen=True)
 class RTSSmoother(OfflineEstimator, GaussianEstimator):
-    """The extended Kalman filter forward, and Rauch, Tung and Striebel's recursion backward, which
-    gives each state from all outputs (Särkkä 2013, section 9.1).
+    """The extended Kalman filter, followed by the backward recursion of Rauch, Tung and Striebel,
+    which estimates each state from all outputs (Särkkä 2013, section 9.1).
 
-    It takes the filter's linearisation: where that locked on wrongly, so does it. Without process
-    noise P⁻ of a plant that contracts becomes singular, and the way back rounds; least squares do
-    not.
+    The smoother uses the filter's linearisation. Where the filter converges to a wrong trajectory,
+    the smoother does, too. Without process noise, P⁻ of a contracting plant becomes singular, and
+    the backward recursion loses accuracy to rounding; least squares (`BatchLeastSquares`) do not.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
     """
 
     name = "rts_smoother"
@@ -37,6 +37,6 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
 
     def run(self, record: Record) -> Estimates:
         record = replace(record, prior=checked(record.prior))
-        with np.errstate(all="ignore"):  # rows that diverge are marked by what they then hold
+        with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             path = backward(forward(self.system, record, *self.tuning()))
         return Estimates(path.xhat.swapaxes(0, 1), path.P.transpose(3, 0, 1, 2))

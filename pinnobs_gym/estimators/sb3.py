@@ -1,4 +1,4 @@
-"""An agent of Stable-Baselines3 as an estimator."""
+"""The estimator that runs a trained agent of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -23,39 +23,39 @@ Layer = tuple[np.ndarray, np.ndarray]
 """Weights (rows, columns) and biases (rows,)."""
 
 SETUP = ("xhat0", "P0_std", "dt", "duration", "noise_std")
-"""What a form takes from the setup of the training."""
+"""Fields of the training's setup that the form of actions and features uses."""
 TINY = 1e-8
-"""Added to the variance of features by SB3's ``VecNormalize``."""
+"""Number that SB3's ``VecNormalize`` adds to the variance of features."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedAgent(Trained):
-    """The part of an agent that chooses actions. Its loss is the trainer's measure on episodes held
-    out."""
+    """The policy of a trained agent. Its loss is the trainer's measure on held-out episodes."""
 
     layers: tuple[Layer, ...]
-    """From normalised features, or from the recurrent layer, to the action."""
+    """Layers from the normalised features, or from the recurrent layer, to the action."""
     recurrent: tuple[Layer, Layer] | None
-    """Weights on the input and on the state of a long short-term memory (gates in the order input,
-    forget, cell, output, as in torch), if it has one before the other layers."""
+    """Weights on the input and on the state of a long short-term memory before the other layers
+    (gates in the order input, forget, cell, output, as in torch); None without one."""
     normalization: Layer
     """Mean and variance of the features."""
     clip: float
-    """Largest normalised feature."""
+    """Bound on the absolute values of normalised features."""
     activation: str
-    """``tanh`` or ``relu``, of all layers but the last."""
+    """Activation of all layers except the last: ``tanh`` or ``relu``."""
     squash: bool
-    """Whether the action is the hyperbolic tangent of the last layer; else it is cut off at ±1."""
+    """Whether the action is the hyperbolic tangent of the last layer; otherwise it is clipped at
+    ±1."""
     algorithm: str
     action_mode: str
     stack: int
-    """How many of the last outputs the features hold."""
+    """Number of the last outputs in the features."""
     setup: Mapping[str, Any]
-    """The part of the training's setup that the form takes; see `SETUP`."""
+    """The fields `SETUP` of the training's setup."""
     sb3: str
-    """Version of Stable-Baselines3 that trained it."""
+    """Version of Stable-Baselines3 used in training."""
     steps: int
-    """Steps of the env that training took, those of all rows together."""
+    """Number of env steps in training, summed over all rows."""
 
     @property
     def notes(self) -> Mapping[str, Any]:
@@ -63,33 +63,36 @@ class TrainedAgent(Trained):
         return {"reward": "of the true states", **{name: getattr(self, name) for name in names}}
 
     def check_fits(self, path: str | Path, system: System) -> None:
-        here = importlib.metadata.version("stable-baselines3")
-        if self.sb3.partition(".")[0] != here.partition(".")[0]:
+        installed = importlib.metadata.version("stable-baselines3")
+        if self.sb3.partition(".")[0] != installed.partition(".")[0]:
             raise ValueError(
-                f"{path} was trained with stable-baselines3 {self.sb3}; {here} is installed, of "
-                "another major version"
+                f"{path} was trained with stable-baselines3 {self.sb3}; {installed} is installed, "
+                "of another major version"
             )
         form = self.form(system)
         actions: int = form.action_space.shape[0]
-        found = [self.normalization[0].size, len(self.layers[-1][1])]
-        check_same(path, {"sizes": found}, {"sizes": [form.num_features, actions]})
+        sizes = [self.normalization[0].size, len(self.layers[-1][1])]
+        check_same(path, {"sizes": sizes}, {"sizes": [form.num_features, actions]})
 
     def form(self, system: System, noise_std: Any = None) -> Form:
-        """The form of its actions and features, told a noise; the training's if None."""
+        """Return the form of actions and features for a known noise level; that of the training if
+        None."""
         known = dict(self.setup) | ({} if noise_std is None else {"noise_std": noise_std})
         setup = replace(system.setups["benchmark"], **known)
         return form_of(self.action_mode, system, setup, self.stack)
 
     def begin(self, batch: int) -> tuple[np.ndarray, np.ndarray]:
-        """The recurrent layer's first state, twice (batch, size); of size 0 if there is none."""
+        """Return the initial hidden and cell state of the recurrent layer, (batch, size) each; the
+        size is 0 without such a layer."""
         size = 0 if self.recurrent is None else self.recurrent[1][0].shape[1]
         return np.zeros((batch, size)), np.zeros((batch, size))
 
     def act(
         self, features: np.ndarray, state: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """The actions (batch, n) for features (batch, m), without exploration, and the recurrent
-        layer's next state; computed in double precision, row by row alike in any batch."""
+        """Return the actions (batch, n) without exploration for features (batch, m), and the next
+        state of the recurrent layer. The computation is in double precision, and the result of a
+        row does not depend on its batch."""
         mean, variance = self.normalization
         x = np.clip((features - mean) / np.sqrt(variance + TINY), -self.clip, self.clip)
         if self.recurrent is not None:
@@ -101,7 +104,8 @@ class TrainedAgent(Trained):
 def _remember(
     layer: tuple[Layer, Layer], x: np.ndarray, state: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """A step of a long short-term memory (Hochreiter & Schmidhuber 1997, with a forget gate)."""
+    """Return the output and the next state of a long short-term memory (Hochreiter & Schmidhuber
+    1997, with a forget gate)."""
     (W, b), (V, c) = layer
     hidden, cell = state
     gates = np.split(x @ W.T + b + hidden @ V.T + c, 4, axis=1)
@@ -113,15 +117,15 @@ def _remember(
 
 @dataclass(frozen=True)
 class Sb3(LearnedEstimator, Estimator):
-    """An agent that was trained by reinforcement learning with Stable-Baselines3, at work without
-    exploration. Its reward in training was made of the true states.
+    """An agent trained by reinforcement learning with Stable-Baselines3, run without exploration.
+    Its reward in training is computed from the true states.
 
-    What its actions mean is a form of `pinnobs_gym.envs.actions`: with ``gain`` it is an observer
-    on the model whose gain the agent chooses at every sample.
+    The meaning of its actions is a form of `pinnobs_gym.envs.actions`. With ``gain`` the agent
+    chooses the gain of an observer on the model at every sample.
     """
 
     trained: TrainedAgent = field(kw_only=True, repr=False)
-    """The agent."""
+    """The trained agent."""
 
     name = "sb3"
     equations = r"""
@@ -155,5 +159,5 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 
 
 def setup_of(setup: Setup) -> dict[str, Any]:
-    """What a saved agent keeps of a setup, as JSON holds it."""
+    """Return the fields `SETUP` of a setup as plain values that JSON can represent."""
     return plain({name: np.asarray(getattr(setup, name)) for name in SETUP})

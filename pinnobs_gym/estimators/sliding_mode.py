@@ -1,4 +1,4 @@
-"""A sliding-mode observer."""
+"""The sliding-mode observer."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ class SlidingMode(RecursiveEstimator):
     """The sliding-mode observer with a boundary layer (Slotine, Hedrick & Misawa 1987):
     x̂' = f(t, x̂, u) + L(e + ρ·sat(e/ε)), e = y − h(t, x̂, u).
 
-    The switching term drives e to the surface e = 0 as long as what the model does not know of the
-    output's rate stays below it, and within the layer it is a higher gain. Beyond the layer it
-    grows no more. At a sample the correction over the time since the last, by Euler's implicit
-    method with the secant of the saturation, so that it does not chatter.
+    The switching term drives e to the surface e = 0 as long as it exceeds the unmodelled part of
+    the output's rate. Within the boundary layer it acts as a higher gain; beyond the layer it is
+    constant. At a sample the observer applies the correction over the time since the previous
+    sample, by Euler's implicit method with the secant of the saturation, which avoids chattering.
 
-    Default tuning, the same rule for all systems: L as in the Luenberger observer
-    (`pinnobs_gym.estimation.observer_gains.settling_gain`), ε = `layer` standard deviations of the
-    output noise, ρ = `switching`·ε.
+    Default tuning is the same rule for all systems: L is designed as for the Luenberger observer
+    (`pinnobs_gym.estimation.observer_gains.settling_gain`), ε is `layer` standard deviations of the
+    output noise, and ρ = `switching`·ε.
     """
 
     rate: float | None = None
-    """How fast errors should decay in 1/s; 20 time constants per benchmark episode if None."""
+    """Decay rate of errors in 1/s; 20 time constants per benchmark episode if None."""
     switching: float = 5.0
-    """ρ over ε."""
+    """Ratio ρ/ε of the switching term to the width of the boundary layer."""
     layer: float = 5.0
-    """ε over the standard deviation of the output noise."""
+    """Width ε of the boundary layer in standard deviations of the output noise."""
 
     name = "sliding_mode"
     equations = r"""

@@ -17,21 +17,22 @@ from pinnobs_gym.simulation.record import Prior
 @dataclass(frozen=True)
 class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
     """The extended Kalman filter whose process noise grows with the innovation (Boutayeb & Aubry
-    1999), so that it stays awake however long the record.
+    1999), so that its gain does not vanish on long records.
 
-    Q_k = (`gamma`·eᵀR⁻¹e/ny + `process_noise`²)·diag(scale²), with e the innovation at the sample
-    before; optionally R_k = `output_factor`·HPHᵀ + R. The paper weighs e with an identity instead
-    of R⁻¹, in one unit. Joseph's form; a missing output counts as no innovation.
+    Q_k = (`gamma`·eᵀR⁻¹e/ny + `process_noise`²)·diag(scale²), with e the innovation at the previous
+    sample; optionally R_k = `output_factor`·HPHᵀ + R. The paper weights e with the identity instead
+    of R⁻¹, which requires outputs of one unit. The update has Joseph's form. The innovation of a
+    missing output is zero.
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), and the numbers below.
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), and the settings are the defaults below.
     """
 
     gamma: float = 1e-6
-    """Variance of the process noise over scale² that an innovation of one standard deviation of
-    the output noise brings."""
+    """Variance of the process noise, relative to scale², that an innovation of one standard
+    deviation of the output noise adds."""
     output_factor: float = 0.0
-    """What part of HPHᵀ is added to R."""
+    """Factor with which HPHᵀ is added to R."""
 
     name = "strong_tracking_ekf"
     equations = r"""

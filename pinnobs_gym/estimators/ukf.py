@@ -13,16 +13,16 @@ from pinnobs_gym.estimation.sigma_points import SigmaPointFilter
 class UKF(SigmaPointFilter):
     """The unscented Kalman filter (Julier & Uhlmann 1997) with 2·nx + 1 points.
 
-    The centre has weight κ/(nx + κ), κ = max(0, 3 − nx), and the points x̂ ± √(nx + κ)·columns of
-    √P weigh 1/(2(nx + κ)) each: van der Merwe's α = 1, at which no weight is negative. In
-    covariances the centre has β more (van der Merwe 2004).
+    The centre has the weight κ/(nx + κ), κ = max(0, 3 − nx), and the points x̂ ± √(nx + κ)·columns
+    of √P have the weights 1/(2(nx + κ)). This is van der Merwe's α = 1, for which no weight is
+    negative. In covariances the weight of the centre is larger by β (van der Merwe 2004).
 
-    Default tuning, the same rule for all systems: P₀ from the prior, R from the noise level it is
-    given (`BaseEstimator.output_variance`), Q = (`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
+    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
     """
 
     beta: float = 0.0
-    """What is added to the weight of the centre in covariances."""
+    """Number β added to the weight of the centre in covariances."""
 
     name = "ukf"
     equations = (

@@ -502,7 +502,7 @@ def test_sound_estimator_passes(make: Callable[[System], Estimator]) -> None:
         (
             Standing,
             "model_alone",
-            "without any output, the estimate at sample 1 and what the model",
+            "the estimate at sample 1 and the model",
         ),
         (ExemptFromNothing, "exemptions", "exempt_from names 'modell_alone'; known are immutable,"),
         (ExemptWithoutReason, "exemptions", r"exempt_from\['model_alone'\]=' '; expected a reason"),

@@ -3,13 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
+from kinds import untrained
 from linear import H, Linear, linear_record, runge_kutta_matrix
 
 from pinnobs_gym.estimation.checks import check_estimator
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.simulation.model import model_step
 
+RECURSIVE = [n for n in untrained() if issubclass(ESTIMATORS.resolve(n), RecursiveEstimator)]
 L = np.array([[0.4, 0.1], [-0.2, 0.3]])
 
 
@@ -44,3 +48,16 @@ def test_the_first_sample_corrects_the_prior_and_each_other_a_prediction():
 
 def test_it_conforms():
     check_estimator(ConstantGain(Linear()))
+
+
+@pytest.mark.parametrize("name", RECURSIVE)
+def test_a_prediction_is_that_of_the_sample_to_come(name):
+    """Without outputs the correction changes nothing, so that it shows the prediction."""
+    estimator = ESTIMATORS.resolve(name).for_setup(Linear(), Linear.setups["benchmark"])
+    record = linear_record()
+    u, missing = record.u, np.full_like(record.y, np.nan)
+    state = estimator.update(estimator.reset(record.prior), 0.0, record.y[:, 0], u[:, 0])
+    predicted = estimator.predict(state, 0.1, u[:, 1])
+    corrected = estimator.correct(predicted, 0.1, missing[:, 1], u[:, 1])
+    np.testing.assert_allclose(predicted.xhat, corrected.xhat, atol=1e-12)
+    assert predicted.t == state.t
