@@ -43,9 +43,9 @@ def print_table(table: standings_table.Table) -> None:
     for line in standings_table.cells(table, intervals=wide):
         shown.add_row(*(line[i] for i in columns))
     console.print(shown)
-    for standing in table.standings:
+    for standing, name in zip(table.standings, standings_table.names(table.standings), strict=True):
         trained = f"; trained: {standing.training}" if standing.training else ""
-        console.print(f"  {standing.estimator} knows: {standing.knows}{trained}")
+        console.print(f"  {name} knows: {standing.knows}{trained}", markup=False)
     if table.note:
         console.print(f"  {table.note}", style="yellow", markup=False)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.distinct import name_of
 from pinnobs_gym.leaderboard.intervals import log_ratio
 from pinnobs_gym.leaderboard.runs import Run, rows_of
 from pinnobs_gym.leaderboard.standings import Standing, standing
@@ -49,19 +49,15 @@ class Contender:
 
 
 def contenders(runs: Iterable[Run]) -> list[Contender]:
-    """Group runs into contenders, those with the most rows first.
-
-    Names include the training budget. If several contenders have the same name, all but the one
-    with the most rows also include their settings.
-    """
-    groups: dict[tuple[str, str], dict[GameName, list[Run]]]
-    groups = defaultdict(lambda: defaultdict(list))
+    """Group runs into contenders by name and training budget, those with the most rows first. The
+    rows must be `distinct`."""
+    groups: dict[str, dict[GameName, list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
-        groups[_identity(run.rows[0])][run.game].append(run)
-    named: dict[str, dict[GameName, list[Run]]] = {}
-    for (name, settings), games in sorted(groups.items(), key=lambda group: _order(group[1])):
-        ordered = dict(sorted(games.items(), key=lambda item: label(item[0])))
-        named[f"{name} {settings}" if name in named else name] = ordered
+        groups[name_of(run.rows[0])][run.game].append(run)
+    named = {
+        name: dict(sorted(games.items(), key=lambda item: label(item[0])))
+        for name, games in sorted(groups.items(), key=lambda group: _order(group[1]))
+    }
     peer = named.get(PEER, {})
     return [Contender(name, games, _ratios(games, peer)) for name, games in named.items()]
 
@@ -84,14 +80,6 @@ def label(game: GameName) -> str:
     condition = "" if game.condition == "nominal" else f" ({game.condition})"
     setup = "" if game.setup == "benchmark" else f", {game.setup}"
     return game.system + condition + setup
-
-
-def _identity(row: Row) -> tuple[str, str]:
-    """Return the name of a row's estimator with the budget, and its settings if it is not
-    trained."""
-    budget = row["training"].get("config", {}).get("budget")
-    name = row["estimator"] if budget is None else f"{row['estimator']}, {budget:g} s"
-    return name, "" if row["training"] else json.dumps(row["options"], sort_keys=True)
 
 
 def _order(games: Mapping[GameName, Sequence[Run]]) -> tuple[int, int]:

@@ -28,9 +28,9 @@ class Run:
         return self.rows[0]["estimator"]
 
     @property
-    def config_hash(self) -> str:
-        """Hash of the estimator's settings, model and training."""
-        return self.rows[0]["config_hash"]
+    def hashes(self) -> tuple[str, str]:
+        """Hashes of the game and of the estimator; see `pinnobs_gym.scoring.rows.Row`."""
+        return self.rows[0]["game_hash"], self.rows[0]["estimator_hash"]
 
     @property
     def track(self) -> str:
@@ -50,9 +50,9 @@ class Run:
 
 def runs_of(rows: Iterable[Row]) -> list[Run]:
     """Group scored episodes into runs, in the order of their first rows."""
-    runs: dict[tuple[GameName, str, str], Run] = {}
+    runs: dict[tuple[GameName, str, str, str], Run] = {}
     for position, row in enumerate(rows):
-        key = (game_of(row), row["estimator"], row["config_hash"])
+        key = (game_of(row), row["game_hash"], row["estimator"], row["estimator_hash"])
         if key not in runs:
             runs[key] = Run(key[0], [], position)
         runs[key].rows.append(row)

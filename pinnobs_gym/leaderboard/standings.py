@@ -54,6 +54,8 @@ class Standing:
     """CPU seconds allotted to training; None without such a limit."""
     training: str
     """Short description of the training."""
+    seed: int | None
+    """Training seed; None without training, or of several seeds together."""
 
 
 def standing(rows: Sequence[Row]) -> Standing:
@@ -84,6 +86,7 @@ def standing(rows: Sequence[Row]) -> Standing:
         knows=", ".join(first["knows"]),
         budget=first["training"].get("config", {}).get("budget"),
         training=training_of(rows),
+        seed=first["training_seed"] if len({row["training_seed"] for row in rows}) == 1 else None,
     )
 
 

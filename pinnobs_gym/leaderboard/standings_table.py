@@ -95,20 +95,32 @@ HEADER = (
 def cells(table: Table, intervals: bool = True) -> list[list[str]]:
     """Return the table's rows as text, a cell per column of `HEADER`, with or without intervals."""
     lines, ranks = [], defaultdict(int)
-    for standing in table.standings:
+    for standing, name in zip(table.standings, names(table.standings), strict=True):
         ranks[standing.track] += 1
-        lines.append([str(ranks[standing.track]), *_cells(standing, intervals)])
+        lines.append([str(ranks[standing.track]), name, *_cells(standing, intervals)])
     return lines
 
 
+def names(standings: Iterable[Standing]) -> list[str]:
+    """Return the names of the lines, with the training budget and, where that is not enough to tell
+    them apart, the training seed."""
+    standings = list(standings)
+    named = [
+        s.estimator if s.budget is None else f"{s.estimator}, {s.budget:g} s" for s in standings
+    ]
+    return [
+        name if named.count(name) == 1 else f"{name}, seed {standing.seed}"
+        for name, standing in zip(named, standings, strict=True)
+    ]
+
+
 def _cells(s: Standing, intervals: bool) -> list[str]:
-    """Return the cells of a standing, except its rank."""
+    """Return the cells of a standing, except its rank and name."""
     shown = _interval if intervals else lambda interval: number(interval.value)
     tail = shown(s.tail)
     if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
         tail += f" [{number(s.tail_modulo)}]"
     return [
-        s.estimator if s.budget is None else f"{s.estimator}, {s.budget:g} s",
         s.track,
         str(s.episodes),
         shown(s.diverged.percent),

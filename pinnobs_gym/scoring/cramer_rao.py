@@ -5,15 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.scoring.metrics import by_sample, window
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import Setup, System, vector
+
+if TYPE_CHECKING:
+    from pinnobs_gym.envs.game import Game
 
 
 def cramer_rao(

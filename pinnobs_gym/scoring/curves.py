@@ -106,7 +106,7 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
     """
     about = {
         "estimator": row["estimator"],
-        "config_hash": row["config_hash"],
+        "hashes": [row["game_hash"], row["estimator_hash"]],
         "states": curves.states,
         "measured": list(curves.measured.items()),
         "example_seed": int(curves.example.seed),
@@ -115,14 +115,15 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
     arrays: dict[str, Any] = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
     arrays |= {"x": example.x, "xhat": example.xhat, "y": example.y, "example_t": example.t}
     arrays |= {name: array for name, array in optional.items() if array is not None}
-    name = f"{_file_safe(row['estimator'])}-{row['config_hash']}-{curves.seeds[0]}.npz"
+    hashes = f"{row['game_hash']}-{row['estimator_hash']}"
+    name = f"{_file_safe(row['estimator'])}-{hashes}-{curves.seeds[0]}.npz"
     path = _folder_of_game(folder, game_of(row)) / name
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
 
 
 def read(folder: Path, game: GameName) -> dict[tuple[str, str], list[Curves]]:
-    """Read the curves of a game: a list per estimator and config hash, in the order of first
+    """Read the curves of a game: a list per game hash and estimator hash, in the order of first
     episodes. The result is empty if there is no such folder.
 
     Raises:
@@ -136,7 +137,8 @@ def read(folder: Path, game: GameName) -> dict[tuple[str, str], list[Curves]]:
                 curves = _from_arrays(about, {name: data[name] for name in data.files})
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"cannot read curves from {path}: {error}; delete it") from None
-        by_estimator.setdefault((about["estimator"], about["config_hash"]), []).append(curves)
+        game_hash, estimator_hash = about["hashes"]
+        by_estimator.setdefault((game_hash, estimator_hash), []).append(curves)
     return {name: sorted(parts, key=lambda c: c.seeds[0]) for name, parts in by_estimator.items()}
 
 

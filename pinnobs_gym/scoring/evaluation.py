@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
@@ -15,7 +15,14 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
 from pinnobs_gym.scoring.playing import Played, play
-from pinnobs_gym.scoring.provenance import canonical, now, versions
+from pinnobs_gym.scoring.provenance import (
+    canonical,
+    estimator_code,
+    estimator_hash,
+    game_hash,
+    now,
+    versions,
+)
 from pinnobs_gym.scoring.rows import SCHEMA, Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.simulation.conditions import canonical_name
@@ -24,6 +31,16 @@ from pinnobs_gym.training.log import SILENT, Log
 
 BATCH = 256
 """Number of episodes run together."""
+_LOGGER = logging.getLogger(__name__)
+
+
+StoredKey: TypeAlias = tuple[str, str, int | None, int]
+"""What identifies a row among those of one estimator's name in one game: ``game_hash``,
+``estimator_hash``, ``training_seed`` and ``episode_seed``."""
+stored_key: Callable[[Row], StoredKey] = itemgetter(
+    "game_hash", "estimator_hash", "training_seed", "episode_seed"
+)
+"""Return the `StoredKey` of a row."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +48,19 @@ class Results:
     """A rows file to which scores are appended."""
 
     path: Path
-    known: frozenset[tuple[str, int | None, int]] | None = None
-    """(config_hash, training_seed, episode_seed) of the stored rows of the same estimator and game;
-    if None, the file is read."""
+    known: frozenset[StoredKey] | None = None
+    """The stored rows of the same estimator and game; if None, the file is read."""
+    fresh: bool = False
+    """Whether episodes are run again even if they are stored; the new rows replace the old."""
 
     def stored(self, wanted: Sequence[Row]) -> dict[tuple[Any, ...], Row]:
         """Return those of the wanted rows that are stored, by their key. Their scores are included
         only if the file is read."""
+        if self.fresh:
+            return {}
         if self.known is None:
             return {rows_module.key(row): row for row in rows_module.read(self.path)}
-        stored = (row for row in wanted if rows_module.key(row)[4:] in self.known)
+        stored = (row for row in wanted if stored_key(row) in self.known)
         return {rows_module.key(row): row for row in stored}
 
 
@@ -54,6 +74,7 @@ def evaluate(
     condition: str = "nominal",
     options: Mapping[str, Any] | None = None,
     results: Path | str | None = None,
+    fresh: bool = False,
     log: Log = SILENT,
     progress: Callable[[int], None] | None = None,
 ) -> list[Row]:
@@ -73,9 +94,11 @@ def evaluate(
         condition: change of the episodes relative to the setup, such as ``load_step`` or
             ``noise5+dropout10``.
         options: settings of an estimator that is instantiated here.
-        results: a rows file to append to, in whole batches. Episodes already in it are not run
-            again, and their rows are taken from it. Curves for figures are written to a folder
-            beside it.
+        results: a rows file to append to, in whole batches. Episodes already in it, of the same
+            settings and the same code of estimator, system, simulation and scores, are not run
+            again: their rows are taken from it, which is logged as a warning. Curves for figures
+            are written to a folder beside it.
+        fresh: run all episodes, also those in ``results``, whose rows are replaced.
         log: TensorBoard log of scalars, figures and hyperparameters.
         progress: called after each batch with its number of episodes.
 
@@ -88,8 +111,10 @@ def evaluate(
     """
     game = Game.of(env_id, setup, condition)
     made = make_estimator(estimator, game, options or {})
-    stored = None if results is None else Results(Path(results))
+    stored = None if results is None else Results(Path(results), fresh=fresh)
     evaluated = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
+    if evaluated.reused:
+        _LOGGER.warning(evaluated.reuse(Path(results or "")))
     log_episodes(log, evaluated.rows, evaluated.first_played)
     log_summary(log, evaluated.rows)
     return evaluated.rows
@@ -118,6 +143,12 @@ class Evaluated:
     """The rows in the order of seeds. Rows known to be stored but not read have no scores."""
     first_played: Played | None
     """The first batch that was run; None if all episodes were stored."""
+    reused: int
+    """Number of episodes that were stored."""
+
+    def reuse(self, path: Path) -> str:
+        """Return in words how many episodes were taken from the rows file."""
+        return f"{self.reused} of {len(self.rows)} episodes taken from {path}"
 
 
 def run_episodes(
@@ -151,11 +182,13 @@ def run_episodes(
         if results is not None:
             # Curves first: if a crash follows, episodes without rows are run again.
             save(folder_of(results.path), done[0], curves_of(played))
-            rows_module.append(results.path, done, new=estimator.trains_on_record is not None)
+            new = estimator.trains_on_record is not None and not results.fresh
+            rows_module.append(results.path, done, new=new, replace=results.fresh)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))
-    return Evaluated([stored[rows_module.key(row)] for row in wanted], first_played)
+    rows = [stored[rows_module.key(row)] for row in wanted]
+    return Evaluated(rows, first_played, len(wanted) - len(missing))
 
 
 def _scored(played: Played) -> list[Row]:
@@ -202,26 +235,19 @@ def _check_model(model: System, system: System) -> None:
 def _common(estimator: BaseEstimator, game: Game) -> Row:
     """Return the fields common to all rows of an evaluation."""
     system = game.source.system
-    identity = {
-        "class": f"{type(estimator).__module__}.{type(estimator).__qualname__}",
-        "model": canonical(estimator.system),
-        "noise_std": canonical(estimator.noise_std),
-        "options": canonical(estimator.options),
-        "training": {k: v for k, v in canonical(estimator.training).items() if k != "seconds"},
-        "played": canonical(game.source.setup),
-    }
-    text = json.dumps(identity, sort_keys=True)
     return {
         "schema": SCHEMA,
         "kind": "score",
         **game.name._asdict(),
+        "game_hash": game_hash(game.source),
         "ranked": game.name.condition == canonical_name(system.ranked_condition),
         "nx": system.nx,
         "estimator": estimator.label,
         "track": estimator.track,
         "knows": list(estimator.knows),
         "options": canonical(estimator.options),
-        "config_hash": hashlib.sha256(text.encode()).hexdigest()[:12],
+        "estimator_code": estimator_code(type(estimator)),
+        "estimator_hash": estimator_hash(estimator),
         "training": canonical(estimator.training),
         "training_seed": estimator.training.get("seed"),
         "versions": versions(),

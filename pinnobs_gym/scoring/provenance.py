@@ -1,4 +1,4 @@
-"""The provenance of a score: settings, versions and date."""
+"""The provenance of a score: code, settings, versions and date."""
 
 from __future__ import annotations
 
@@ -9,10 +9,88 @@ from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.scoring.code_hash import Unreadable, code_hash, content, digest
 from pinnobs_gym.simulation.system import System
+
+_GAME = (
+    "pinnobs_gym.envs.episodes",
+    "pinnobs_gym.scoring.metrics",
+    "pinnobs_gym.scoring.consistency",
+    "pinnobs_gym.scoring.cramer_rao",
+)
+"""The modules that make and score episodes, with what they import."""
+
+
+def game_hash(source: EpisodeSource) -> str:
+    """Return the hash of a game: the code of its system, of the simulation and of the scores, its
+    setup and the system's parameters. Scores with another hash are not comparable.
+
+    A game whose code cannot be read has another hash each time.
+    """
+    try:
+        code = code_hash(type(source.system), *_GAME)
+        return digest([code, content(source.system), content(source.setup)])
+    except Unreadable:
+        return _unique()
+
+
+def estimator_code(cls: type[BaseEstimator]) -> str:
+    """Return the hash of the code of an estimator and, if it trains on each record, of its trainer;
+    ``unreadable`` if the code cannot be read."""
+    try:
+        trainer = cls.trains_on_record
+        return code_hash(cls, *(() if trainer is None else (TRAINERS.resolve(trainer),)))
+    except Unreadable:
+        return "unreadable"
+
+
+def training_code(trainer: str, source: EpisodeSource) -> str:
+    """Return the hash of what a trained estimator depends on beside the settings: the code of its
+    trainer, and that of the episodes. If it cannot be read, the hash is another each time."""
+    try:
+        return code_hash(
+            TRAINERS.resolve(trainer),
+            type(source.system),
+            "pinnobs_gym.envs.episodes",
+            "pinnobs_gym.training.loop",
+        )
+    except Unreadable:
+        return _unique()
+
+
+def estimator_hash(estimator: BaseEstimator) -> str:
+    """Return the hash of an estimator: its code, its settings, its model and what was trained.
+
+    If a part cannot be read, such as a lambda among the settings, the hash is another each time, so
+    that its scores are never taken for those of another estimator.
+    """
+    held = getattr(estimator, "trained", None)
+    names = [f.name for f in fields(held) if f.name != "seconds"] if is_dataclass(held) else []
+    training = {name: value for name, value in estimator.training.items() if name != "seconds"}
+    parts = {
+        "model": estimator.system,
+        "noise_std": estimator.noise_std,
+        "options": estimator.options,
+        "training": training,
+        "trained": {name: getattr(held, name) for name in names},
+    }
+    code = estimator_code(type(estimator))
+    try:
+        return _unique() if code == "unreadable" else digest([code, content(parts)])
+    except Unreadable:
+        return _unique()
+
+
+def _unique() -> str:
+    """Return a hash that equals no other."""
+    return f"once{uuid4().hex[:8]}"
 
 
 def canonical(value: Any) -> Any:

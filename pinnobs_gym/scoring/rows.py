@@ -6,7 +6,7 @@ import gc
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import FileIO
 from operator import itemgetter
@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.files import json_line, locked, write_whole
+from pinnobs_gym.files import json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
-SCHEMA = 3
+SCHEMA = 4
 """Version of the row format."""
 
 Row: TypeAlias = dict[str, Any]
@@ -25,9 +25,12 @@ Row: TypeAlias = dict[str, Any]
 
 - ``schema``: version of this format.
 - ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
+- ``game_hash``: hash of the code and settings that make and score the episode.
 - ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
-- ``estimator``, ``track``, ``knows``, ``options``, ``config_hash``: the estimator, its track, its
-  prior knowledge, its settings, and a hash of these and of its model and training.
+- ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
+  and its settings.
+- ``estimator_code``: hash of the estimator's code.
+- ``estimator_hash``: hash of its code, settings, model and training.
 - ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,
   ...
 - the scores of `pinnobs_gym.scoring.metrics.score` by name; ``null`` stands for infinity.
@@ -50,8 +53,9 @@ KEY = (
     "env_id",
     "setup",
     "condition",
+    "game_hash",
     "estimator",
-    "config_hash",
+    "estimator_hash",
     "training_seed",
     "episode_seed",
 )
@@ -89,7 +93,7 @@ key: Callable[[Row], tuple[Any, ...]] = itemgetter(*KEY)
 """Return the values of `KEY` of a row."""
 
 
-def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
+def append(path: Path, rows: Iterable[Row], *, new: bool = False, replace: bool = False) -> None:
     """Append rows to a file, all or none of them, under a lock: several processes and machines may
     share the file. An incomplete line at its end, left by a killed process, is cut off first.
 
@@ -98,12 +102,18 @@ def append(path: Path, rows: Iterable[Row], *, new: bool = False) -> None:
         rows: the rows to append.
         new: leave out scored episodes that are already in the file, which is read for this purpose.
             Of two runs whose scores may differ, the first counts.
+        replace: delete earlier rows of the same episodes, together with the appending: the file is
+            written anew.
 
     Raises:
         CannotWrite: in one line, if the file cannot be written; its content is unchanged.
     """
     try:
         with locked(path) as file:
+            rows = list(rows)
+            if replace:
+                _replace(path, file, rows)
+                return
             present = _keys(file) if new else set()
             rows = [row for row in rows if row["kind"] != "score" or key(row) not in present]
             _write(file, b"".join(_line(row) for row in rows))
@@ -116,6 +126,26 @@ def _keys(file: FileIO) -> set[tuple[Any, ...]]:
     file.seek(0)
     rows = [_parsed(line) for line in file.readall().splitlines()]
     return {key(row) for row in rows if row is not None and row.get("kind") == "score"}
+
+
+def _replace(path: Path, file: FileIO, rows: Sequence[Row]) -> None:
+    """Write a locked file anew: without the earlier rows of these episodes, and with these."""
+    keys = {key(row) for row in rows}
+    file.seek(0)
+    *lines, tail = file.readall().split(b"\n")
+    lines += [] if _is_cut(tail) or not tail else [tail]
+    file.close()  # Windows replaces no open file
+    kept = [line + b"\n" for line in lines if _key_in(line) not in keys]
+    with replacing(path) as temporary:
+        temporary.write_bytes(b"".join(kept) + b"".join(_line(row) for row in rows))
+
+
+def _key_in(line: bytes) -> tuple[Any, ...] | None:
+    """Return the key of the scored row in a line; None if it is another line."""
+    row = _parsed(line)
+    if row is None or (row.get("schema"), row.get("kind")) != (SCHEMA, "score"):
+        return None
+    return key(row)
 
 
 def _write(file: FileIO, data: bytes) -> None:
@@ -285,7 +315,7 @@ def _parsed(line: bytes) -> Row | None:
 
 _ABSENT = object()
 _NEEDED = {
-    "score": frozenset((*KEY, *SCORES, "diverged", "ranked", "nx")),
+    "score": frozenset((*KEY, *SCORES, "diverged", "ranked", "nx", "estimator_code", "date")),
     "failure": frozenset((*JOB, "error", "date")),
     "recovery": frozenset((*JOB, "date")),
 }

@@ -46,7 +46,7 @@ def log_folder(folder: Path, row: Row) -> Path:
     """Return the log folder of a row's estimator; other settings of it have another folder."""
     system = row["env_id"].removeprefix("pinnobs/")
     played = folder / "tensorboard" / system / row["setup"] / row["condition"]
-    return played / row["estimator"] / row["config_hash"]
+    return played / row["estimator"] / row["estimator_hash"]
 
 
 def log_summaries(folder: Path, rows: Iterable[Row]) -> None:

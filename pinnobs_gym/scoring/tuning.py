@@ -14,9 +14,11 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.metrics import score
 from pinnobs_gym.scoring.playing import play
+from pinnobs_gym.scoring.provenance import estimator_code, game_hash
 
 if TYPE_CHECKING:
     import optuna
+    from optuna.storages import JournalStorage
 
 TUNING_SEED = 2 * 10**6
 """Seed of the first tuning episode; none of these episodes is scored."""
@@ -102,6 +104,13 @@ class Search:
                 study.tell(trial, error)
                 progress(Tried(settings, error))
 
+    def forget(self) -> None:
+        """Delete the trials of this search from the storage."""
+        self._study()
+        import optuna
+
+        optuna.delete_study(study_name=self._name(), storage=self._journal())
+
     def done(self) -> int:
         """Return the number of finished trials in the storage."""
         ended = ("COMPLETE", "PRUNED")
@@ -115,8 +124,6 @@ class Search:
     def _study(self) -> optuna.Study:
         try:
             import optuna
-            from optuna.storages import JournalStorage
-            from optuna.storages.journal import JournalFileBackend
         except ImportError:
             raise ValueError(
                 'tuning needs Optuna; install it with pip install "pinnobs-gym[tune]"'
@@ -124,9 +131,8 @@ class Search:
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.storage.parent.mkdir(parents=True, exist_ok=True)
         try:
-            storage = JournalStorage(JournalFileBackend(str(self.storage)))
             study = optuna.create_study(
-                storage=storage, study_name=self._name(), load_if_exists=True
+                storage=self._journal(), study_name=self._name(), load_if_exists=True
             )
         except Exception as error:  # whatever a file that is no journal makes it raise
             raise ValueError(f"cannot read trials from {self.storage}: {error}") from None
@@ -134,7 +140,16 @@ class Search:
         study.sampler = optuna.samplers.TPESampler(seed=self.seed + len(study.trials))
         return study
 
+    def _journal(self) -> JournalStorage:
+        """Return Optuna's view of the storage."""
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+
+        return JournalStorage(JournalFileBackend(str(self.storage)))
+
     def _name(self) -> str:
-        """Return the name of the study, common to all trials in one storage."""
-        what = (*self.game.name, ESTIMATORS.name_of(self.estimator))
+        """Return the name of the study, common to its trials: those of other code are not
+        continued."""
+        code = (game_hash(self.game.source), estimator_code(self.estimator))
+        what = (*self.game.name, ESTIMATORS.name_of(self.estimator), *code)
         return "-".join([*what, f"{self.episodes} episodes", str(dict(self.estimator.tunable))])

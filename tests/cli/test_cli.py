@@ -222,7 +222,7 @@ def test_a_damaged_rows_file_is_refused_before_anything_runs(folder, capsys):
     assert "lb/rows.jsonl, line 1, is cut off" in capsys.readouterr().err
     path.write_text('{"schema": 2}\n')
     assert run("leaderboard", *QUICK, "--out", "lb") == 2
-    assert "lb/rows.jsonl, line 1: rows of schema 2; expected 3" in capsys.readouterr().err
+    assert "lb/rows.jsonl, line 1: rows of schema 2; expected 4" in capsys.readouterr().err
     assert path.read_text() == '{"schema": 2}\n'
 
 
@@ -316,7 +316,7 @@ def test_a_gain_is_trained_on_several_episodes_and_told_the_noise(folder, capsys
     for condition in ("nominal", "noise5"):
         more = ["--system", "Academic", "--episodes", "2", "--condition", condition]
         assert run(*scored, *more) == 0
-    assert len({row["config_hash"] for row in rows.read(folder / "ev" / "rows.jsonl")}) == 2
+    assert len({row["estimator_hash"] for row in rows.read(folder / "ev" / "rows.jsonl")}) == 2
 
 
 def test_an_estimators_fault_is_one_line(folder, capsys):

@@ -32,9 +32,9 @@ def test_ratios_are_of_the_episodes_that_the_peer_and_all_trainings_played():
     made = {"training": {"seconds": 1.0}}
     rows = [
         *rows_of("ekf", [1.0, 1.0, 2.0]),
-        *rows_of("gain", [0.5, 4.0], training_seed=0, config_hash="g0", **made),
-        *rows_of("gain", [0.25, 1.0, 1.0], training_seed=1, config_hash="g1", **made),
-        *rows_of("gain", [9.0], condition="delay", training_seed=0, config_hash="g0", **made),
+        *rows_of("gain", [0.5, 4.0], training_seed=0, estimator_hash="g0", **made),
+        *rows_of("gain", [0.25, 1.0, 1.0], training_seed=1, estimator_hash="g1", **made),
+        *rows_of("gain", [9.0], condition="delay", training_seed=0, estimator_hash="g0", **made),
     ]
     gain, ekf = contenders(runs_of(rows))
     assert (gain.name, ekf.name) == ("gain", "ekf")  # the most rows first

@@ -7,12 +7,13 @@ from made_rows import rows_of
 from pinnobs_gym.leaderboard import ranks, ranks_table
 from pinnobs_gym.leaderboard.board import board, markdown
 from pinnobs_gym.leaderboard.contenders import contenders, label
+from pinnobs_gym.leaderboard.distinct import distinct
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.scoring.rows import Stored
 
 
 def lines(rows):
-    return ranks.lines(contenders(runs_of(rows)))
+    return ranks.lines(contenders(runs_of(distinct(rows).rows)))
 
 
 def placed(rows):
@@ -64,14 +65,14 @@ def test_cells_by_hand():
 
 def test_settings_and_budgets_are_told_apart_and_training_seeds_are_not():
     rows = [
-        *rows_of("ekf", [0.5], options={"gate": 0.99}, config_hash="gated"),
+        *rows_of("ekf", [0.5], options={"gate": 0.99}, estimator_hash="gated"),
         *rows_of("ekf", [1.0, 1.0]),
         *rows_of("gain", [0.5, 0.5], training={"config": {"budget": 9.0}}, training_seed=0),
         *rows_of("gain", [2.0, 2.0], training={"config": {"budget": 9.0}}, training_seed=1),
     ]
     found = {line.estimator: line for line in lines(rows)}
-    assert set(found) == {"ekf", 'ekf {"gate": 0.99}', "gain, 9 s"}
-    assert found['ekf {"gate": 0.99}'].ratio.value == pytest.approx(0.5)
+    assert set(found) == {"ekf", "ekf (gate=0.99)", "gain, 9 s"}
+    assert found["ekf (gate=0.99)"].ratio.value == pytest.approx(0.5)
 
 
 def test_training_seeds_are_resampled():

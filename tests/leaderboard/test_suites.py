@@ -140,7 +140,7 @@ def test_variants_have_rows_of_their_own_and_what_is_stored_is_not_run_again(tmp
     assert run(suite) == both
     assert run(suite) == []
     assert run(suite.changed(episodes=4)) == [("ekf", 3), ("robust ekf", 3)]
-    hashes = {row["estimator"]: row["config_hash"] for row in rows.read(path)}
+    hashes = {row["estimator"]: row["estimator_hash"] for row in rows.read(path)}
     assert len(set(hashes.values())) == 2
     # another setting under the same name: what is stored is of another configuration
     other = (Entry("ekf"), Entry("ekf", "robust ekf", {"huber": 2.0}))

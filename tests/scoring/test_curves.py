@@ -39,14 +39,17 @@ def one(**changes):
     return Curves(t=t, states=("a (m)", "b"), measured={0: 0}, **{**parts, **changes})
 
 
+HASHES = {"game_hash": "4567", "estimator_hash": "0123"}
+
+
 def row(seed=3):
-    return {**NOISY._asdict(), "estimator": "a b/c", "config_hash": "0123", "episode_seed": seed}
+    return {**NOISY._asdict(), "estimator": "a b/c", **HASHES, "episode_seed": seed}
 
 
 def test_what_is_written_is_read_back(tmp_path):
     curves.save(tmp_path, row(), one())
     found = curves.read(tmp_path, NOISY)
-    (back,) = found["a b/c", "0123"]
+    (back,) = found["4567", "0123"]
     np.testing.assert_array_equal(back.error, one().error)
     np.testing.assert_array_equal(back.example.x, one().example.x)
     assert (back.states, back.measured, back.example.seed) == (("a (m)", "b"), {0: 0}, 3)

@@ -63,13 +63,13 @@ def test_instance_class_and_name_give_the_same_scores():
     by_instance = evaluate(EKF(ReverseDuffing(), noise_std=0.02), ENV, episodes=2)
     for other in (by_class, by_instance):
         assert [r["nrmse"] for r in other] == [r["nrmse"] for r in by_name]
-        assert [r["config_hash"] for r in other] == [r["config_hash"] for r in by_name]
+        assert [r["estimator_hash"] for r in other] == [r["estimator_hash"] for r in by_name]
 
 
 def test_options_are_settings_and_part_of_the_identity():
     default = evaluate("ekf", ENV, episodes=1)
     tuned = evaluate("ekf", ENV, episodes=1, options={"process_noise": 1e-2})
-    assert tuned[0]["config_hash"] != default[0]["config_hash"]
+    assert tuned[0]["estimator_hash"] != default[0]["estimator_hash"]
     assert tuned[0]["nrmse"] != default[0]["nrmse"]
     assert tuned[0]["options"]["process_noise"] == 1e-2
 

@@ -136,7 +136,7 @@ def test_files_are_merged_by_concatenation_in_any_order(tmp_path):
 def test_another_schema_and_missing_fields_are_refused(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(schema=99)])
-    with pytest.raises(ValueError, match="schema 99; expected 3: move the file"):
+    with pytest.raises(ValueError, match="schema 99; expected 4: move the file"):
         rows.read(path)
     path.unlink()
     incomplete = row()

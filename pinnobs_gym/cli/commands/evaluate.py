@@ -42,6 +42,8 @@ class Evaluate:
     """Number of episodes."""
     seed: int = 0
     """Seed of the first episode."""
+    fresh: bool = False
+    """Run all episodes, also those whose scores are stored; the new scores replace them."""
     out: Path = Path("runs/evaluate")
     """Folder of rows and TensorBoard log."""
     video: Path | None = None
@@ -82,8 +84,11 @@ class Evaluate:
             def count(done: int) -> None:
                 bar.advance(task, done)
 
-            evaluated = run_episodes(game, estimator, seeds, Results(self._rows), count)
+            results = Results(self._rows, fresh=self.fresh)
+            evaluated = run_episodes(game, estimator, seeds, results, count)
             bar.update(task, completed=episodes)
+        if evaluated.reused:
+            console.print(evaluated.reuse(self._rows), soft_wrap=True, highlight=False)
         with Log(log_folder(self.out, evaluated.rows[0])) as log:
             log_episodes(log, evaluated.rows, evaluated.first_played)
             log_summary(log, evaluated.rows)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pinnobs_gym.cli.console import RunView, console, print_grid, print_table
 from pinnobs_gym.cli.options import parse
@@ -14,6 +14,7 @@ from pinnobs_gym.leaderboard import ranks_table, standings_table, suites
 from pinnobs_gym.leaderboard.board import board, markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
+from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.scoring import rows, tensorboard
 
 PROCESSES = 2
@@ -55,6 +56,9 @@ class Leaderboard:
     """Address of the Dask scheduler, such as tcp://host:8786."""
     retry_failed: bool = False
     """Run jobs again that failed before; otherwise they are left out."""
+    fresh: bool = False
+    """Run all episodes, also those whose scores are stored; the new scores replace them. Trained
+    files are kept."""
     out: Path = Path("runs/leaderboard")
     """Folder of rows, tables, TensorBoard log and trained files."""
 
@@ -77,13 +81,15 @@ class Leaderboard:
         stored = rows.load(path)  # reject a damaged file before anything is run
         if stored.warning:
             console.print(stored.warning, style="yellow", soft_wrap=True)
-        jobs = plan.jobs_of(played, self.out.absolute())
+        jobs = [replace(job, fresh=self.fresh) for job in plan.jobs_of(played, self.out.absolute())]
         to_run, left_out = plan.left(jobs, stored, self.retry_failed)
+        earlier = {rows.key(row): row["date"] for row in stored.rows}
         engine = Engine(workers)
         with RunView(len(to_run), lambda: [job.name for job in engine.running]) as view:
             for job, error in engine.run(to_run):
                 view.ended(job.name, error)
         stored = rows.load(path)
+        self._say_reuse(to_run, view.failed, earlier, stored)
         tensorboard.log_summaries(self.out, stored.rows)
         self._report(stored, {job.game.name.condition for job in jobs})
         if left_out:
@@ -94,6 +100,23 @@ class Leaderboard:
                 soft_wrap=True,
             )
         return 1 if view.failed or left_out else 0
+
+    def _say_reuse(
+        self,
+        jobs: Sequence[Job],
+        failed: int,
+        earlier: Mapping[tuple[Any, ...], str],
+        stored: rows.Stored,
+    ) -> None:
+        """Print how many episodes were taken from the rows file, if any were."""
+        asked = sum(job.episodes for job in jobs)
+        played = sum(earlier.get(rows.key(row)) != row["date"] for row in stored.rows)
+        if not failed and played < asked:
+            console.print(
+                f"{asked - played} of {asked} episodes taken from {self.out / 'rows.jsonl'}",
+                soft_wrap=True,
+                highlight=False,
+            )
 
     def _workers(self) -> Workers:
         if self.backend == "dask":
@@ -118,6 +141,8 @@ class Leaderboard:
         console.print(standings_table.NOTE if len(conditions) <= 2 else "")
         print_grid("Across systems", *ranks_table.cells(results.lines))
         console.print(ranks_table.NOTE)
+        for note in results.notes:
+            console.print(note, style="yellow", markup=False, soft_wrap=True)
         if len(results.ranks) > 1:
             print_grid("Ranks", *ranks_table.rank_cells(results.ranks))
             console.print(ranks_table.RANK_NOTE)

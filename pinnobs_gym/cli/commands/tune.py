@@ -36,6 +36,8 @@ class Tune:
     """Episodes of each trial."""
     seed: int = 0
     """Seed of the search."""
+    fresh: bool = False
+    """Search anew, without the trials of earlier runs."""
     out: Path = Path("runs/tune")
     """Folder of the trials."""
 
@@ -48,7 +50,11 @@ class Tune:
         check_writable(self.out)
         path = self.out / f"{game.name.file_stem}-{ESTIMATORS.name_of(cls)}.journal"
         search = Search(cls, game, self.episodes, path, self.seed)
+        if self.fresh:
+            search.forget()
         done = search.done()
+        if done:
+            console.print(f"{done} trials taken from {path}", soft_wrap=True, highlight=False)
         default = Tried({}, search.error({}))
         console.print(f"default: geometric mean NRMSE {default.error:.4g}", highlight=False)
         stopped = False

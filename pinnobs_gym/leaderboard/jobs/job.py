@@ -15,8 +15,15 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import rows as rows_module
-from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes
-from pinnobs_gym.scoring.provenance import canonical, now, versions
+from pinnobs_gym.scoring.evaluation import Results, StoredKey, make_estimator, run_episodes
+from pinnobs_gym.scoring.provenance import (
+    canonical,
+    estimator_code,
+    game_hash,
+    now,
+    training_code,
+    versions,
+)
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder
 from pinnobs_gym.training.by_name import load, train_by_name
@@ -41,8 +48,10 @@ class Job:
     """The estimator's own settings."""
     label: str | None = None
     """Name of the estimator in rows; its own name if None."""
-    known: frozenset[tuple[str, int | None, int]] | None = None
+    known: frozenset[StoredKey] | None = None
     """Keys of the stored rows; see `Results`."""
+    fresh: bool = False
+    """Whether stored episodes are run again; see `Results`."""
     failed: bool = False
     """Whether the job failed before and is retried."""
 
@@ -60,9 +69,14 @@ class Job:
 
     @property
     def digest(self) -> str:
-        """Hash of the job's specification."""
-        aside = {f.name: None for f in fields(self) if f.name in ("folder", "known", "failed")}
-        return _digest({f.name: getattr(self, f.name) for f in fields(self)} | aside)
+        """Hash of the job's specification and of the code that it runs."""
+        aside = ("folder", "known", "fresh", "failed")
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in aside}
+        cls = ESTIMATORS.resolve(self.estimator)
+        trainer = cls.needs_training
+        code = [game_hash(self.game.source), estimator_code(cls)]
+        code += [] if trainer is None else [training_code(trainer, self.game.source)]
+        return _digest({**own, "code": code})
 
     def run(self) -> None:
         """Append the missing rows; see `run_job`."""
@@ -108,13 +122,14 @@ def run_job(job: Job) -> None:
     if cls.trains_on_record is not None:
         recipe = TRAINERS.resolve(cls.trains_on_record).configured(job.training)
         stem = job.game.name.file_stem
-        place = f"{stem}-{cls.trains_on_record}-{_digest(recipe)}-episode{job.seed}"
+        code = training_code(cls.trains_on_record, job.game.source)
+        place = f"{stem}-{cls.trains_on_record}-{_digest([recipe, code])}-episode{job.seed}"
         options = {"config": recipe, "folder": job.folder / "trained" / place}
     elif cls.needs_training is not None:
         chosen = trained(cls, job)
     estimator = make_estimator(chosen, job.game, options)
     seeds = range(job.seed, job.seed + job.episodes)
-    results = Results(job.rows, job.known)
+    results = Results(job.rows, job.known, job.fresh)
     evaluated = run_episodes(job.game, estimator, seeds, results, label=job.label)
     scored = [row for row in evaluated.rows if "nrmse" in row]
     if evaluated.first_played is not None:  # some episodes were not stored
@@ -127,7 +142,8 @@ def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:
     before."""
     name = str(cls.needs_training)
     recipe = TRAINERS.resolve(name).configured({**cls.recipe, **job.training})
-    label = f"{job.game.name.file_stem}-{name}-{_digest(recipe)}"
+    code = training_code(name, job.game.source)
+    label = f"{job.game.name.file_stem}-{name}-{_digest([recipe, code])}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:

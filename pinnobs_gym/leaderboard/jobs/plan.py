@@ -15,6 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
 from pinnobs_gym.scoring.rows import Stored, game_of
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
@@ -99,11 +100,9 @@ def _learning(
 def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[Job], list[Job]]:
     """Return the jobs to run, with the keys of their stored rows, and the jobs left out because
     they failed before; with ``retry_failed`` the latter are run again."""
-    known_rows: dict[tuple[GameName, str], list[tuple[str, int | None, int]]] = defaultdict(list)
+    known_rows: dict[tuple[GameName, str], list[StoredKey]] = defaultdict(list)
     for row in stored.rows:
-        known_rows[game_of(row), row["estimator"]].append(
-            (row["config_hash"], row["training_seed"], row["episode_seed"])
-        )
+        known_rows[game_of(row), row["estimator"]].append(stored_key(row))
     failed = {row["job"] for row in stored.failures}
     to_run, left_out = [], []
     for job in jobs:
@@ -117,7 +116,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
             name = job.label or ESTIMATORS.name_of(cls)
             keys = known_rows[job.game.name, name]
             seeds = range(job.seed, job.seed + job.episodes)
-            known = frozenset(entry for entry in keys if entry[2] in seeds)
+            known = frozenset(entry for entry in keys if entry[-1] in seeds)
         to_run.append(replace(job, known=known, failed=again))
     return to_run, left_out
 

@@ -88,7 +88,7 @@ def _curves(game: GameName, players: Players, folders: Sequence[Path]) -> dict[s
             parts[name] += listed
     by_contender = {}
     for name, runs in players.items():
-        names = sorted((run.estimator, run.config_hash) for run in runs)
+        names = sorted(run.hashes for run in runs)
         own = [part for each in names for part in parts.get(each, [])]
         merged = curves.merged(own, {row["episode_seed"] for row in rows_of(runs)})
         if merged is not None:

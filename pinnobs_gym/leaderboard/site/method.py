@@ -8,7 +8,7 @@ from typing import Any
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import Contender
-from pinnobs_gym.leaderboard.runs import Run, rows_of
+from pinnobs_gym.leaderboard.runs import Run, rows_of, runs_of
 from pinnobs_gym.leaderboard.standings import training_of
 from pinnobs_gym.scoring.rows import Row, Stored, game_of
 
@@ -46,6 +46,8 @@ class Method:
     failures: tuple[FailedJob, ...]
     versions: Mapping[str, str]
     """Versions of each package."""
+    notes: tuple[str, ...]
+    """What was left out, a sentence each."""
     commands: tuple[str, ...]
     """Command lines that reproduce the rows."""
     dates: str
@@ -54,8 +56,8 @@ class Method:
     """Number of rows."""
 
 
-def method_of(stored: Stored, runs: Sequence[Run], contenders: Iterable[Contender]) -> Method:
-    """Return the provenance of stored scores, given their runs and contenders."""
+def method_of(stored: Stored, contenders: Iterable[Contender], notes: tuple[str, ...]) -> Method:
+    """Return the provenance of stored scores, given their contenders and what was left out."""
     return Method(
         estimators=tuple(map(estimator_method, contenders)),
         failures=tuple(
@@ -63,7 +65,8 @@ def method_of(stored: Stored, runs: Sequence[Run], contenders: Iterable[Contende
             for row in stored.failures
         ),
         versions=versions(stored.rows),
-        commands=tuple(commands(runs)),
+        notes=notes,
+        commands=tuple(commands(runs_of(stored.rows))),
         dates=dates(stored.rows),
         episodes=len(stored.rows),
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pinnobs_gym.leaderboard import ranks
 from pinnobs_gym.leaderboard.contenders import PEER, Contender, contenders
+from pinnobs_gym.leaderboard.distinct import distinct
 from pinnobs_gym.leaderboard.ranks import Line
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.site.across import Factors, costs, factors, training_seconds
@@ -59,7 +60,8 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
     Raises:
         ValueError: in one line, if a file of curves is damaged.
     """
-    runs = runs_of(stored.rows)
+    kept, notes = distinct(stored.rows)
+    runs = runs_of(kept)
     compared = contenders(runs)
     lines = ranks.lines(compared)
     listed = _listed(compared, lines)
@@ -71,7 +73,7 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
         costs=costs(lines, seconds),
         sections=tuple(_sections(games_of(listed, folders))),
         factors=tuple(factors(compared)),
-        method=method_of(stored, runs, listed),
+        method=method_of(stored, listed, notes),
     )
 
 

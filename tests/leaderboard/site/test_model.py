@@ -28,7 +28,7 @@ def scored():
             ranked = condition == "load_step"
             rows += rows_of(name, [0.1, 0.3], condition=condition, ranked=ranked, **MOTOR)
     for seed in (0, 1):
-        made = {"training": {"seed": seed}, "training_seed": seed, "config_hash": f"gain{seed}"}
+        made = {"training": {"seed": seed}, "training_seed": seed, "estimator_hash": f"gain{seed}"}
         rows += rows_of("gain", [0.2, 0.1], **COMMON, **made)
     return rows
 
@@ -92,12 +92,12 @@ def test_drawing_needs_neither_rows_nor_curves(tmp_path, counted):
 
 def test_a_contender_has_one_name_in_all_sections():
     """Other settings have fewer rows in all, but more under the condition that is ranked."""
-    gated = {"options": {"gate": 0.9}, "config_hash": "gated"}
+    gated = {"options": {"gate": 0.9}, "estimator_hash": "gated"}
     rows = rows_of("ekf", [0.1] * 4, condition="noise5", ranked=False, **COMMON)
     rows += rows_of("ekf", [0.1], **COMMON)
     rows += rows_of("ekf", [0.2, 0.2], **gated, **COMMON)
     page = page_model(Stored(rows, []), [])
-    gate = 'ekf {"gate": 0.9}'
+    gate = "ekf (gate=0.9)"
     assert {line.estimator for line in page.lines} == set(page.tracks) == {"ekf", gate}
     medians = {line.estimator: [s.nrmse.value for s in line.games.values()] for line in page.lines}
     assert medians == {"ekf": [0.1], gate: [0.2]}

@@ -1,0 +1,221 @@
+"""Hashes of code, on which a score depends beside the settings.
+
+The syntax trees of a module and of all modules of its project that it imports are hashed, also
+those imported inside functions. Docstrings and comments do not count. Packages of others count by
+their version alone, which rows carry; files that code reads at run time are not seen.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import sys
+import sysconfig
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+
+import pinnobs_gym
+from pinnobs_gym.simulation.system import System
+
+_OWN = frozenset({"pinnobs_gym", "trainers"})
+"""Packages that are followed wherever they are installed."""
+_FACE = "pinnobs_gym"
+"""The package whose names are imported lazily from the modules below it."""
+
+
+class Unreadable(Exception):
+    """Code without readable source, such as a lambda or a cell of a notebook."""
+
+
+def code_hash(*subjects: type | str) -> str:
+    """Return the hash of the code of classes, with all that they derive from, and of modules by
+    name, with all that these import of their projects.
+
+    The code counts as it was loaded: an edited file counts once its module is loaded again.
+
+    Raises:
+        Unreadable: in one line, if the source of a class or module cannot be read.
+    """
+    names = {name for subject in subjects for name in _modules(subject)}
+    home = {name.partition(".")[0] for name in names} | _OWN
+    digests: dict[str, str] = {}
+    waiting = sorted(names)
+    while waiting:
+        name = waiting.pop()
+        if name not in digests:
+            digests[name], imports = _loaded(name)
+            followed = [pair for pair in imports if _is_followed(pair[0], home)]
+            waiting += [_home_of(base, part) for base, part in followed]
+    return digest(sorted(digests.items()))
+
+
+def content(value: Any) -> Any:
+    """Convert settings and trained values to nested lists and numbers, of which arrays are
+    represented by a hash. Functions and classes are represented by the hash of their code.
+
+    Raises:
+        Unreadable: in one line, if a part is neither data nor code with a source.
+    """
+    if value is None or isinstance(value, bool | int | float | str | bytes | complex):
+        return repr(value)
+    if isinstance(value, np.ndarray | np.generic):
+        array = np.ascontiguousarray(value)
+        return [str(array.dtype), array.shape, hashlib.sha256(array.tobytes()).hexdigest()]
+    if isinstance(value, Mapping):
+        return sorted([str(name), content(part)] for name, part in value.items())
+    if isinstance(value, set | frozenset):
+        return sorted(repr(content(part)) for part in value)
+    if isinstance(value, list | tuple):
+        return [content(part) for part in value]
+    if isinstance(value, Path):
+        return str(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        code = code_hash(type(value)) if isinstance(value, System) else ""
+        parts = [[f.name, content(getattr(value, f.name))] for f in fields(value)]
+        return [type(value).__qualname__, code, parts]
+    if isinstance(value, type):
+        return [value.__qualname__, code_hash(value)]
+    if isinstance(value, FunctionType) and "<" not in value.__qualname__:
+        return [value.__qualname__, code_hash(value.__module__)]
+    name = getattr(value, "__qualname__", type(value).__qualname__)
+    raise Unreadable(f"{name} is neither data nor code with a source of its own")
+
+
+def digest(value: Any) -> str:
+    """Return a short hash of what `repr` shows of a value."""
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
+
+
+def _modules(subject: type | str) -> Iterator[str]:
+    """Yield the modules that define a class and its bases, without those of foreign packages."""
+    if isinstance(subject, str):
+        yield subject
+        return
+    home = {subject.__module__.partition(".")[0]} | _OWN
+    for cls in subject.__mro__:
+        if cls is subject or _is_followed(cls.__module__, home):
+            yield cls.__module__
+
+
+def _is_followed(name: str, home: set[str] | frozenset[str]) -> bool:
+    """Return whether a module belongs to a project: those of the subjects, and any whose files are
+    not installed as a package of others."""
+    top = name.partition(".")[0]
+    if top in home:
+        return True
+    if top in sys.stdlib_module_names:
+        return False
+    return not _is_installed(top)
+
+
+@lru_cache(maxsize=512)
+def _is_installed(top: str) -> bool:
+    """Return whether a package comes from the folders of installed packages, or from nowhere."""
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        return True
+    if spec is None:
+        return True
+    origin = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
+    if origin is None or origin in ("built-in", "frozen"):
+        return True
+    paths = {sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib", "platstdlib")}
+    parents = Path(origin).resolve().parents
+    if any(parent.name in ("site-packages", "dist-packages") for parent in parents):
+        return True
+    return any(Path(path).resolve() in parents for path in paths if path)
+
+
+_Import = tuple[str, str]
+"""A module, and the name that is imported from it, if any."""
+_LOADED: dict[str, tuple[ModuleType, ModuleSpec | None, str, tuple[_Import, ...]]] = {}
+"""By name: the module and its spec, of which a reload makes new ones, the digest of its code, and
+its imports."""
+
+
+def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
+    """Return the digest of a module's code, and its imports."""
+    module = sys.modules.get(name)
+    if module is not None and name in _LOADED:
+        same, spec, code, imports = _LOADED[name]
+        if same is module and spec is module.__spec__:
+            return code, imports
+    spec = _spec(name)
+    file = getattr(module, "__file__", None) or (spec.origin if spec else None)
+    if file is None or not file.endswith(".py"):
+        raise Unreadable(f"module {name} has no source file")
+    try:
+        tree = ast.parse(Path(file).read_bytes())
+    except (OSError, SyntaxError) as error:
+        raise Unreadable(f"module {name}: {error}") from None
+    package = spec.parent if spec else name.rpartition(".")[0]
+    code, imports = digest(_shape(tree)), tuple(_imports(package or "", tree))
+    if module is not None:
+        _LOADED[name] = module, module.__spec__, code, imports
+    return code, imports
+
+
+def _shape(node: Any) -> Any:
+    """Return the shape of a syntax tree: no positions, no docstrings, no empty fields, which
+    differ between versions of Python."""
+    if isinstance(node, ast.AST):
+        parts = (
+            (field, _shape(value)) for field, value in ast.iter_fields(node) if field != "kind"
+        )
+        return [type(node).__name__, *(part for part in parts if part[1] not in (None, []))]
+    if isinstance(node, list):
+        return [_shape(part) for part in node if not _is_text(part)]
+    return None if node is None else repr(node)
+
+
+def _is_text(node: Any) -> bool:
+    """Return whether a statement is a string alone, such as a docstring."""
+    if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
+        return False
+    return isinstance(node.value.value, str)
+
+
+def _imports(package: str, tree: ast.AST) -> Iterator[_Import]:
+    """Yield what a module of a package imports, at its head or inside functions."""
+    for node in _executed(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, ""
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            for alias in node.names:
+                yield base, alias.name
+
+
+def _executed(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes of a tree, without blocks for type checkers."""
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if not (isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING")):
+            yield from _executed(child)
+
+
+def _home_of(base: str, name: str) -> str:
+    """Return the module that ``from base import name`` takes the name from."""
+    if base == _FACE and name in pinnobs_gym.__all__:
+        return getattr(getattr(pinnobs_gym, name), "__module__", base)
+    return f"{base}.{name}" if name and _spec(f"{base}.{name}") else base
+
+
+def _spec(name: str) -> ModuleSpec | None:
+    """Return the spec of a module, loaded or not; None if there is no such module."""
+    if name in sys.modules:
+        return sys.modules[name].__spec__
+    try:
+        return importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return None

@@ -1,0 +1,69 @@
+"""Scores of code that was edited since never come back."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from edited import write
+
+WHAT = ["--systems", "plant:Oscillator", "--estimators", "mine:Obs"]
+EVALUATE = ["evaluate", "--system", "plant:Oscillator", "--estimator", "mine:Obs"]
+CALLS = {
+    "evaluate": [*EVALUATE, "--episodes", "3"],
+    "fresh": [*EVALUATE, "--episodes", "3", "--fresh"],
+    "leaderboard": ["leaderboard", *WHAT, "--episodes", "3", "--jobs", "1"],
+    "python": """
+import logging
+from pinnobs_gym import evaluate
+from mine import Obs
+from plant import Oscillator
+from pinnobs_gym.envs.registration import env_id
+evaluate(Obs, env_id(Oscillator), episodes=3, results="out/rows.jsonl")
+""",
+}
+
+
+def scores(folder, call):
+    """The rows after a call in a new process, and whether it says that it took some from there."""
+    command = [sys.executable, "-W", "ignore", "-c"]
+    if isinstance(CALLS[call], str):
+        command.append(CALLS[call])
+    else:
+        command.append("import sys; from pinnobs_gym.cli import main; sys.exit(main(sys.argv[1:]))")
+        command += [*CALLS[call], "--out", "out"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = (folder / "out" / "rows.jsonl").read_text().splitlines()
+    said = done.stdout + done.stderr
+    return [json.loads(line) for line in lines], [x for x in said.splitlines() if "taken" in x]
+
+
+@pytest.mark.parametrize(
+    ("call", "edit"), [("evaluate", "a helper module"), ("leaderboard", "f"), ("python", "h")]
+)
+def test_after_an_edit_everything_is_scored_anew(tmp_path, call, edit):
+    write(tmp_path)
+    first, taken = scores(tmp_path, call)
+    assert (len(first), taken) == (3, [])
+    write(tmp_path, "a comment")
+    same, taken = scores(tmp_path, call)
+    assert same == first
+    (said,) = taken
+    assert said.startswith("3 of 3 episodes taken from ")
+    assert said.endswith("rows.jsonl")
+    write(tmp_path, edit)
+    both, taken = scores(tmp_path, call)
+    assert taken == []
+    assert both[:3] == first
+    assert len(both) == 6
+    assert not {row["nrmse"] for row in both[3:]} & {row["nrmse"] for row in first}
+
+
+def test_fresh_scores_replace_those_that_are_stored(tmp_path):
+    write(tmp_path)
+    first, _ = scores(tmp_path, "evaluate")
+    again, taken = scores(tmp_path, "fresh")
+    assert taken == []
+    assert [row["nrmse"] for row in again] == [row["nrmse"] for row in first]
+    assert all(a["date"] > b["date"] for a, b in zip(again, first, strict=True))

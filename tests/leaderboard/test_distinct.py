@@ -1,0 +1,92 @@
+"""Rows told apart before they are compared."""
+
+import pytest
+from made_rows import rows_of
+
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.distinct import distinct
+from pinnobs_gym.leaderboard.standings_table import cells
+from pinnobs_gym.scoring.rows import Stored
+
+OLD, NEW = {"date": "2030-01-02"}, {"date": "2030-01-03"}
+
+
+def names(rows):
+    return [row["estimator"] for row in distinct(rows).rows]
+
+
+def test_rows_that_agree_are_left_as_they_are():
+    rows = [*rows_of("ekf", [1.0, 2.0]), *rows_of("ukf", [1.0])]
+    assert distinct(rows) == (rows, ())
+
+
+def test_only_the_newest_code_of_a_game_is_kept_and_the_rest_is_named():
+    old = rows_of("ekf", [1.0, 1.0, 1.0], game_hash="aaaaaaaaaa", **OLD)
+    new = rows_of("ekf", [2.0, 2.0], game_hash="bbbbbbbbbb", **NEW)
+    elsewhere = rows_of("ekf", [3.0], condition="noise5", game_hash="cccccccccc", **OLD)
+    kept, (note,) = distinct([*old, *new, *elsewhere])
+    assert kept == [*new, *elsewhere]
+    assert note.startswith("3 episodes of pinnobs/X-v0, benchmark, nominal are left out: the code")
+    assert "hash aaaaaa, now bbbbbb" in note
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"options": {"gate": 0.9, "huber": None}}, "ekf (gate=0.9)"),
+        ({"options": {"huber": None}}, "ekf (without gate)"),
+        ({"estimator_code": "0123456789"}, "ekf (code 012345)"),
+        (
+            {"options": {"gate": 0.9, "huber": 1.0}, "estimator_code": "0123456789"},
+            "ekf (gate=0.9, huber=1.0, code 012345)",
+        ),
+    ],
+)
+def test_estimators_of_one_name_are_named_by_what_differs(changes, expected):
+    plain = {"options": {"gate": None, "huber": None}, **OLD}
+    rows = [
+        *rows_of("ekf", [1.0, 1.0], **plain),
+        *rows_of("ekf", [1.0], estimator_hash="other", **{**plain, **NEW, **changes}),
+    ]
+    assert names(rows) == ["ekf", "ekf", expected]
+
+
+def test_of_as_many_rows_the_latest_keep_the_name():
+    old = rows_of("ekf", [1.0], estimator_hash="old", estimator_code="0123456789", **OLD)
+    new = rows_of("ekf", [1.0], estimator_hash="new", estimator_code="abcdefghij", **NEW)
+    assert names([*old, *new]) == ["ekf (code 012345)", "ekf"]
+
+
+def test_training_settings_tell_apart_and_training_seeds_do_not():
+    def trained(seed, width, **changes):
+        config = {"seed": seed, "width": width, "budget": 9.0}
+        facts = {"training": {"config": config}, "training_seed": seed}
+        return rows_of("gain", [1.0, 1.0], estimator_hash=f"{seed}{width}", **facts, **changes)
+
+    rows = [*trained(0, 8), *trained(1, 8), *trained(0, 16)[:1]]
+    assert names(rows) == ["gain"] * 4 + ["gain (width=16)"]
+
+
+def test_what_still_looks_alike_is_named_by_its_hash():
+    """As two instances whose code cannot be read, or that know another noise."""
+    old = rows_of("mine", [1.0], estimator_hash="once0123", **OLD)
+    new = rows_of("mine", [1.0], estimator_hash="once4567", **NEW)
+    assert names([*old, *new]) == ["mine (run once01)", "mine"]
+
+
+def test_no_two_lines_of_a_table_look_alike():
+    """Settings, code, training seeds, training settings and hashes: each of them is seen."""
+    rows = [
+        *rows_of("ekf", [1.0] * 3, options={"gate": None}),
+        *rows_of("ekf", [1.0], options={"gate": 0.9}, estimator_hash="a"),
+        *rows_of("ekf", [1.0], options={"gate": None}, estimator_code="b", estimator_hash="b"),
+        *rows_of("ekf", [1.0], options={"gate": None}, estimator_hash="c", **OLD),
+    ]
+    for seed in (0, 1):
+        config = {"seed": seed, "width": 8}
+        facts = {"training": {"config": config}, "training_seed": seed}
+        rows += rows_of("gain", [1.0], estimator_hash=f"g{seed}", **facts)
+    (table,) = board(Stored(rows, [])).tables
+    shown = [line[1] for line in cells(table)]
+    assert len(shown) == 6
+    assert len(set(shown)) == 6

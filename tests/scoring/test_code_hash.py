@@ -1,0 +1,173 @@
+"""Hashes of code: what changes them, and what does not."""
+
+import importlib
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.scoring.code_hash import Unreadable, code_hash, content
+from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+
+MODULE = '''"""A module."""
+import {imports}
+
+GAIN = {gain}  # {comment}
+
+
+class Thing:
+    """{docstring}"""
+
+    def gain(self):
+        {inner}
+        return GAIN
+'''
+PLAIN = {
+    "imports": "math",
+    "gain": "3.0",
+    "comment": "a comment",
+    "docstring": "A thing.",
+    "inner": "pass",
+}
+
+
+@pytest.fixture
+def hash_of(tmp_path, monkeypatch):
+    """Writes modules, imports the first and hashes its class."""
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules)
+
+    def write(files):
+        for name, text in files.items():
+            path = tmp_path / f"{name}.py"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+        for name in set(sys.modules) - before:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        first = next(iter(files))
+        return code_hash(importlib.import_module(first).Thing)
+
+    yield write
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def text(**changes):
+    return MODULE.format(**{**PLAIN, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "same"),
+    [
+        ({"comment": "another"}, True),
+        ({"docstring": "Another."}, True),
+        ({"inner": "# nothing\n        pass"}, True),
+        ({"gain": "3.00"}, True),
+        ({"gain": "-50.0"}, False),
+        ({"inner": "print()"}, False),
+        ({"imports": "cmath"}, False),
+    ],
+)
+def test_the_syntax_tree_counts_and_nothing_else(hash_of, changes, same):
+    before = hash_of({"first_thing": text()})
+    assert (hash_of({"first_thing": text(**changes)}) == before) == same
+
+
+@pytest.mark.parametrize(
+    ("imports", "helper"),
+    [
+        ("a_helper", "a_helper"),
+        ("between", "a_helper"),
+        ("math", "a_helper"),
+        ("a_package.part", "a_package/part"),
+    ],
+)
+def test_what_is_imported_counts_too(hash_of, imports, helper):
+    """Directly, through another module, inside a function, and in a package of one's own."""
+    files = {
+        "first_thing": text(imports=imports, inner="from a_helper import K"),
+        "between": "from a_helper import K",
+        "a_helper": "K = 1",
+        "a_package/__init__": "",
+        "a_package/part": "K = 1",
+    }
+    before = hash_of(files)
+    assert hash_of(files) == before
+    assert hash_of({**files, "unrelated": "K = 2"}) == before
+    assert hash_of({**files, helper: "K = 2"}) != before
+
+
+def test_a_module_counts_as_it_was_loaded(hash_of, tmp_path):
+    """An edit of the file alone does not change what runs."""
+    before = hash_of({"first_thing": text()})
+    module = sys.modules["first_thing"]
+    (tmp_path / "first_thing.py").write_text(text(gain="4.0"))
+    assert code_hash(module.Thing) == before
+    importlib.reload(module)
+    assert code_hash(module.Thing) != before
+
+
+def test_an_estimator_counts_with_the_mathematics_that_it_imports_and_not_with_others(monkeypatch):
+    read = []
+
+    def spy(path):
+        read.append(path.name)
+        return original(path)
+
+    from pathlib import Path
+
+    from pinnobs_gym.scoring import code_hash as module
+
+    original = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", spy)
+    monkeypatch.setattr(module, "_LOADED", {})
+    code_hash(EKF)
+    assert {"ekf.py", "kalman.py", "gaussian.py", "model.py"} <= set(read)
+    assert not {"smoother.py", "ukf.py", "evaluation.py", "tensorboard.py"} & set(read)
+
+
+def test_code_without_source_is_refused():
+    scope = {"__name__": "nowhere"}
+    exec("class Thing: pass", scope)
+    with pytest.raises(Unreadable, match="module nowhere has no source file"):
+        code_hash(scope["Thing"])
+    for value in (lambda: 1, np.random.default_rng(0), object()):
+        with pytest.raises(Unreadable, match="is neither data nor code with a source of its own"):
+            content({"option": value})
+
+
+@dataclass(frozen=True)
+class Settings:
+    numbers: tuple = (1, 2)
+    array: object = None
+
+
+def test_equal_values_have_equal_content_and_others_have_not():
+    values = [
+        None,
+        True,
+        1,
+        1.5,
+        "1",
+        (1, 2),
+        {"a": 1},
+        {"a": 2},
+        np.array([1.0, 2.0]),
+        np.array([1.0, 3.0]),
+        np.array([1.0, 2.0], dtype=np.float32),
+        np.array([[1.0, 2.0]]),
+        Settings(),
+        Settings((1, 3)),
+        Settings(array=np.arange(3)),
+        Settings(array=np.arange(4)),
+        ReverseDuffing(),
+        EKF,
+        test_code_without_source_is_refused,
+    ]
+    shown = [repr(content(value)) for value in values]
+    assert len(set(shown)) == len(values)
+    assert content({"a": 1, "b": 2}) == content({"b": 2, "a": 1})
+    assert content(np.array([1.0, 2.0])) == content(np.array([1.0, 2.0]))
