@@ -90,6 +90,11 @@ class Game:
         """The source of the episodes, with the model and the setup that estimators are given."""
         return EpisodeSource(self.system, self.name.setup, self.name.condition, **self.changes)
 
+    @property
+    def nominal(self) -> Self:
+        """The same game without its condition, under which estimators are trained."""
+        return type(self)(self.name._replace(condition="nominal"), self.system, self.changes)
+
     def episodes(self, seeds: Iterable[int], x0: np.ndarray | None = None) -> Episodes:
         """Return the first episodes of single envs that are reset with these seeds.
 

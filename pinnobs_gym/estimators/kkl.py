@@ -116,7 +116,7 @@ class KKL(LearnedEstimator, Estimator):
     trained: TrainedKKL = field(kw_only=True, repr=False)
     """The trained observer."""
 
-    knows = ("model", "noise", "simulated true states")
+    knows = ("model", "noise", "initial set", "simulated true states")
     exempt_from = {"model_alone": "its estimate is a function of z, which knows no prior"}
     equations = r"""
 \dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\

@@ -79,6 +79,7 @@ K'_{ij} &= K_{ij}\, 8^{\tanh(a_{ij} s_j)}
 P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
 """
     needs_training = "pinn_gain"
+    knows = ("model", "prior", "noise", "initial set")
 
     def reset(self, prior: Prior) -> State:
         return self.begin(checked(prior), self.output_variance[:, None])

@@ -135,7 +135,7 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 \text{(action mode gain: correlations in } [-1, 1]^{n_x \times n_y} \text{)}
 """
     needs_training = "rl"
-    knows = ("model", "prior", "noise", "true states in training")
+    knows = ("model", "prior", "noise", "initial set", "true states in training")
     exempt_from = {"model_alone": "an agent's action may move the estimate at any time"}
 
     @cached_property

@@ -34,8 +34,8 @@ class Contender:
 
     @property
     def track(self) -> str:
-        """``online`` or ``offline``."""
-        return self.runs[0].track
+        """``online`` or ``offline``, with ``condition known`` if that is so in any of its games."""
+        return max((run.track for run in self.runs), key=len)
 
     @property
     def runs(self) -> list[Run]:

@@ -84,6 +84,8 @@ def _facts(row: Row) -> dict[str, Any]:
     differ in their training seeds and still be one."""
     config = row["training"].get("config", {})
     trained = {name: value for name, value in config.items() if name not in ("seed", "budget")}
+    if "condition" in row["training"]:
+        trained["trained_under"] = row["training"]["condition"]
     settings = trained if row["training"] else row["options"]
     return {**settings, "code": row["estimator_code"]}
 

@@ -234,7 +234,9 @@ def _check_model(model: System, system: System) -> None:
 
 def _common(estimator: BaseEstimator, game: Game) -> Row:
     """Return the fields common to all rows of an evaluation."""
-    system = game.source.system
+    system, condition = game.source.system, game.name.condition
+    # An estimator trained under the very condition that is scored is no match for the others.
+    informed = condition != "nominal" and estimator.training.get("condition") == condition
     return {
         "schema": SCHEMA,
         "kind": "score",
@@ -243,8 +245,8 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "ranked": game.name.condition == canonical_name(system.ranked_condition),
         "nx": system.nx,
         "estimator": estimator.label,
-        "track": estimator.track,
-        "knows": list(estimator.knows),
+        "track": f"{estimator.track}, condition known" if informed else estimator.track,
+        "knows": [*estimator.knows, *(["condition"] if informed else [])],
         "options": canonical(estimator.options),
         "estimator_code": estimator_code(type(estimator)),
         "estimator_hash": estimator_hash(estimator),

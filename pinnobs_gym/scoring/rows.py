@@ -28,7 +28,7 @@ Row: TypeAlias = dict[str, Any]
 - ``game_hash``: hash of the code and settings that make and score the episode.
 - ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
 - ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
-  and its settings.
+  and its settings. One that was trained under the condition that is scored has a track of its own.
 - ``estimator_code``: hash of the estimator's code.
 - ``estimator_hash``: hash of its code, settings, model and training.
 - ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,

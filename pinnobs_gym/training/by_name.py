@@ -12,11 +12,11 @@ from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.training.loop import train
 from pinnobs_gym.training.settings import TrainingConfig
-from pinnobs_gym.training.trainer import TRAINING_SEED, Trainer
+from pinnobs_gym.training.trainer import Trainer, first_episode
 
 
 def trainer_of(
-    name: str, config: TrainingConfig, game: Game, episode: int = TRAINING_SEED
+    name: str, config: TrainingConfig, game: Game, episode: int | None = None
 ) -> Trainer[Any, Any]:
     """Create the trainer of a name for a game, ready for its first iteration.
 
@@ -26,17 +26,19 @@ def trainer_of(
         name: name of the trainer.
         config: its Config.
         game: source of the episodes.
-        episode: seed of the first episode.
+        episode: seed of the first episode; `first_episode` of the training seed if None.
     """
     cls, source = TRAINERS.resolve(name), game.source
-    data: dict[str, Any] = {"game": game, "episode": episode}
+    first = first_episode(config.seed) if episode is None else episode
+    data: dict[str, Any] = {"game": game, "episode": first}
     if config.records:
-        data = {"record": game.record(range(episode, episode + config.records))}
+        record = game.record(range(first, first + config.records))
+        data = {"record": record, "condition": game.name.condition}
     return cls(source.system, config, noise_std=source.setup.noise_std, **data)
 
 
 def train_by_name(
-    name: str, config: TrainingConfig, game: Game, episode: int = TRAINING_SEED, **options: Any
+    name: str, config: TrainingConfig, game: Game, episode: int | None = None, **options: Any
 ) -> Trained:
     """Train with the trainer of a name, and return the trained object; see `trainer_of`.
 
@@ -44,7 +46,7 @@ def train_by_name(
         name: name of the trainer.
         config: its Config.
         game: source of the episodes.
-        episode: seed of the first episode.
+        episode: seed of the first episode; `first_episode` of the training seed if None.
         options: ``log``, ``checkpoint``, ``resume`` and ``progress`` of `train`.
     """
     return train(trainer_of(name, config, game, episode), **options)

@@ -19,8 +19,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRAINING_SEED = 10**6
-"""Seed of the first training episode; further episodes have the seeds after it. No estimator is
-scored on them."""
+"""Seed of the first training episode of training seed 0; further episodes have the seeds after it.
+No estimator is scored on them."""
+_APART = 10**4
+"""Episode seeds between those of two training seeds."""
+
+
+def first_episode(seed: int) -> int:
+    """Return the seed of the first training episode of a training seed: trainings of different
+    seeds have different episodes."""
+    return TRAINING_SEED + _APART * seed
+
 
 ConfigT = TypeVar("ConfigT", bound=TrainingConfig)
 TrainedT = TypeVar("TrainedT", bound=Trained)
@@ -42,6 +51,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
             for all outputs; that of the benchmark setup if None.
         game: source of the episodes, for a trainer that plays episodes itself.
         episode: seed of the first episode that such a trainer plays.
+        condition: name of the condition of the record's episodes; a game has its own.
 
     Raises:
         ValueError: in one line, if training is impossible with these arguments.
@@ -63,6 +73,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         noise_std: Sequence[float] | float | None = None,
         game: Game | None = None,
         episode: int = TRAINING_SEED,
+        condition: str = "nominal",
     ) -> None:
         known_noise = system.setups["benchmark"].noise_std if noise_std is None else noise_std
         if (record is None) == (game is None):
@@ -70,6 +81,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         self.system, self.config = system, config
         self.noise_std = vector(known_noise, system.ny, "noise_std")
         self.episode = episode
+        self.condition = condition if game is None else game.name.condition
         self.iteration = 0
         """Number of iterations so far."""
         self.ending: Ending = "running"
@@ -144,6 +156,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
             "system": type(system).__name__,
             "parameters": plain(system.parameters),
             "noise_std": tuple(self.noise_std.tolist()),
+            "condition": self.condition,
             "config": plain(asdict(self.config)),
             "seed": seed,
             "loss": loss,

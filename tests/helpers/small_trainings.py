@@ -122,6 +122,7 @@ def trained_network(system, network, record=None):
         parameters=about["parameters"],
         noise_std=(0.0,) * system.ny,
         ending="finished",
+        condition="nominal",
         config={},
         seed=0,
         loss=0.25,

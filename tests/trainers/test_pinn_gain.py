@@ -60,6 +60,7 @@ def gain_of(system: System, size: float = 0.0, variant: str = "kalman", noise_st
         iterations=0,
         seconds=0.0,
         ending="finished",
+        condition="nominal",
     )
     return PinnGain(system, told, trained=trained)
 

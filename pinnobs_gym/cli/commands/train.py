@@ -23,7 +23,7 @@ from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.training.by_name import load, trainer_of
 from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import train
-from pinnobs_gym.training.trainer import TRAINING_SEED, Trainer
+from pinnobs_gym.training.trainer import Trainer, first_episode
 
 ConfigType = TypeVar("ConfigType")
 
@@ -42,8 +42,9 @@ class Train(Generic[ConfigType]):
     """Setup to play."""
     condition: str = "nominal"
     """Condition, such as load_step."""
-    episode: int = TRAINING_SEED
-    """Seed of the training episode, or of the first of several."""
+    episode: int | None = None
+    """Seed of the training episode, or of the first of several; by default those of each training
+    seed are its own."""
     out: Path = Path("runs/train")
     """Folder of checkpoints, trained files, figures and TensorBoard log."""
     resume: bool = False
@@ -60,7 +61,9 @@ def run(arguments: Sequence[str]) -> int:
     check_writable(chosen.out)
     game = Game.of(chosen.system, chosen.setup, chosen.condition)
     title = game.name.file_stem
-    stem = chosen.out / f"{title}-{name}-episode{chosen.episode}-seed{chosen.config.seed}"
+    seed = chosen.config.seed
+    episode = first_episode(seed) if chosen.episode is None else chosen.episode
+    stem = chosen.out / f"{title}-{name}-episode{episode}-seed{seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
     path = stem.with_name(stem.name + ".pt")
     for earlier in (checkpoint, path):
@@ -68,7 +71,7 @@ def run(arguments: Sequence[str]) -> int:
             raise ValueError(
                 f"{earlier} is there already; --resume goes on with it, --out names another folder"
             )
-    trainer = trainer_of(name, chosen.config, game, chosen.episode)
+    trainer = trainer_of(name, chosen.config, game, episode)
     with Log(chosen.out / "tensorboard" / stem.name) as log:
         result = train(trainer, log=log, checkpoint=checkpoint, resume=chosen.resume, progress=True)
     result.save(path)
@@ -85,7 +88,7 @@ def run(arguments: Sequence[str]) -> int:
     for label, kind_of in ESTIMATORS.classes().items():
         if kind_of.needs_training == name:
             estimator = load(kind_of, path, game)
-            own = _report_training(label, estimator, game, chosen.episode, result.loss)
+            own = _report_training(label, estimator, game, episode, result.loss)
             picture = stem.with_name(f"{stem.name}-{label}.png")
             write_figure(picture, own.figure(f"{label}: {title}"))
             console.print(f"picture: {picture}", soft_wrap=True)

@@ -38,6 +38,8 @@ class Trained(ABC):
     """The system's physical parameters, as JSON values."""
     noise_std: tuple[float, ...]
     """Standard deviations of the output noise given to the trainer, in output units."""
+    condition: str
+    """Name of the condition of the training episodes."""
     config: Mapping[str, Any]
     """The trainer's settings, as JSON values."""
     seed: int
@@ -153,5 +155,6 @@ class LearnedEstimator(ABC):
     @property
     def training(self) -> dict[str, Any]:
         """Training metadata for rows of results."""
-        names = ("trainer", "seed", "loss", "iterations", "seconds", "ending", "config")
-        return {**{name: getattr(self.trained, name) for name in names}, **self.trained.notes}
+        names = ("trainer", "condition", "seed", "loss", "iterations", "seconds", "ending")
+        own = {name: getattr(self.trained, name) for name in (*names, "config")}
+        return {**own, **self.trained.notes}

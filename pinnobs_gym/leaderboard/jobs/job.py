@@ -138,16 +138,16 @@ def run_job(job: Job) -> None:
 
 
 def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:
-    """Return the estimator trained on episodes that are never scored; load it if it was trained
-    before."""
-    name = str(cls.needs_training)
+    """Return the estimator trained on nominal episodes that are never scored; load it if it was
+    trained before."""
+    name, game = str(cls.needs_training), job.game.nominal
     recipe = TRAINERS.resolve(name).configured({**cls.recipe, **job.training})
-    code = training_code(name, job.game.source)
-    label = f"{job.game.name.file_stem}-{name}-{_digest([recipe, code])}"
+    code = training_code(name, game.source)
+    label = f"{game.name.file_stem}-{name}-{_digest([recipe, code])}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = train_by_name(name, recipe, job.game, log=log)
+            result = train_by_name(name, recipe, game, log=log)
         if not path.exists():  # of two simultaneous trainings, the first counts
             result.save(path)
     return load(cls, path, job.game)
