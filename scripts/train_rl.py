@@ -86,6 +86,8 @@ class Main:
                     resume=checkpoint.exists(),
                     progress=sys.stdout.isatty(),
                 )
+            if trained.ending == "interrupted":  # an interrupted training is not a result
+                raise KeyboardInterrupt
             trained.save(path)
         estimator = Sb3.load(path, game.source.system)
         check_same(path, estimator.trained.config, plain(asdict(config)))
@@ -110,4 +112,4 @@ if __name__ == "__main__":
     except ValueError as error:
         sys.exit(f"train_rl: error: {error}")
     except KeyboardInterrupt:
-        sys.exit("train_rl: stopped; run again to go on")
+        sys.exit("train_rl: stopped; the same command resumes it")

@@ -283,4 +283,12 @@ class PinnObs(OfflineEstimator):
         )
 
     def run(self, record: Record) -> Estimates:
-        return estimates_of(self.fit(record), record.t)
+        """Return x̂ at every sample of networks trained on each row.
+
+        Raises:
+            KeyboardInterrupt: if Ctrl-C ended a training: what it left is not a result.
+        """
+        networks = self.fit(record)
+        if any(network.ending == "interrupted" for network in networks):
+            raise KeyboardInterrupt
+        return estimates_of(networks, record.t)

@@ -73,4 +73,5 @@ def _record(trainer: Trainer[Any, Any]) -> Mapping[str, np.ndarray]:
     if not trainer.has_record:
         return {}
     record = trainer.record
-    return {"t": record.t, "y": record.y, "u": record.u, "xhat0": record.prior.mean}
+    prior = {"xhat0": record.prior.mean, "P0": record.prior.cov}
+    return {"t": record.t, "y": record.y, "u": record.u, **prior}

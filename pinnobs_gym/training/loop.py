@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,7 +37,7 @@ def train(
         log: destination of curves, figures and settings.
         checkpoint: file of the training's state, rewritten every ``checkpoint_every`` iterations
             and at the end.
-        resume: resume exactly from the checkpoint.
+        resume: resume from the checkpoint, exactly unless the trainer says otherwise.
         progress: show a progress bar in the terminal.
 
     Raises:
@@ -50,15 +51,19 @@ def train(
         if checkpoint is None:
             raise ValueError("resume=True without a checkpoint; name its file")
         load_checkpoint(trainer, checkpoint)
-    config = trainer.config
+    config, shown = trainer.config, -1
+    trainer.ending = "running"
     try:
         with _bar(progress) as show, deferred_interrupt() as interrupt:
             while not ended_now(trainer, interrupt):
                 trainer.step()
-                if trainer.iteration % config.log_every == 0 or trainer.finished():
+                if trainer.iteration % config.log_every == 0:
                     _show(trainer, log, show if progress else None)
+                    shown = trainer.iteration
                 if checkpoint is not None and trainer.iteration % config.checkpoint_every == 0:
                     save_checkpoint(trainer, checkpoint)
+            if trainer.iteration not in (0, shown):
+                _show(trainer, log, show if progress else None)
         if checkpoint is not None:
             save_checkpoint(trainer, checkpoint)
     except KeyboardInterrupt:  # within an iteration: the last checkpoint stays valid
@@ -101,6 +106,8 @@ def deferred_interrupt() -> Iterator[Interrupt]:
         if interrupt.requested:
             raise KeyboardInterrupt
         interrupt.requested = True
+        with suppress(OSError, ValueError):  # a closed stream
+            sys.stderr.write("\nstopping after this iteration; Ctrl-C again stops at once\n")
 
     signal.signal(signal.SIGINT, handle)
     _active.append(interrupt)
@@ -116,13 +123,15 @@ def ended_now(trainer: Trainer[Any, Any], interrupt: Interrupt) -> bool:
 
     The budget and Ctrl-C take effect after the first iteration at the earliest.
     """
-    config, started = trainer.config, trainer.iteration > 0
+    started, budget = trainer.iteration > 0, trainer.config.budget
+    spent = budget is not None and trainer.seconds >= budget
     if trainer.finished():
-        trainer.ending = "finished"
+        # A schedule that fits the budget is finished when that is spent.
+        trainer.ending = "budget" if spent and trainer.paced_by_budget else "finished"
     elif started and interrupt.requested:
         trainer.ending = "interrupted"
-    elif started and not trainer.paced_by_budget and config.budget is not None:
-        trainer.ending = "budget" if trainer.seconds >= config.budget else "running"
+    elif started and spent and not trainer.paced_by_budget:
+        trainer.ending = "budget"
     return trainer.ending != "running"
 
 

@@ -31,10 +31,11 @@ from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.training.checkpoint import save_checkpoint
 from pinnobs_gym.training.loop import train
 from trainers.kkl.fitting import Equations, Fit, Term
 from trainers.kkl.labels import driven, frequency, initial_states, noise_in_z, simulated, steady
-from trainers.kkl.learned_poles import response
+from trainers.kkl.learned_poles import STEPS, response
 from trainers.kkl.pictures import figures
 from trainers.kkl.samples import kept_samples
 from trainers.kkl.trainer import KKLTrainer
@@ -43,6 +44,7 @@ from trainers.kkl.two_stages import TwoStageFit
 TRAINERS = [name for name, cls in REGISTRY.classes().items() if issubclass(cls, KKLTrainer)]
 """Without simulated z (`KKLTrainer.labelled`) T is not found in few iterations where it changes
 with time."""
+POLES = (-0.5, -1.5, -4.0)
 SMALL = {"trajectories": 80, "samples": 40, "iterations": 60, "width": 10, "patience": 1.0}
 
 
@@ -60,13 +62,15 @@ def linear_T(dynamics, plant=PLANT):
 
 def trained_on(name, system="ReverseDuffing", noise_std=None, part=1.0, **settings):
     """Trained on the sample times of the first part of an episode."""
+    options = {n: settings.pop(n) for n in ("checkpoint", "resume") if n in settings}
     game = Game.of(system)
     plant, setup, whole = game.source.system, game.source.setup, game.record([10**6])
     n = round(part * whole.num_samples)
     record = Record(whole.t[:n], whole.y[:, :n], whole.u[:, :n], whole.prior)
     told = setup.noise_std if noise_std is None else noise_std
     chosen = {**SMALL, **settings}
-    return trained_by(name, plant, chosen, record=record, noise_std=told), plant, setup, record
+    trained = trained_by(name, plant, chosen, record=record, noise_std=told, **options)
+    return trained, plant, setup, record
 
 
 def trained_on_linear(name, cls=Linear, **settings):
@@ -495,6 +499,69 @@ def test_a_budget_ends_the_cosine_and_the_training(ticking):
     trained, *_ = trained_on("kkl_supervised", iterations=10**6, budget=0.3)
     assert trained.iterations <= 30  # the time is looked at in each
     assert 0.3 <= trained.seconds < 0.6
+
+
+def test_a_training_that_its_budget_ends_says_so_and_goes_on_with_more(ticking, tmp_path):
+    path, most = tmp_path / "checkpoint.pt", {"iterations": 10**6}
+    short, *_ = trained_on("kkl_supervised", budget=0.3, checkpoint=path, **most)
+    assert short.ending == "budget"
+    again, *_ = trained_on("kkl_supervised", budget=3.0, checkpoint=path, resume=True, **most)
+    assert again.ending == "budget"
+    assert again.iterations > short.iterations
+    assert 3.0 <= again.seconds < 3.5
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_result_in_between_changes_nothing(name):
+    game = Game.of("ReverseDuffing")
+    cls = REGISTRY.resolve(name)
+    config = cls.configured({**SMALL, "iterations": 12, "share": 1.0})
+    record = game.record([10**6])
+    disturbed, plain = (cls(game.source.system, config, record=record) for _ in range(2))
+    disturbed.step()
+    first = disturbed.result()
+    assert np.isfinite(first.loss)
+    ends = [train(trainer) for trainer in (disturbed, plain)]
+    assert ends[0].iterations == ends[1].iterations
+    for network in ("encoder", "decoder"):
+        pairs = zip(*(getattr(end, network) for end in ends), strict=True)
+        for layer, other in pairs:
+            for a, b in zip(layer, other, strict=True):
+                np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("settings", [{"sweep": "cutoff"}, {"design": "learned", "poles": POLES}])
+def test_preparations_keep_to_the_budget_too(settings, ticking):
+    """A sweep and the learning of poles are steps of the training like all others."""
+    trained, *_ = trained_on("kkl_supervised", budget=2.0, iterations=10**6, **settings)
+    assert trained.ending == "budget"
+    assert 2.0 <= trained.seconds < 2.5
+
+
+def test_poles_are_learned_step_by_step_and_resumed(tmp_path):
+    settings = {"design": "learned", "poles": POLES, "iterations": 5, "checkpoint_every": 1}
+    whole, *_ = trained_on("kkl_supervised", **settings)
+    game = Game.of("ReverseDuffing")
+    cls = REGISTRY.resolve("kkl_supervised")
+    make = cls(
+        game.source.system,
+        cls.configured({**SMALL, **settings}),
+        record=game.record([10**6]),
+        noise_std=game.source.setup.noise_std,
+    )
+    for _ in range(3):
+        make.step()
+    early = make.result()  # as Ctrl-C leaves it
+    assert (np.linalg.eigvals(early.A).real < 0).all()
+    for _ in range(STEPS - 1):
+        make.step()
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(make, path)
+    resumed, *_ = trained_on("kkl_supervised", checkpoint=path, resume=True, **settings)
+    assert resumed.iterations == whole.iterations > make.iteration
+    np.testing.assert_array_equal(resumed.A, whole.A)
+    for layer, other in zip(resumed.decoder, whole.decoder, strict=True):
+        np.testing.assert_array_equal(layer[0], other[0])
 
 
 def test_the_response_to_a_window_is_that_of_the_filter():

@@ -1,4 +1,4 @@
-"""Training of the poles of z together with a small T*."""
+"""The first phase of a training with learned poles: the poles of z, together with a small T*."""
 
 from __future__ import annotations
 
@@ -22,15 +22,8 @@ _BATCH, _WIDTH, _RATE = 128, 24, 1e-2
 _LONGEST = 400
 
 
-def learn(
-    system: System,
-    poles: Sequence[float],
-    t: np.ndarray,
-    noise_std: np.ndarray,
-    x0: np.ndarray,
-    seed: int,
-) -> tuple[float, ...]:
-    """Train real poles together with a small network that maps z to x, by Adam.
+class PoleSearch:
+    """A training of real poles together with a small network that maps z to x, by Adam.
 
     z is the exact response, from z = 0, to windows of noisy output samples; its derivatives by the
     poles come from automatic differentiation. The variables are the logarithms of the poles' sizes,
@@ -44,48 +37,73 @@ def learn(
         x0: initial states of simulated episodes, shape (batch, nx).
         seed: seed of the windows, the noise and the network.
 
-    Returns:
-        The poles in 1/s.
-
     Raises:
         ValueError: in one line, if an initial pole is not negative.
     """
-    sizes = -np.asarray(poles, dtype=float)
-    if not (sizes > 0).all():
-        raise ValueError(f"A_z is not Hurwitz: poles={tuple(poles)}; expected all below 0")
-    # Simulated episodes: scaled states and outputs.
-    h = float(np.diff(t).mean())
-    window = min(int(np.ceil(MEMORY / sizes.min() / h)), len(t) // 2, _LONGEST)
-    x = truth(system, x0[:EPISODES], t, system.setups["benchmark"].truth_step)
-    scale = vector(system.scale, system.nx, "scale")
-    states = torch.tensor((x - x.mean(axis=(0, 1))) / scale)
-    y = torch.tensor(system.h(t[:, None], x, np.asarray(system.input(t))[:, None]))
-    # The network and the logarithms of the poles, with one optimiser.
-    generator = torch.Generator().manual_seed(seed)
-    ny, number = system.ny, len(sizes)
-    logs = torch.tensor(np.log(sizes), requires_grad=True)
-    inputs, outputs = (Scaling(np.zeros(n), np.eye(n)) for n in (ny * number, system.nx))
-    net = Mlp(inputs, outputs, 2, _WIDTH, "tanh", generator)
-    adam = torch.optim.Adam([*net.parameters, logs], _RATE)
-    std = torch.tensor(noise_std)
-    steps = torch.arange(window + 1)
-    for step in range(STEPS):
-        for group in adam.param_groups:
-            group["lr"] = _RATE * 0.5 * (1 + np.cos(np.pi * step / STEPS))
+
+    def __init__(
+        self,
+        system: System,
+        poles: Sequence[float],
+        t: np.ndarray,
+        noise_std: np.ndarray,
+        x0: np.ndarray,
+        seed: int,
+    ) -> None:
+        sizes = -np.asarray(poles, dtype=float)
+        if not (sizes > 0).all():
+            raise ValueError(f"A_z is not Hurwitz: poles={tuple(poles)}; expected all below 0")
+        # Simulated episodes: scaled states and outputs.
+        self._h = float(np.diff(t).mean())
+        self._window = min(int(np.ceil(MEMORY / sizes.min() / self._h)), len(t) // 2, _LONGEST)
+        x = truth(system, x0[:EPISODES], t, system.setups["benchmark"].truth_step)
+        scale = vector(system.scale, system.nx, "scale")
+        self._states = torch.tensor((x - x.mean(axis=(0, 1))) / scale)
+        self._y = torch.tensor(system.h(t[:, None], x, np.asarray(system.input(t))[:, None]))
+        self._std = torch.tensor(noise_std)
+        # The network and the logarithms of the poles, with one optimiser.
+        self._generator = torch.Generator().manual_seed(seed)
+        self._logs = torch.tensor(np.log(sizes), requires_grad=True)
+        inputs, outputs = (
+            Scaling(np.zeros(n), np.eye(n)) for n in (system.ny * len(sizes), system.nx)
+        )
+        self._net = Mlp(inputs, outputs, 2, _WIDTH, "tanh", self._generator)
+        self._adam = torch.optim.Adam([*self._net.parameters, self._logs], _RATE)
+        self.iteration = 0
+        """Number of steps so far."""
+        self.loss = float("nan")
+        """Mean squared scaled error of x̂ in the last batch."""
+
+    @property
+    def poles(self) -> tuple[float, ...]:
+        """The poles so far, in 1/s."""
+        return tuple((-torch.exp(self._logs.detach())).tolist())
+
+    def finished(self) -> bool:
+        """Return whether all steps are made."""
+        return self.iteration >= STEPS
+
+    def step(self) -> None:
+        """Make a step of Adam, of a length that falls as a half cosine."""
+        for group in self._adam.param_groups:
+            group["lr"] = _RATE * 0.5 * (1 + np.cos(np.pi * self.iteration / STEPS))
         # A batch of windows, each ending at a sample k of an episode i, with fresh noise.
-        k = torch.randint(window, len(t), (_BATCH,), generator=generator)
-        i = torch.randint(x.shape[1], (_BATCH,), generator=generator)
-        windows = y[k[:, None] - window + steps, i[:, None]]
+        y, window, generator = self._y, self._window, self._generator
+        k = torch.randint(window, len(y), (_BATCH,), generator=generator)
+        i = torch.randint(y.shape[1], (_BATCH,), generator=generator)
+        windows = y[k[:, None] - window + torch.arange(window + 1), i[:, None]]
         noise = torch.randn(windows.shape, generator=generator, dtype=windows.dtype)
-        windows = windows + std * noise
+        windows = windows + self._std * noise
         # z at the end of each window, standardised over the batch, and the network's error.
-        z = torch.einsum("pw,bwo->bop", response(logs, h, window), windows).reshape(_BATCH, -1)
+        weights = response(self._logs, self._h, window)
+        z = torch.einsum("pw,bwo->bop", weights, windows).reshape(_BATCH, -1)
         z = (z - z.mean(0)) / z.std(0)
-        loss = (net(z) - states[k, i]).square().mean()
-        adam.zero_grad()
+        loss = (self._net(z) - self._states[k, i]).square().mean()
+        self._adam.zero_grad()
         loss.backward()
-        adam.step()
-    return tuple((-torch.exp(logs.detach())).tolist())
+        self._adam.step()
+        self.iteration += 1
+        self.loss = loss.item()
 
 
 def response(logs: Tensor, h: float, window: int) -> Tensor:

@@ -14,7 +14,6 @@ from pinnobs_gym.estimators.kkl import Clock
 from pinnobs_gym.simulation.system import System, vector
 from trainers.kkl.config import KKLConfig
 from trainers.kkl.labels import driven, initial_states, noise_in_z, simulated
-from trainers.kkl.learned_poles import EPISODES, learn
 
 _PARTS = 12
 """Number of parts of the episode whose errors have the same weight."""
@@ -47,17 +46,14 @@ class Samples:
         noise_std: np.ndarray,
         gap: int,
         labelled: bool,
+        poles: tuple[float, ...] | None = None,
     ) -> None:
         self.system, self.config, self.noise_std, self.gap = system, config, noise_std, gap
         self.driven = driven(system)
         self.t, self.prior = t, prior
-        if config.design == "learned":
-            x0 = initial_states(system, config.low, config.high, EPISODES, config.seed)
-            std = noise_std if config.noise else np.zeros(system.ny)
-            poles = learn(system, config.poles, self.t, std, x0, config.seed)
-            self.dynamics: Dynamics = realised(poles, system.ny, config.mode)
-        else:
-            self.dynamics = config.dynamics(system)
+        self.dynamics: Dynamics = (
+            config.dynamics(system) if poles is None else realised(poles, system.ny, config.mode)
+        )
         self.dynamics.step(self.interval)  # raise an error before the simulation
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
         self._simulate()

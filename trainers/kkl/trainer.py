@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+import numpy as np
+
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.estimators.kkl import TrainedKKL
 from pinnobs_gym.simulation.record import Record
@@ -15,6 +17,8 @@ from pinnobs_gym.training.trainer import Trainer
 from trainers.kkl import pictures
 from trainers.kkl.config import KKLConfig
 from trainers.kkl.fitting import Objective
+from trainers.kkl.labels import initial_states
+from trainers.kkl.learned_poles import EPISODES, STEPS, PoleSearch
 from trainers.kkl.samples import Samples
 from trainers.kkl.two_stages import TwoStageFit
 
@@ -27,6 +31,8 @@ SWEEP = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The cut-offs of a sweep, over that of the settings."""
 SWEEP_SHARE = 0.5
 """Fraction of the budget that a sweep takes."""
+SEARCH_SHARE = 0.25
+"""Fraction of the budget that the training of the poles may take."""
 _SWEEP_STEPS = 120
 """Largest number of steps of T* in each fit of a sweep."""
 
@@ -61,84 +67,134 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         _check(self.system, self.record)
         self.sweep: list[dict[str, float]] = []
         """The results at each cut-off so far."""
-        if self.config.sweep == "cutoff":
-            self.fit = self._fit(self._swept_config())
+        self.search: PoleSearch | None = None
+        """The training of the poles, if they are learned and not yet known."""
+        self.poles: tuple[float, ...] | None = None
+        """The learned poles in 1/s; None if they are not learned, or not yet."""
+        self.fit: TwoStageFit | None = None
+        """The current fit; None while the poles are learned."""
+        if self.config.design == "learned":
+            self.search = self._search()
         else:
-            self.fit = self._fit(self.config)
+            self.fit = self._next_fit()
+
+    def _search(self) -> PoleSearch:
+        """Prepare the training of the poles."""
+        config, system = self.config, self.system
+        x0 = initial_states(system, config.low, config.high, EPISODES, config.seed)
+        std = self.noise_std if config.noise else np.zeros(system.ny)
+        return PoleSearch(system, config.poles, self.record.t, std, x0, config.seed)
 
     @property
     def sweeping(self) -> bool:
         """Whether the cut-off is still to be chosen."""
         return self.config.sweep == "cutoff" and len(self.sweep) < len(SWEEP)
 
-    def _fit(self, config: KKLConfigT) -> TwoStageFit:
-        """Simulate the samples for a config, and prepare the fit to them."""
-        record = self.record
-        prior = record.prior.mean[:1]
-        samples = Samples(
-            self.system, config, record.t, prior, self.noise_std, self.gap(), self.labelled
-        )
-        return TwoStageFit(samples, config, self.encoding)
+    def _next_fit(self, poles: tuple[float, ...] | None = None) -> TwoStageFit:
+        """Simulate the samples for the sweep's next fit or for the final one, and prepare it.
 
-    def _swept_config(self) -> KKLConfigT:
-        """Return the config of the sweep's next fit, or of the final fit with the best cut-off."""
-        config, budget = self.config, self.config.budget
+        The fits of a sweep share what is left of its part of the budget equally.
+        """
+        record, config, deadline = self.record, self.config, self.config.budget
         if self.sweeping:
             cutoff = SWEEP[len(self.sweep)] * config.cutoff_for(self.system)
-            part = None if budget is None else budget * SWEEP_SHARE / len(SWEEP)
             steps = min(config.iterations, _SWEEP_STEPS)
-            return replace(config, cutoff=cutoff, iterations=steps, budget=part)
-        best = min(self.sweep, key=lambda point: point["loss"])["cutoff"]
-        left = None if budget is None else budget * (1 - SWEEP_SHARE)
-        return replace(config, cutoff=best, budget=left)
+            config = replace(config, cutoff=cutoff, iterations=steps)
+            if deadline is not None:
+                left = deadline * SWEEP_SHARE - self.seconds
+                deadline = self.seconds + left / (len(SWEEP) - len(self.sweep))
+        elif self.sweep:
+            best = min(self.sweep, key=lambda point: point["loss"])["cutoff"]
+            config = replace(config, cutoff=best)
+        samples = Samples(
+            self.system,
+            config,
+            record.t,
+            record.prior.mean[:1],
+            self.noise_std,
+            self.gap(),
+            self.labelled,
+            poles or self.poles,
+        )
+        return TwoStageFit(samples, config, self.encoding, lambda: self.seconds, deadline)
 
     def step(self) -> None:
-        self.fit.step()
         self.iteration += 1
-        if self.sweeping and self.fit.finished():
-            cutoff = self.fit.config.cutoff_for(self.system)
-            loss = self.fit.best["T*"].error
-            self.sweep.append({"cutoff": cutoff, "loss": loss, **self.fit.traded()})
-            self.fit = self._fit(self._swept_config())
+        if self.search is not None:
+            self.search.step()
+            budget = self.config.budget
+            spent = budget is not None and self.seconds >= budget * SEARCH_SHARE
+            if spent or self.search.finished():
+                self.poles, self.search = self.search.poles, None
+                self.fit = self._next_fit()
+            return
+        fit = self._present_fit
+        fit.step()
+        if self.sweeping and fit.finished():
+            cutoff, loss = fit.config.cutoff_for(self.system), fit.best["T*"].error
+            self.sweep.append({"cutoff": cutoff, "loss": loss, **fit.traded()})
+            self.fit = self._next_fit()
+
+    @property
+    def _present_fit(self) -> TwoStageFit:
+        """The current fit; while the poles are learned, one with the poles so far."""
+        if self.fit is not None:
+            return self.fit
+        assert self.search is not None
+        return self._next_fit(self.search.poles)
 
     def finished(self) -> bool:
-        return self.fit.finished() and not self.sweeping
+        return self.fit is not None and self.fit.finished() and not self.sweeping
 
     def progress(self) -> float:
-        if self.config.sweep == "none":
-            return self.fit.progress()
+        if self.fit is None:
+            assert self.search is not None
+            return SEARCH_SHARE * self.search.iteration / STEPS
+        first = SEARCH_SHARE if self.poles else 0.0
+        part = self.fit.progress()
         if self.sweeping:
-            return SWEEP_SHARE * (len(self.sweep) + self.fit.progress()) / len(SWEEP)
-        return SWEEP_SHARE + (1 - SWEEP_SHARE) * self.fit.progress()
+            part = SWEEP_SHARE * (len(self.sweep) + part) / len(SWEEP)
+        elif self.sweep:
+            part = SWEEP_SHARE + (1 - SWEEP_SHARE) * part
+        return first + (1 - first) * part
 
     def status(self) -> str:
+        if self.fit is None:
+            assert self.search is not None
+            return f"poles: loss {self.search.loss:.3g}"
         text = f"{self.fit.stage}: held out {self.fit.latest:.3g}"
         if self.sweeping:
             text = f"cut-off {self.fit.config.cutoff_for(self.system):.3g} Hz, {text}"
         return text
 
     def curves(self) -> Mapping[str, float]:
+        if self.fit is None:
+            assert self.search is not None
+            return {"loss/poles": self.search.loss}
         if self.sweeping:
             return {f"sweep/{name}": value for name, value in (self.sweep or [{}])[-1].items()}
         name = "T" if self.fit.stage == "T" else "T_star"
         return {f"loss/{name}": self.fit.fit.loss, f"loss/{name}_held_out": self.fit.latest}
 
     def state(self) -> dict[str, Any]:
-        # A fit of an unfinished sweep is restarted.
-        return {"sweep": self.sweep, "fit": None if self.sweeping else self.fit.state()}
+        # An unfinished search of the poles and an unfinished fit of a sweep are restarted.
+        fit = None if self.sweeping or self.fit is None else self.fit.state()
+        return {"sweep": self.sweep, "poles": self.poles, "fit": fit}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         self.sweep = list(state["sweep"])
-        if self.sweep:
-            self.fit = self._fit(self._swept_config())
+        if state["poles"] is not None:
+            self.poles, self.search = tuple(state["poles"]), None
+        if self.search is None and (self.sweep or self.poles):
+            self.fit = self._next_fit()
         if state["fit"] is not None:
-            self.fit.load_state(state["fit"])
+            self._present_fit.load_state(state["fit"])
 
     def result(self) -> TrainedKKL:
         """Return the observer with the least validation errors."""
-        fit, samples = self.fit, self.fit.samples
-        decoder = fit.decoder
-        facts = self.facts(loss=fit.best["T*"].error, seed=self.config.seed)
+        fit = self._present_fit
+        samples, decoder = fit.samples, fit.decoder()
+        facts = self.facts(loss=decoder.error, seed=self.config.seed)
         return TrainedKKL(
             **{**facts, "config": plain(asdict(fit.config))},
             A=samples.dynamics.A,
@@ -148,7 +204,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
             clock=samples.clock,
             activation=self.config.activation,
             encoder=fit.encoder,
-            decoder=decoder,
+            decoder=decoder.layers,
             facts={
                 "dropped": samples.data.dropped,
                 "drawn": samples.data.drawn,

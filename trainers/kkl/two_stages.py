@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields
 from typing import Any, Literal, TypeAlias
 
@@ -45,21 +45,23 @@ class TwoStageFit:
         samples: the training samples.
         config: the settings.
         encoding: returns the equations to which T is fitted.
+        clock: returns the CPU seconds of the whole training.
+        deadline: what the clock shows when the fit has to end; None without a limit.
     """
 
     def __init__(
-        self, samples: Samples, config: KKLConfig, encoding: Callable[[Samples], Objective]
+        self,
+        samples: Samples,
+        config: KKLConfig,
+        encoding: Callable[[Samples], Objective],
+        clock: Callable[[], float],
+        deadline: float | None,
     ) -> None:
-        self._started_at, self._earlier = time.process_time(), 0.0
         self.samples, self.config, self._encoding = samples, config, encoding
+        self._clock, self._deadline = clock, deadline
         self.latest = np.nan
         self.best: dict[str, BestWeights] = {}
         self._begin("T")
-
-    @property
-    def seconds(self) -> float:
-        """CPU seconds so far."""
-        return self._earlier + time.process_time() - self._started_at
 
     @property
     def iterations(self) -> int:
@@ -71,16 +73,15 @@ class TwoStageFit:
         """The best weights of T."""
         return self.best["T"].layers
 
-    @property
-    def decoder(self) -> Layers:
-        """The best weights of T*.
-
-        If T is still in training, the stage of T* is begun, and these are its initial weights.
-        """
-        if self.stage == "T":
-            self.best["T"].made = self.fit.iteration
-            self._begin("T*")
-        return self.best["T*"].layers
+    def decoder(self) -> BestWeights:
+        """Return the best weights of T*; the initial ones if T is still in training, which is not
+        disturbed."""
+        if self.stage != "T":
+            return self.best["T*"]
+        aside = copy(self)
+        aside.best, aside.samples = dict(self.best), copy(self.samples)
+        aside._begin("T*")
+        return aside.best["T*"]
 
     def finished(self) -> bool:
         """Return whether both networks are trained."""
@@ -109,7 +110,7 @@ class TwoStageFit:
     def _begin(self, stage: Stage) -> None:
         """Draw the network of a stage, and prepare its data."""
         self.stage: Stage = stage
-        self._stage_start = self.seconds
+        self._stage_start = self._clock()
         config, samples = self.config, self.samples
         generator = torch.Generator().manual_seed(2 * config.seed + (stage == "T*"))
         if stage == "T":
@@ -182,10 +183,10 @@ class TwoStageFit:
         config = self.config
         steps = config.iterations * (config.share if self.stage == "T" else 1.0)
         done = self.fit.iteration / steps
-        if config.budget is not None:
-            budget = config.budget - self._stage_start
+        if self._deadline is not None:
+            budget = self._deadline - self._stage_start
             share = budget * config.share / (1 + config.share) if self.stage == "T" else budget
-            spent = self.seconds - self._stage_start
+            spent = self._clock() - self._stage_start
             done = max(done, spent / max(share, 1e-9))
         return done
 
@@ -255,13 +256,12 @@ class TwoStageFit:
         """Return all that `load_state` needs to resume exactly; samples are simulated again."""
         return {
             "stage": self.stage,
-            "seconds": self.seconds,
             "stage_start": self._stage_start,
             "best": {
                 stage: {f.name: getattr(best, f.name) for f in fields(BestWeights)}
                 for stage, best in self.best.items()
             },
-            "usual": self._mse.cpu().numpy() if self.stage == "T*" else None,
+            "usual": None if self.stage == "T" else self._mse.cpu().numpy(),
             "fit": self.fit.state(),
         }
 
@@ -272,11 +272,13 @@ class TwoStageFit:
         if state["stage"] != "T":
             self._begin("T*")
         self.fit.load_state(state["fit"])
-        self.best, self.stage = kept, state["stage"]
+        self.best = kept
         if state["usual"] is not None:
             self._mse = torch.from_numpy(state["usual"]).to(self.samples.device)
-        self._earlier += state["seconds"]
         self._stage_start = state["stage_start"]
+        # A fit that its budget has ended goes on if there is more of it now.
+        if state["stage"] == "done" and self._stage_over():
+            self.stage = "done"
 
 
 def _held_equations(objective: Objective, seed: int) -> list[Equations]:
