@@ -18,9 +18,11 @@ created it, and recognises a dead process on the same machine.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import FileIO
@@ -32,6 +34,23 @@ from filelock import BaseFileLock, FileLock, Timeout
 
 POLL = 0.01
 """Seconds between two attempts to lock a file that another process has locked."""
+
+
+_LONGEST_NAME = 80
+"""Largest length of a `file_name`, short enough for several in one path."""
+_DEVICES = (f"{device}{number}" for device in ("com", "lpt") for number in range(10))
+_RESERVED = frozenset({"con", "prn", "aux", "nul", *_DEVICES})
+"""Names that Windows keeps for devices."""
+
+
+def file_name(name: str) -> str:
+    """Return a name as one part of a path. Different names stay different, up to upper and lower
+    case: a name with unsafe characters, such as ``../a``, is spelt without them and with its
+    hash."""
+    safe = re.sub(r"[^\w.+-]", "_", name, flags=re.ASCII).strip(".")[:_LONGEST_NAME]
+    if safe == name and safe.partition(".")[0].lower() not in _RESERVED:
+        return safe
+    return f"{safe}-{hashlib.sha256(name.encode()).hexdigest()[:8]}".lstrip("-")
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from pinnobs_gym.leaderboard import ranks, ranks_table
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.contenders import contenders
 from pinnobs_gym.leaderboard.runs import runs_of
-from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.leaderboard.standings_table import text_table
 from pinnobs_gym.scoring import rows
 
 ROOT = Path(__file__).parents[1]
@@ -73,9 +73,9 @@ def summary(scored: list[rows.Row]) -> str:
         "`runs/leaderboard/leaderboard.md`."
     )
     standings = board(rows.Stored(scored, []))
-    parts = [intro, ranks_table.NOTE, markdown_table(*ranks_table.cells(standings.lines))]
+    parts = [intro, ranks_table.NOTE, text_table(*ranks_table.cells(standings.lines))]
     if len(standings.ranks) > 2:
-        parts += [ranks_table.RANK_NOTE, markdown_table(*ranks_table.rank_cells(standings.ranks))]
+        parts += [ranks_table.RANK_NOTE, text_table(*ranks_table.rank_cells(standings.ranks))]
     return "\n\n".join(parts)
 
 
@@ -87,7 +87,7 @@ def under_conditions(scored: list[rows.Row]) -> str:
         f"--condition all --episodes {episodes}`."
     )
     ratios = ranks.log_ratios(contenders(runs_of(scored)))
-    table = markdown_table(*ranks_table.rank_cells(ranks.ranks(ratios)))
+    table = text_table(*ranks_table.rank_cells(ranks.ranks(ratios)))
     return "\n\n".join([intro, ranks_table.RANK_NOTE, table])
 
 

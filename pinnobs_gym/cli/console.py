@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich import box
 from rich.console import Console, Group
@@ -25,8 +25,10 @@ from pinnobs_gym.leaderboard import standings_table
 
 WIDE = 190
 """Width of a leaderboard's table with its intervals, in characters."""
-console = Console() if Console().is_terminal else Console(width=WIDE)
-"""The console for all output; wide enough for the tables if it is not a terminal."""
+_PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
+console = Console(**_PLAIN) if Console().is_terminal else Console(width=WIDE, **_PLAIN)
+"""The console for all output; wide enough for the tables if it is not a terminal. Names are data:
+brackets and colons in them are printed as they are."""
 
 
 def print_table(table: standings_table.Table) -> None:
@@ -45,9 +47,9 @@ def print_table(table: standings_table.Table) -> None:
     console.print(shown)
     for standing, name in zip(table.standings, standings_table.names(table.standings), strict=True):
         trained = f"; trained: {standing.training}" if standing.training else ""
-        console.print(f"  {name} knows: {standing.knows}{trained}", markup=False)
+        console.print(f"  {name} knows: {standing.knows}{trained}")
     if table.note:
-        console.print(f"  {table.note}", style="yellow", markup=False)
+        console.print(f"  {table.note}", style="yellow")
 
 
 def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
@@ -63,7 +65,7 @@ def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]
 def progress() -> Progress:
     """Return a progress bar with counts and times."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -116,7 +118,7 @@ class RunView:
         self.failed += error is not None
         self._bar.advance(self._task)
         if error is not None:
-            console.print(f"failed: {name}: {error}", style="red", markup=False, soft_wrap=True)
+            console.print(f"failed: {name}: {error}", style="red", soft_wrap=True)
         now = time.monotonic()
         last = self.done + self.failed == self._total
         if not console.is_terminal and (last or now - self._printed_at >= self.EVERY):

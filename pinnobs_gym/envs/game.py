@@ -13,6 +13,7 @@ import numpy as np
 from pinnobs_gym.envs.episodes import Changes, Episodes, EpisodeSource, Stream
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.envs.vector_env import EstimationVectorEnv
+from pinnobs_gym.files import file_name
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -36,7 +37,7 @@ class GameName(NamedTuple):
     @property
     def file_stem(self) -> str:
         """The name as the beginning of file names."""
-        return "-".join([self.system, self.setup, self.condition])
+        return "-".join(map(file_name, (self.system, self.setup, self.condition)))
 
 
 @dataclass(frozen=True)

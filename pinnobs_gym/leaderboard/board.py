@@ -44,5 +44,5 @@ def board(stored: Stored) -> Board:
 def markdown(board: Board) -> str:
     """Return the overview, the ranks and the table of every game in Markdown."""
     across = ranks_table.markdown(board.lines, board.ranks)
-    notes = "".join(f"\n{note}\n" for note in board.notes)
+    notes = "".join(f"\n{standings_table.markdown_text(note)}\n" for note in board.notes)
     return across + notes + "\n" + standings_table.markdown(board.tables)

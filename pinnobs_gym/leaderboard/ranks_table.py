@@ -11,7 +11,7 @@ from pinnobs_gym.leaderboard.contenders import label
 from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.ranks import Line
 from pinnobs_gym.leaderboard.standings import Standing
-from pinnobs_gym.leaderboard.standings_table import markdown_table, number
+from pinnobs_gym.leaderboard.standings_table import number, text_table
 
 NOTE = (
     "Median NRMSE over the whole episode, under the condition that a system is ranked under; `div` "
@@ -67,9 +67,9 @@ RANK_NOTE = (
 def markdown(found: Sequence[Line], placed: Mapping[str, Mapping[str, int]]) -> str:
     """Return the overview of `lines` in Markdown, followed by the table of `ranks` if it has
     several conditions."""
-    parts = ["# Leaderboard\n", NOTE, "", markdown_table(*cells(found)), ""]
+    parts = ["# Leaderboard\n", NOTE, "", text_table(*cells(found)), ""]
     if len(placed) > 1:
-        parts += ["# Conditions\n", RANK_NOTE, "", markdown_table(*rank_cells(placed)), ""]
+        parts += ["# Conditions\n", RANK_NOTE, "", text_table(*rank_cells(placed)), ""]
     return "\n".join(parts) + "\n"
 
 

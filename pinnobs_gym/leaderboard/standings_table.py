@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -144,16 +145,31 @@ def markdown(tables: Iterable[Table]) -> str:
     """Return the tables in Markdown."""
     parts = ["# Each game\n", NOTE + "\n"]
     for table in tables:
-        parts.append(f"\n## {table.title}\n")
-        parts.append(markdown_table(HEADER, cells(table)))
-        parts += [f"\n{table.note}"] if table.note else []
+        parts.append(f"\n## {markdown_text(table.title)}\n")
+        parts.append(text_table(HEADER, cells(table)))
+        parts += [f"\n{markdown_text(table.note)}"] if table.note else []
     return "\n".join(parts) + "\n"
 
 
 def markdown_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return one table in Markdown."""
+    """Return one table in Markdown, of cells in Markdown."""
     rules = ["---"] * len(header)
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rules, *lines))
+
+
+def text_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return one table in Markdown, of cells that are text, whatever characters are in them."""
+    return markdown_table(
+        [markdown_text(cell) for cell in header],
+        ([markdown_text(cell) for cell in line] for line in lines),
+    )
+
+
+def markdown_text(text: str) -> str:
+    """Return text with the characters escaped that Markdown, HTML or a table would take for
+    markup; brackets only where they could be a link."""
+    text = re.sub(r"[\\`*<>|]", r"\\\g<0>", " ".join(text.split()))
+    return re.sub(r"\](?=[(\[:])", r"\\]", text)
 
 
 NOTE = (

@@ -4,7 +4,6 @@ rows."""
 from __future__ import annotations
 
 import json
-import re
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 
 from pinnobs_gym.envs.figures import measured_states
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.files import replacing
+from pinnobs_gym.files import file_name, replacing
 from pinnobs_gym.scoring.metrics import by_sample
 from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row, game_of
@@ -116,7 +115,7 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
     arrays |= {"x": example.x, "xhat": example.xhat, "y": example.y, "example_t": example.t}
     arrays |= {name: array for name, array in optional.items() if array is not None}
     hashes = f"{row['game_hash']}-{row['estimator_hash']}"
-    name = f"{_file_safe(row['estimator'])}-{hashes}-{curves.seeds[0]}.npz"
+    name = f"{file_name(row['estimator'])}-{hashes}-{curves.seeds[0]}.npz"
     path = _folder_of_game(folder, game_of(row)) / name
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
@@ -189,9 +188,4 @@ def _from_arrays(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves
 
 
 def _folder_of_game(folder: Path, game: GameName) -> Path:
-    return folder / _file_safe(game.system) / _file_safe(game.setup) / _file_safe(game.condition)
-
-
-def _file_safe(name: str) -> str:
-    """Replace the characters of a name that are unsafe in a file name."""
-    return re.sub(r"[^\w.+-]", "_", name)
+    return folder.joinpath(*map(file_name, (game.system, game.setup, game.condition)))

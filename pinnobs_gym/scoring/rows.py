@@ -249,7 +249,7 @@ def _parsed_together(lines: list[bytes]) -> list[Any] | None:
     """Parse all lines at once, which is faster than one by one; None if a line is damaged."""
     try:
         parsed = json.loads(b"[" + b",".join(lines) + b"]")
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     whole = len(parsed) == len(lines) and all(type(row) is dict for row in parsed)
     return parsed if whole else None
@@ -308,18 +308,71 @@ def _parsed(line: bytes) -> Row | None:
     """Return the object in a line, or None if the line is not a JSON object."""
     try:
         row = json.loads(line)
-    except ValueError:  # not JSON, or not text
+    except (ValueError, RecursionError):  # not JSON, or not text, or nested without end
         return None
     return row if isinstance(row, dict) else None
 
 
-_ABSENT = object()
-_NEEDED = {
-    "score": frozenset((*KEY, *SCORES, "diverged", "ranked", "nx", "estimator_code", "date")),
+NEEDED = {
+    "score": frozenset(
+        (
+            *(*KEY, *SCORES, "diverged", "ranked", "nx", "estimator_code", "track", "knows"),
+            *("options", "training", "versions", "us_per_step", "date"),
+        )
+    ),
     "failure": frozenset((*JOB, "error", "date")),
     "recovery": frozenset((*JOB, "date")),
 }
 """The required fields of each kind of row."""
+
+
+_LONGEST_SHOWN = 60
+"""Largest number of characters that an error shows of a value."""
+
+
+def _is_text(value: object) -> bool:
+    return type(value) is str and len(value) <= 1000
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _is_seed(value: object) -> bool:
+    return value is None or _is_count(value)
+
+
+def _is_flag(value: object) -> bool:
+    return type(value) is bool
+
+
+def _is_object(value: object) -> bool:
+    return type(value) is dict
+
+
+def _are_texts(value: object) -> bool:
+    return type(value) is list and all(map(_is_text, value))
+
+
+_TEXT = ("a text of at most 1000 characters", _is_text)
+_COUNT = ("a whole number of at least 0", _is_count)
+_FLAG = ("true or false", _is_flag)
+_OBJECT = ("an object", _is_object)
+_KINDS = {
+    **dict.fromkeys(("env_id", "setup", "condition", "estimator", "track", "date", "error"), _TEXT),
+    **dict.fromkeys(("game_hash", "estimator_code", "estimator_hash", "job"), _TEXT),
+    **dict.fromkeys(("episode_seed", "episodes", "nx"), _COUNT),
+    **dict.fromkeys(("diverged", "ranked"), _FLAG),
+    **dict.fromkeys(("options", "training", "versions"), _OBJECT),
+    "training_seed": ("a whole number of at least 0, or null", _is_seed),
+    "knows": ("a list of texts", _are_texts),
+}
+FIELDS = {
+    kind: [(name, *_KINDS[name]) for name in sorted(needed) if name in _KINDS]
+    for kind, needed in NEEDED.items()
+}
+"""The required fields of each kind of row that are no scores: what is expected, and whether a value
+fits."""
 
 
 def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
@@ -336,20 +389,41 @@ def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
             f"the file away and run again"
         )
     kind = row.get("kind")
-    if kind not in _NEEDED:
+    if kind not in NEEDED:
         raise ValueError(
-            f"{path}, line {number}: a row of kind {kind!r}; expected {', '.join(_NEEDED)}"
+            f"{path}, line {number}: a row of kind {kind!r}; expected {', '.join(NEEDED)}"
         )
-    if not _NEEDED[kind] <= row.keys():
-        missing = ", ".join(sorted(_NEEDED[kind] - row.keys()))
+    if not NEEDED[kind] <= row.keys():
+        missing = ", ".join(sorted(NEEDED[kind] - row.keys()))
         raise ValueError(f"{path}, line {number}: a row without {missing}")
+    for name, expected, fits in FIELDS[kind]:
+        if not fits(row[name]):
+            raise ValueError(
+                f"{path}, line {number}: {name}={_shown(row[name])}; expected {expected}"
+            )
     if kind == "score":
-        for name in SCORES:
-            if row[name] is None:
-                row[name] = math.inf
+        for name in (*SCORES, "us_per_step"):
+            row[name] = _score(path, number, name, row[name])
         for name in OPTIONAL_SCORES:
-            if row.setdefault(name, _ABSENT) is None:
-                row[name] = math.inf
-            elif row[name] is _ABSENT:
-                row[name] = None
+            row[name] = _score(path, number, name, row[name]) if name in row else None
     return row
+
+
+def _score(path: Path, number: int, name: str, value: object) -> float:
+    """Return a score, of which null stands for infinity."""
+    if value is None:
+        return math.inf
+    signed = name == "innovation_correlation"
+    if type(value) in (float, int) and (value >= 0 or (signed and value >= -1)):  # pyright: ignore
+        return float(value)  # pyright: ignore[reportArgumentType]
+    least = "-1" if signed else "0"
+    raise ValueError(
+        f"{path}, line {number}: {name}={_shown(value)}; expected a number of at least {least}, or "
+        "null for infinity"
+    )
+
+
+def _shown(value: object) -> str:
+    """Return the beginning of what JSON shows of a value."""
+    text = json.dumps(value)
+    return text if len(text) <= _LONGEST_SHOWN else text[: _LONGEST_SHOWN - 3] + "..."

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pinnobs_gym.files import file_name
 from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.training.log import Log
@@ -45,8 +46,8 @@ def log_summary(log: Log, rows: list[Row]) -> None:
 def log_folder(folder: Path, row: Row) -> Path:
     """Return the log folder of a row's estimator; other settings of it have another folder."""
     system = row["env_id"].removeprefix("pinnobs/")
-    played = folder / "tensorboard" / system / row["setup"] / row["condition"]
-    return played / row["estimator"] / row["estimator_hash"]
+    parts = (system, row["setup"], row["condition"], row["estimator"], row["estimator_hash"])
+    return folder.joinpath("tensorboard", *map(file_name, parts))
 
 
 def log_summaries(folder: Path, rows: Iterable[Row]) -> None:

@@ -171,7 +171,7 @@ def _bar(shown: bool) -> Iterator[Show]:
     columns = (
         TextColumn("{task.fields[iteration]} iterations"),
         BarColumn(bar_width=20),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         TimeRemainingColumn(),
     )
     with Progress(*columns) as progress:

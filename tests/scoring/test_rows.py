@@ -7,7 +7,7 @@ import pytest
 from stored_rows import row, write_fifty
 
 from pinnobs_gym.scoring import rows
-from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES
+from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
 
 def test_round_trip_keeps_infinity_as_valid_json(tmp_path):
@@ -102,7 +102,8 @@ def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
 
 
 def event(kind="failure", day=1, job="a", **changes):
-    names = dict.fromkeys(rows.JOB, "x") | {"job": job, "date": f"2026-01-{day:02d}"}
+    names = dict.fromkeys(rows.JOB, "x") | {"episode_seed": 0, "episodes": 1}
+    names |= {"job": job, "date": f"2026-01-{day:02d}"}
     error = {"error": "out of luck"} if kind == "failure" else {}
     return {"schema": rows.SCHEMA, "kind": kind, **names, **error, **changes}
 
@@ -193,3 +194,49 @@ def test_processes_may_share_a_file(tmp_path):
         worker.join()
     seeds = sorted(r["episode_seed"] for r in rows.read(path))
     assert seeds == sorted(100 * i + j for i in range(3) for j in range(50))
+
+
+WRONG = {
+    "nrmse": ("-1", '"a"', "true", "NaN", "[0.1]", '{"a": 1}'),
+    "us_per_step": ("-1", '"a"'),
+    "anees": ("-0.5", "[]"),
+    "innovation_correlation": ("-1.5", '"a"'),
+    "episode_seed": ("-1", "1.5", "true", "null", '"1"'),
+    "nx": ("-1", '"2"'),
+    "training_seed": ("-1", "1.5", '"a"'),
+    "diverged": ("1", "null", '"no"'),
+    "ranked": ("0",),
+    "estimator": ("1", "null", "[]", json.dumps("a" * 1001)),
+    "env_id": ("null", "{}"),
+    "game_hash": ("null",),
+    "date": ("3",),
+    "knows": ('"model"', "[1]"),
+    "options": ("[]", "null"),
+    "training": ("[]",),
+    "versions": ("1",),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, vs in WRONG.items() for v in vs])
+def test_a_wrong_value_is_named_with_its_file_line_and_field(tmp_path, name, value):
+    path = tmp_path / "rows.jsonl"
+    first, second = json.dumps(row(0)), json.dumps(row(1) | {name: "?"})
+    path.write_text(f"{first}\n{second.replace(json.dumps('?'), value)}\n")
+    with pytest.raises(ValueError, match=rf"rows.jsonl, line 2: {name}=.*; expected ") as caught:
+        rows.load(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_endless_nesting_is_no_row(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(f"{json.dumps(row(0))}\n{'[' * 10**5}\n{json.dumps(row(1))}\n")
+    with pytest.raises(ValueError, match="line 2, is cut off or is not a row"):
+        rows.load(path)
+
+
+def test_every_required_field_is_checked():
+    scores = {*SCORES, "us_per_step"}
+    for kind, needed in rows.NEEDED.items():
+        checked = {name for name, *_ in rows.FIELDS[kind]}
+        assert needed - checked - scores == set(), kind

@@ -142,7 +142,7 @@ class Leaderboard:
         print_grid("Across systems", *ranks_table.cells(results.lines))
         console.print(ranks_table.NOTE)
         for note in results.notes:
-            console.print(note, style="yellow", markup=False, soft_wrap=True)
+            console.print(note, style="yellow", soft_wrap=True)
         if len(results.ranks) > 1:
             print_grid("Ranks", *ranks_table.rank_cells(results.ranks))
             console.print(ranks_table.RANK_NOTE)

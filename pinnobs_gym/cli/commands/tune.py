@@ -13,7 +13,7 @@ from pinnobs_gym.cli.console import console, progress
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.files import check_writable
+from pinnobs_gym.files import check_writable, file_name
 from pinnobs_gym.scoring.tuning import Search, Tried
 
 
@@ -48,7 +48,7 @@ class Tune:
         cls = ESTIMATORS.resolve(self.name)
         game = Game.of(self.system, self.setup, self.condition)
         check_writable(self.out)
-        path = self.out / f"{game.name.file_stem}-{ESTIMATORS.name_of(cls)}.journal"
+        path = self.out / f"{game.name.file_stem}-{file_name(ESTIMATORS.name_of(cls))}.journal"
         search = Search(cls, game, self.episodes, path, self.seed)
         if self.fresh:
             search.forget()

@@ -51,7 +51,7 @@ def embedded(charts: Charts, styles: Mapping[str, Style], chosen: Sequence[str])
         "data": charts.data,
     }
     text = json.dumps(everything, separators=(",", ":"), ensure_ascii=False)
-    return text.replace("</", "<\\/")
+    return text.replace("<", "\\u003c")  # which could end the script element
 
 
 def _across(styled: Styled, costs: Columns) -> Charts:
