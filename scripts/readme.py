@@ -17,14 +17,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import measured
-import numpy as np
 import tyro
 from machine import processor
 from reproduction import report as paper
 from reproduction.tables import TABLES
 
 from pinnobs_gym.cli.output import write_figure
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.files import replacing
@@ -48,7 +47,7 @@ BEFORE = "## Development"
 def picture(path: Path, seed: int = 3) -> None:
     """Draw the EKF's estimates of one episode of ReverseDuffing."""
     source = EpisodeSource("ReverseDuffing")
-    episodes = source.play(source.draw([Stream(np.random.SeedSequence(seed))]))
+    episodes = source.play(source.draw(source.streams([seed])))
     record = source.record(episodes)
     estimates = EKF.for_setup(source.system, source.setup).run(record)
     assert estimates.P is not None

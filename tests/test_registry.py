@@ -22,7 +22,7 @@ class Decay(System):
     state_names = ("x",)
     output_names = ("y",)
     scale = (1.0,)
-    setups = {"benchmark": Setup((-1.0,), (1.0,), (0.0,), (1.0,), duration=1.0, dt=0.1)}
+    setups = {"benchmark": Setup((-1.0,), (1.0,), duration=1.0, dt=0.1)}
 
     def f(self, t, x, u):
         return stack(x, -x[..., 0])
@@ -200,7 +200,7 @@ def test_register_refuses_what_is_incomplete_or_taken():
         pinnobs_gym.register(NoSetups)
 
     class OldOutput(NoSetups):
-        setups = {"benchmark": Setup((0,), (1,), (0,), (1,), duration=1, dt=0.1)}
+        setups = {"benchmark": Setup((0,), (1,), duration=1, dt=0.1)}
 
         def h(self, x):
             return x
@@ -209,7 +209,7 @@ def test_register_refuses_what_is_incomplete_or_taken():
         pinnobs_gym.register(OldOutput)
 
     class WrongSize(NoSetups):
-        setups = {"benchmark": Setup((0, 0), (1, 1), (0, 0), (1, 1), duration=1, dt=0.1)}
+        setups = {"benchmark": Setup((0, 0), (1, 1), duration=1, dt=0.1)}
 
     with pytest.raises(TypeError, match=r"WrongSize: x0_low .* shape \(2,\); expected 1"):
         pinnobs_gym.register(WrongSize)

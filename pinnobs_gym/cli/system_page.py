@@ -10,6 +10,7 @@ from docstring_parser import parse_from_object
 
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
+from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.system import System, vector
 
 
@@ -82,19 +83,24 @@ def _setups(cls: type[System]) -> str:
     lines = []
     for name in cls.setups:
         system, setup = cls.configured(name)
-        low, high, xhat0, P0_std = (
-            vector(getattr(setup, part), system.nx, part).tolist()
-            for part in ("x0_low", "x0_high", "xhat0", "P0_std")
+        low, high = (
+            vector(getattr(setup, part), system.nx, part).tolist() for part in ("x0_low", "x0_high")
         )
+        xhat0, P0 = (moments.tolist() for moments in prior_moments(system, setup))
         if setup.fixed_x0:
             start = f"x₀ = {low}"
         else:
             start = f"x₀ uniform in {low} to {high}, where admissible"
         noise = vector(setup.noise_std, system.ny, "noise_std").tolist()
         lines.append(
-            f"- `{name}`: {start}; x̂₀ = {xhat0}, √P₀ = {P0_std}; output "
+            f"- `{name}`: {start}; x̂₀ = {xhat0}, P₀ = {P0}; output "
             f"noise {noise}" + (f"; {dict(setup.parameters)}" if setup.parameters else "")
         )
+        if setup.poor_prior is not None:
+            xhat0, P0 = setup.poor_prior.xhat0, setup.poor_prior.P0
+            lines[-1] += (
+                f"; under `poor_prior`, x̂₀ = {list(xhat0)}, P₀ = {[list(row) for row in P0]}"
+            )
     note = inspect.getdoc(cls.admissible) or ""
     return "\n".join([*lines, f"\nAdmissible: {note}" if "admissible" in vars(cls) else ""])
 

@@ -16,6 +16,8 @@ from gymnasium.spaces import Box
 
 from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimation.kalman import joseph_update, predict
+from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_scale, vector
 
@@ -337,9 +339,10 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
         ValueError: in one line, if the model diverges from every draw.
     """
     times, nx = setup.times, system.nx
-    mean, std = vector(setup.xhat0, nx, "xhat0"), vector(setup.P0_std, nx, "P0_std")
-    x = mean + std * np.random.default_rng(0).standard_normal((_DRAWS, nx))
-    P = np.broadcast_to(np.diag(std**2)[..., None], (nx, nx, _DRAWS))
+    mean, cov = prior_moments(system, setup)
+    draws = np.random.default_rng(0).standard_normal((_DRAWS, nx))
+    x = mean + draws @ root(cov[..., None])[..., 0].T
+    P = np.broadcast_to(cov[..., None], (nx, nx, _DRAWS))
     scale = vector(system.scale, nx, "scale")
     Q = np.diag((GaussianEstimator.process_noise * scale) ** 2)[..., None]
     floor = NOISE_FLOOR * output_scale(system)

@@ -91,7 +91,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         prior = Prior.of(self.source.system, self.source.setup, 1, options.get("xhat0"))
         x0 = given_x0(self.source, options, 1)
         if seed is not None or self._stream is None:
-            self._stream = Stream(seeds_of(self.np_random))
+            self._stream = self.source.stream(seeds_of(self.np_random))
             self._buffer.forget([0])
         episode = self._buffer.take([0], [self._stream], x0)
         self._x, self._observations = episode.x[:, 0], episode.observations[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -74,9 +75,9 @@ class Episodes:
 class EpisodeSource:
     """Generates the episodes of an env: every seed defines an endless sequence of them.
 
-    The random numbers of an episode (`Draws`) depend on the seed and on the number of earlier
-    episodes of that seed. Everything else depends on these draws alone. The same seed thus gives
-    the same episodes in any batch.
+    The random numbers of an episode (`Draws`) depend on the seed, the system's name and the number
+    of earlier episodes of that seed. Everything else depends on these draws alone. The same seed
+    thus gives the same episodes in any batch.
 
     Args:
         system: name, ``module:Class`` or class of the system.
@@ -115,6 +116,14 @@ class EpisodeSource:
         """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
         inside = np.asarray(((x0 >= self.x0_low) & (x0 <= self.x0_high)).all(axis=-1))
         return inside if self.fixed_x0 else inside & self.system.admissible(x0)
+
+    def stream(self, seeds: np.random.SeedSequence) -> Stream:
+        """Return the random number stream of a seed for this system."""
+        return Stream(seeds, type(self.system).__name__)
+
+    def streams(self, seeds: Iterable[int | None]) -> list[Stream]:
+        """Return the random number streams of these seeds; None is a seed that is drawn."""
+        return [self.stream(np.random.SeedSequence(seed)) for seed in seeds]
 
     def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
         """Draw the random numbers of the next episode of each stream; a stream may occur several
@@ -240,10 +249,20 @@ class EpisodeBuffer:
 
 
 class Stream:
-    """The random number generators of one seed, and its queue of initial states."""
+    """The random number generators of one seed and system, and its queue of initial states.
 
-    def __init__(self, seeds: np.random.SeedSequence) -> None:
-        states, noise, conditions = (np.random.default_rng(seed) for seed in seeds.spawn(3))
+    The seed is salted with the system's name. The same seed thus gives independent episodes of
+    different systems.
+
+    Args:
+        seeds: the seed.
+        system: name of the system.
+    """
+
+    def __init__(self, seeds: np.random.SeedSequence, system: str) -> None:
+        salt = np.frombuffer(hashlib.sha256(system.encode()).digest()[:16], "<u4").tolist()
+        salted = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, *salt))
+        states, noise, conditions = (np.random.default_rng(seed) for seed in salted.spawn(3))
         self._states = states
         self._queue: list[np.ndarray] = []
         self.noise = noise

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System, initial_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +73,7 @@ def measured_states(system: System) -> dict[int, int]:
     that equals the state at any time and input."""
     setup = system.setups["benchmark"]
     t = setup.duration * np.array([0.0, 0.37])
-    x = np.tile(vector(setup.xhat0, system.nx, "xhat0"), (2, 1))
+    x = initial_states(system, setup, 2)
     u = np.asarray(system.input(t)) + np.array([[0.0], [1.0]])
     y, H = np.asarray(system.h(t, x, u)), np.asarray(system.h_jacobian(t, x, u))
     measured = {}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self, Unpack
 import gymnasium as gym
 import numpy as np
 
-from pinnobs_gym.envs.episodes import Changes, Episodes, EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import Changes, Episodes, EpisodeSource
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.envs.vector_env import EstimationVectorEnv
 from pinnobs_gym.files import file_name
@@ -103,8 +103,7 @@ class Game:
             seeds: one per episode.
             x0: initial states (batch, nx) that replace the drawn ones.
         """
-        streams = [Stream(np.random.SeedSequence(seed)) for seed in seeds]
-        return self.source.play(self.source.draw(streams), x0)
+        return self.source.play(self.source.draw(self.source.streams(seeds)), x0)
 
     def record(self, seeds: Iterable[int]) -> Record:
         """Return the record, given to estimators, of the episodes of these seeds."""

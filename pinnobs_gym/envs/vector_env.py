@@ -186,11 +186,11 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds; expected {self.num_envs}, one per row")
         if not self._streams:
-            self._streams = [Stream(np.random.SeedSequence(s)) for s in seeds]
+            self._streams = self.source.streams(seeds)
         elif seed is not None:
             self._buffer.forget(rows.tolist())
             for row in rows:
-                self._streams[row] = Stream(np.random.SeedSequence(seeds[row]))
+                (self._streams[row],) = self.source.streams([seeds[row]])
 
     def _prior_infos(self, rows: np.ndarray) -> dict[str, Any]:
         """Return the infos of rows whose episode has just started: their prior."""

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.simulation.model import model_step, model_step_jacobian
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System, initial_states, vector
 
 TIME_CONSTANTS = 20.0
 """Duration of a benchmark episode over an observer's time constant, by default."""
+_STATES = 16
+"""Number of initial states for which gains are designed."""
 
 
 def default_rate(system: System) -> float:
@@ -22,17 +24,31 @@ def default_rate(system: System) -> float:
     return TIME_CONSTANTS / system.setups["benchmark"].duration
 
 
-def operating_point(system: System) -> tuple[float, np.ndarray]:
-    """Return the time (s) and state (nx,) of linearisation.
+def design_states(system: System) -> np.ndarray:
+    """Return the initial states (16, nx) for which gains are designed: admissible states of the
+    benchmark's initial set, the same at every call."""
+    return initial_states(system, system.setups["benchmark"], _STATES)
 
-    It is the model's state after a quarter of a benchmark episode that begins at x̂₀.
+
+def operating_points(system: System) -> tuple[float, np.ndarray]:
+    """Return the time (s) and the states (num_points, nx) of linearisation.
+
+    They are the model's states after a quarter of a benchmark episode from each of the
+    `design_states`; those that are not finite are left out.
+
+    Raises:
+        ValueError: in one line, if none is finite.
     """
-    setup = system.setups["benchmark"]
-    x = vector(setup.xhat0, system.nx, "xhat0")
-    times = setup.times[: len(setup.times) // 4 + 1]
-    u = np.asarray(system.input(times))
-    for k in range(len(times) - 1):
-        x = model_step(system, times[k], times[k + 1], x, u[k], u[k + 1])
+    x = design_states(system)
+    times = system.setups["benchmark"].times
+    times = times[: len(times) // 4 + 1]
+    u = np.asarray(system.input(times))[:, None]
+    with np.errstate(all="ignore"):
+        for k in range(len(times) - 1):
+            x = model_step(system, times[k], times[k + 1], x, u[k], u[k + 1])
+    x = x[np.isfinite(x).all(axis=1)]
+    if not len(x):
+        raise ValueError(f"{type(system).__name__}: the model diverges from all design states")
     return float(times[-1]), x
 
 
@@ -59,68 +75,130 @@ def linearised_scaled(
     return A, H, scale
 
 
-def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = None) -> np.ndarray:
-    """Return the gain L (nx, ny) that places the poles of A − LH, linearised at `operating_point`.
+def placed_gains(
+    system: System, rate: float, poles: Sequence[complex] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a gain for each of the `operating_points` at which the poles can be placed.
 
-    With ``poles``, these are placed (Kautsky, Nichols & Van Dooren 1985). Without, all poles are
-    placed to the left of −rate (1/s) by the Kalman gain for A + rate·I, which mirrors at −rate the
-    poles to the right of it (Anderson & Moore 1971, "Linear Optimal Control", section 4.1).
+    With ``poles``, these are the poles of A − LH (Kautsky, Nichols & Van Dooren 1985). Without, all
+    poles are placed to the left of −rate (1/s) by the Kalman gain for A + rate·I, which mirrors at
+    −rate the poles to the right of it (Anderson & Moore 1971, "Linear Optimal Control", section
+    4.1).
+
+    Returns:
+        The gains L (num_gains, nx, ny), and the Jacobians A (num_gains, nx, nx) and H (num_gains,
+        ny, nx) of the points. Those are of states divided by their scale, L is not.
 
     Raises:
-        ValueError: in one line, if (A, H) is not observable, or the number of poles is not nx.
+        ValueError: in one line, if (A, H) is observable at none of the points, or the number of
+            poles is not nx.
     """
-    A, H, scale = linearised_scaled(system, *operating_point(system))
+    if poles is not None and len(poles) != system.nx:
+        raise ValueError(f"poles={tuple(poles)}; {type(system).__name__} has nx={system.nx}")
+    t, points = operating_points(system)
+    found, failed = [], None
+    for x in points:
+        try:
+            A, H, scale = linearised_scaled(system, t, x)
+            found.append((scale[:, None] * _scaled_gain(A, H, rate, poles), A, H))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            failed = error
+    if not found:
+        raise ValueError(str(failed)) from failed
+    L, A, H = (np.stack(arrays) for arrays in zip(*found, strict=True))
+    return L, A, H
+
+
+def _scaled_gain(
+    A: np.ndarray, H: np.ndarray, rate: float, poles: Sequence[complex] | None
+) -> np.ndarray:
+    """Return the gain (nx, ny) that places the poles of A − LH; see `placed_gains`."""
     if poles is not None:
-        if len(poles) != system.nx:
-            raise ValueError(f"poles={tuple(poles)}; {type(system).__name__} has nx={system.nx}")
         from scipy.signal import place_poles  # takes long to import
 
         placed: Any = place_poles(A.T, H.T, poles)
-        return scale[:, None] * placed.gain_matrix.T
+        return placed.gain_matrix.T
     # Riccati equation of the shifted system; the small process noise keeps the gain small.
-    identity = np.eye(system.nx)
-    noise = (0.1 * rate) ** 2 * identity
     from scipy.linalg import solve_continuous_are
 
-    P = solve_continuous_are((A + rate * identity).T, H.T, noise, np.eye(system.ny))
-    return scale[:, None] * (P @ H.T)
+    identity = np.eye(len(A))
+    noise = (0.1 * rate) ** 2 * identity
+    P = solve_continuous_are((A + rate * identity).T, H.T, noise, np.eye(len(H)))
+    return P @ H.T
+
+
+def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = None) -> np.ndarray:
+    """Return the gain L (nx, ny) of the `placed_gains` that is best in the worst case: its slowest
+    pole over all their linearisations is the fastest.
+
+    Raises:
+        ValueError: as `placed_gains` does.
+    """
+    L, A, H = placed_gains(system, rate, poles)
+    scale = vector(system.scale, system.nx, "scale")
+    closed = A - (L / scale[:, None])[:, None] @ H
+    slowest = np.linalg.eigvals(closed).real.max(axis=(1, 2))
+    return L[np.argmin(slowest)]
 
 
 @lru_cache(maxsize=64)
 def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarray:
-    """Return L (nx, ny) of the default design: the `placed_gain` times a factor of at most 1.
+    """Return L (nx, ny) of the default design: one of the `placed_gains` times a factor of at most
+    1.
 
-    A gain that is stable at one operating point may amplify errors at others. Among the factors 1,
-    1/2, ..., 1/128 and 0, the one is chosen with the least error at the end of a benchmark episode,
-    by the error dynamics linearised along the model's trajectory from x̂₀.
+    A gain that is stable at one operating point may amplify errors at others. The candidates are
+    the placed gains times 1, 1/2, ..., 1/128, and zero. Each is judged by the error that it leaves
+    at the end of a benchmark episode: the worst by the error dynamics linearised along the model's
+    trajectories from the `design_states`. The least is taken. What is below exp(−rate·duration), as
+    asked, counts as equal; of equals the smallest gain is taken, for it passes the least noise.
 
     Args:
         system: the model.
-        rate: see `placed_gain`.
+        rate: see `placed_gains`.
         largest: largest factor by which the observer multiplies its gain; the candidates are
-            judged with it.
+            judged with it and with 1, and the worse counts.
 
     Raises:
-        ValueError: in one line, if (A, H) is not observable.
+        ValueError: in one line, if (A, H) is observable at none of the operating points.
     """
-    L, setup = placed_gain(system, rate), system.setups["benchmark"]
-    parts = np.append(0.5 ** np.arange(8), 0.0)
-    weight = np.repeat(largest * parts[:, None], system.ny, axis=1)
     scale = vector(system.scale, system.nx, "scale")
-    x, flow = vector(setup.xhat0, system.nx, "xhat0")[None], np.eye(system.nx)
-    times = setup.times
-    u = np.asarray(system.input(times))[:, None]
-    with np.errstate(all="ignore"):
-        for k in range(len(times) - 1):  # error transition matrix of each candidate gain
-            x, F = model_step_jacobian(system, times[k], times[k + 1], x, u[k], u[k + 1])
-            H = np.asarray(system.h_jacobian(times[k + 1], x, u[k + 1]))
-            K = injection(L, np.repeat(H, len(parts), axis=0), weight, times[k + 1] - times[k])
-            flow = (np.eye(system.nx) - K @ H) @ F @ flow
-        # Largest scaled component of the error that is left from a unit initial error.
-        remaining = abs(flow * scale / scale[:, None]).max(axis=(1, 2))
-    gain = parts[np.argmin(np.nan_to_num(remaining, nan=np.inf))] * L
+    placed, _, _ = placed_gains(system, rate)
+    candidates = np.concatenate([part * placed for part in 0.5 ** np.arange(8)])
+    candidates = np.concatenate([candidates, np.zeros((1, system.nx, system.ny))])
+    remaining = _remaining_error(system, candidates)
+    if largest != 1.0:
+        remaining = np.maximum(remaining, _remaining_error(system, largest * candidates))
+    asked = np.exp(-rate * system.setups["benchmark"].duration)
+    remaining = np.maximum(remaining, asked)
+    size = np.linalg.norm(candidates / scale[:, None], axis=(1, 2))
+    gain = candidates[np.lexsort((size, remaining))[0]]
     gain.flags.writeable = False  # the cache returns the same array again
     return gain
+
+
+def _remaining_error(system: System, gains: np.ndarray) -> np.ndarray:
+    """Return, for each constant gain (num_gains, nx, ny), the largest scaled component of the error
+    that is left at the end of a benchmark episode from a unit initial error: the worst over the
+    model's trajectories from the `design_states`; infinite if it is not finite."""
+    setup, x = system.setups["benchmark"], design_states(system)
+    times, nx, ny = setup.times, system.nx, system.ny
+    u = np.asarray(system.input(times))[:, None]
+    # One row for each gain (slower) and trajectory (faster).
+    L = np.repeat(gains, len(x), axis=0)
+    flow = np.broadcast_to(np.eye(nx), (len(L), nx, nx))
+    weight = np.ones((len(L), ny))
+    with np.errstate(all="ignore"):
+        for k in range(len(times) - 1):
+            x, F = model_step_jacobian(system, times[k], times[k + 1], x, u[k], u[k + 1])
+            H = np.asarray(system.h_jacobian(times[k + 1], x, u[k + 1]))
+            F, H = (np.tile(each, (len(gains), 1, 1)) for each in (F, H))
+            K = injection(L, H, weight, times[k + 1] - times[k])
+            flow = F @ flow
+            flow = flow - K @ (H @ flow)
+        scale = vector(system.scale, nx, "scale")
+        left = abs(flow * scale / scale[:, None]).max(axis=(1, 2))
+    left = np.where(np.isfinite(left), left, np.inf)
+    return left.reshape(len(gains), -1).max(axis=1)
 
 
 def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
@@ -180,7 +258,8 @@ def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np
     K = dt·L·weight·(I + dt·H·L·weight)⁻¹. Unlike dt·L, it is stable for large gains.
 
     Args:
-        L: continuous-time gain, shape (nx, ny), in state units per output unit and s.
+        L: continuous-time gain, shape (nx, ny) or (batch, nx, ny), in state units per output unit
+            and s.
         H: output Jacobians, shape (batch, ny, nx).
         weight: factor of each output, shape (batch, ny); zero for a missing output.
         dt: length of the step in s.

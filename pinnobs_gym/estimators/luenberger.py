@@ -29,11 +29,12 @@ class Luenberger(RecursiveEstimator):
     the time since the previous sample, by Euler's implicit method
     (`pinnobs_gym.estimation.observer_gains.injection`). A missing output contributes no correction.
 
-    Default tuning is the same rule for all systems. The model is linearised at its state a quarter
-    of a benchmark episode after x̂₀, and L places the observer's poles to the left of −`rate`
-    (`pinnobs_gym.estimation.observer_gains.placed_gain`). This design is valid only near that
-    state. L is therefore reduced if a fraction of it leaves a smaller error at the end of the
-    model's trajectory from x̂₀ (`pinnobs_gym.estimation.observer_gains.settling_gain`).
+    Default tuning is the same rule for all systems. For each of 16 states of the benchmark's
+    initial set, the model is linearised a quarter of a benchmark episode later, and a gain places
+    the observer's poles to the left of −`rate`
+    (`pinnobs_gym.estimation.observer_gains.placed_gains`). L is the one of these gains, or the
+    fraction of it, that leaves the smallest error along the model's trajectories from the 16
+    states in the worst case (`pinnobs_gym.estimation.observer_gains.settling_gain`).
     """
 
     gain: Sequence[Sequence[float]] | None = None
@@ -57,7 +58,7 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
 \text{ for all } A, H
 """
     tunable = {"rate": Range(0.1, 1e3, log=True)}
-    knows = ("model", "prior")
+    knows = ("model", "prior", "initial set")
 
     def __post_init__(self) -> None:
         if self.design not in ("poles", "lmi"):

@@ -16,13 +16,14 @@ from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same, plain
+from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Setup, System
 
 Layer = tuple[np.ndarray, np.ndarray]
 """Weights (rows, columns) and biases (rows,)."""
 
-SETUP = ("xhat0", "P0_std", "dt", "duration", "noise_std")
+SETUP = ("xhat0", "P0", "dt", "duration", "noise_std")
 """Fields of the training's setup that the form of actions and features uses."""
 TINY = 1e-8
 """Number that SB3's ``VecNormalize`` adds to the variance of features."""
@@ -158,6 +159,9 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
         return State(memory.xhat, t, u, memory=(memory, hidden))
 
 
-def setup_of(setup: Setup) -> dict[str, Any]:
-    """Return the fields `SETUP` of a setup as plain values that JSON can represent."""
+def setup_of(system: System, setup: Setup) -> dict[str, Any]:
+    """Return the fields `SETUP` of a system's setup as plain values that JSON can represent, the
+    prior in numbers."""
+    xhat0, P0 = prior_moments(system, setup)
+    setup = replace(setup, xhat0=xhat0.tolist(), P0=P0.tolist())
     return plain({name: np.asarray(getattr(setup, name)) for name in SETUP})

@@ -36,6 +36,7 @@ class SlidingMode(RecursiveEstimator):
     """Width ε of the boundary layer in standard deviations of the output noise."""
 
     name = "sliding_mode"
+    knows = ("model", "prior", "noise", "initial set")
     equations = r"""
 e &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
 s_j = 1 + \frac{\rho_j}{\varepsilon_j} \min\Bigl( 1, \frac{\varepsilon_j}{|e_j|} \Bigr) \\

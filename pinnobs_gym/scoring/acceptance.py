@@ -9,7 +9,7 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.scoring.metrics import DIVERGED
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.rows import Row
-from pinnobs_gym.simulation.system import vector
+from pinnobs_gym.simulation.initial_set import prior_moments
 
 OTHER_SEEDS = (0, 1)
 """Seeds of the episodes with other initial states, where the setup draws these."""
@@ -49,7 +49,7 @@ def replays(estimator: BaseEstimator, game: Game, seed: int) -> list[Replay]:
     if not source.fixed_x0:
         others = [Replay(f"episode {k}", play(game, estimator, [k])) for k in OTHER_SEEDS]
         return replayed + others
-    xhat0 = vector(source.setup.xhat0, system.nx, "xhat0")
+    xhat0, _ = prior_moments(system, source.setup)
     for sign in (0.5, -0.5):
         other = xhat0 + sign * (x0 - xhat0)
         name = "x0=[" + ", ".join(f"{v:g}" for v in other) + "]"

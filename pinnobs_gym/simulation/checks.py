@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from typing import Any
@@ -16,7 +17,8 @@ from pinnobs_gym.simulation.conformance import (
     require_shape,
     run_all,
 )
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
 
 EXACT = 1e-12
@@ -33,6 +35,9 @@ SYSTEM_CHECKS: dict[str, Callable[[type[System]], None]] = {}
 def check_system(cls: type[System]) -> None:
     """Run all `SYSTEM_CHECKS` on a system.
 
+    Warns:
+        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup.
+
     Raises:
         CheckFailed: if any check fails; one line per failure with the check's name, what it found
             and what it expected.
@@ -43,17 +48,6 @@ def check_system(cls: type[System]) -> None:
 def _setups(cls: type[System]) -> Iterator[tuple[str, System, Setup]]:
     for name in cls.setups:
         yield (name, *cls.configured(name))
-
-
-def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
-    """Return initial states (count, nx) of a setup."""
-    low, high = vector(setup.x0_low, system.nx, "x0_low"), vector(setup.x0_high, system.nx, "")
-    if setup.fixed_x0:
-        return np.repeat(low[None], count, axis=0)
-    drawn = np.random.default_rng(0).uniform(low, high, (1000 * count, system.nx))
-    x0 = drawn[np.asarray(system.admissible(drawn))][:count]
-    require(len(x0) == count, f"{len(x0)} of {len(drawn)} states of the box are admissible")
-    return x0
 
 
 def _points(system: System, *batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,9 +103,6 @@ def _system_attributes(cls: type[System]) -> None:
         cls.model_step is None or cls.model_step > 0,
         f"model_step={cls.model_step}; expected a positive number of seconds",
     )
-    for name, setup in cls.setups.items():
-        std = np.asarray(setup.P0_std, dtype=float)
-        require((std > 0).all(), f"P0_std={setup.P0_std} of setup {name!r}; expected positive")
 
 
 @add_check(SYSTEM_CHECKS, "shapes")
@@ -285,6 +276,25 @@ def _system_initial_states(cls: type[System]) -> None:
         x, y = _trajectories(system, setup, x0)
         require_shape(x, (len(x), *x0.shape), f"the truth of setup {name!r}")
         require(np.isfinite(y).all(), f"outputs of setup {name!r} leave the finite ones")
+
+
+@add_check(SYSTEM_CHECKS, "prior")
+def _system_prior(cls: type[System]) -> None:
+    """Every setup has a prior. A warning says where an equation is not finite at its mean, as the
+    mean of a set need not belong to the set."""
+    for name, system, setup in _setups(cls):
+        xhat0, _ = prior_moments(system, setup)
+        now = np.asarray(0.0)
+        at_mean = now, xhat0, _inputs(system, now)
+        for what, function in _functions(system).items():
+            with np.errstate(all="ignore"):
+                value = np.asarray(function(*at_mean))
+            if not np.isfinite(value).all():
+                warnings.warn(
+                    f"system {cls.__name__}, setup {name!r}: {what} is not finite at "
+                    f"x̂₀={xhat0.tolist()}; filters that linearise there fail",
+                    stacklevel=2,
+                )
 
 
 @add_check(SYSTEM_CHECKS, "invariants")

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.system import Setup, System
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,14 @@ class Prior:
     @staticmethod
     def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
         """Return the prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
-        own = vector(setup.xhat0, system.nx, "xhat0")
+        own, cov = prior_moments(system, setup)
         mean = own if xhat0 is None else np.asarray(xhat0, dtype=float)
         if mean.shape not in ((system.nx,), (batch, system.nx)):
             raise ValueError(f"xhat0 has shape {mean.shape}; expected ({system.nx},)")
         if not np.isfinite(mean).all():
             raise ValueError(f"xhat0={mean.tolist()} is not finite")
-        variance = vector(setup.P0_std, system.nx, "P0_std") ** 2
         mean = np.broadcast_to(mean, (batch, system.nx)).copy()
-        return Prior(mean, np.broadcast_to(np.diag(variance), (batch, system.nx, system.nx)).copy())
+        return Prior(mean, np.broadcast_to(cov, (batch, system.nx, system.nx)).copy())
 
 
 @dataclass(frozen=True)

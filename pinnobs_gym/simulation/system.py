@@ -16,6 +16,19 @@ Array: TypeAlias = Any
 
 
 @dataclass(frozen=True)
+class PoorPrior:
+    """A prior that is not that of the initial states; see `Setup.poor_prior`."""
+
+    xhat0: Sequence[float]
+    """Initial estimate x̂₀, the mean, in state units."""
+    P0: Sequence[Sequence[float]]
+    """Covariance P₀, nx rows of nx numbers, in products of state units."""
+
+    def __post_init__(self) -> None:
+        _check_covariance(self.P0)
+
+
+@dataclass(frozen=True)
 class Setup:
     """The settings of a system's episodes: initial states, prior, duration, sample time and output
     noise.
@@ -23,22 +36,32 @@ class Setup:
     Vectors are sequences (one number per state or output) or one number for all components. Initial
     states are uniform in the box ``x0_low`` to ``x0_high``, redrawn until `System.admissible`
     accepts them. A box of zero width means one fixed initial state.
+
+    The prior that estimators are given is N(x̂₀, P₀). By default x̂₀ and P₀ are the mean and the
+    covariance of the law of the initial states
+    (`pinnobs_gym.simulation.initial_set.prior_moments`). A fixed initial state has no such law; its
+    setup must give both.
     """
 
     x0_low: Sequence[float]
     """Lower corner of the box of initial states, in state units."""
     x0_high: Sequence[float]
     """Upper corner of the box of initial states, in state units."""
-    xhat0: Sequence[float]
-    """Initial estimate x̂₀, the mean of the prior, in state units."""
-    P0_std: Sequence[float]
-    """Square roots of the diagonal of the prior covariance P₀, in state units."""
     duration: float
     """Length of an episode in s."""
     dt: float
     """Time between samples in s."""
     noise_std: Sequence[float] | float = 0.0
     """Standard deviation of the white Gaussian output noise, in output units."""
+    xhat0: Sequence[float] | None = None
+    """Initial estimate x̂₀, the mean of the prior, in state units. The mean of the law of the
+    initial states if None."""
+    P0: Sequence[Sequence[float]] | None = None
+    """Covariance P₀ of the prior, nx rows of nx numbers, in products of state units. That of the
+    law of the initial states if None; see also `independent`."""
+    poor_prior: PoorPrior | None = None
+    """The prior that replaces the above under the condition ``poor_prior``; without one the
+    condition does not apply."""
     truth_step: float | None = None
     """Initial step of the truth solver in s, halved until the error tolerance is met. A hundredth
     of the duration if None."""
@@ -60,9 +83,14 @@ class Setup:
 
         if np.any(np.asarray(self.x0_low) > np.asarray(self.x0_high)):
             raise ValueError(f"x0_low={self.x0_low} is above x0_high={self.x0_high}")
-        P0_std = np.asarray(self.P0_std, dtype=float)
-        if not (np.isfinite(P0_std).all() and (P0_std >= 0).all()):
-            raise ValueError(f"P0_std={self.P0_std}; expected numbers of at least 0")
+        if self.P0 is not None:
+            _check_covariance(self.P0)
+        if self.fixed_x0 and (self.xhat0 is None or self.P0 is None):
+            missing = "xhat0" if self.xhat0 is None else "P0"
+            raise ValueError(
+                f"the initial state is fixed, x0_low=x0_high={self.x0_low}, and defines no prior; "
+                f"give {missing}"
+            )
 
     @property
     def num_steps(self) -> int:
@@ -246,13 +274,47 @@ class System(ABC):
             for name in cls.setups:
                 system, setup = cls.configured(name)
                 vector(cls.scale, system.nx, "scale")
-                for part in ("x0_low", "x0_high", "xhat0", "P0_std"):
+                for part in ("x0_low", "x0_high"):
                     vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
+                for prior in (setup, setup.poor_prior):
+                    if prior is not None:
+                        _check_sizes(prior, system.nx, f"of setup {name!r}")
         except ValueError as error:
             raise TypeError(f"system {cls.__name__}: {error}") from None
         unknown = [name for name in cls.uncertain or () if name not in cls().parameters]
         if unknown:
             raise TypeError(f"system {cls.__name__}: uncertain names no parameter {unknown[0]!r}")
+
+
+def _check_sizes(prior: Setup | PoorPrior, nx: int, where: str) -> None:
+    """Raise ValueError, naming the value, unless x̂₀ and P₀, if given, are of the right size."""
+    if prior.xhat0 is not None:
+        vector(prior.xhat0, nx, f"xhat0 {where}")
+    if prior.P0 is not None and np.shape(prior.P0) != (nx, nx):
+        raise ValueError(f"P0 {where} has shape {np.shape(prior.P0)}; expected ({nx}, {nx})")
+
+
+def _check_covariance(P0: Sequence[Sequence[float]]) -> None:
+    """Raise ValueError unless P₀ is a covariance; zero variances are allowed."""
+    P = np.array(P0, dtype=float)
+    if P.ndim != 2 or P.shape[0] != P.shape[1]:
+        raise ValueError(f"P0={P0}; expected a covariance, as many rows as columns")
+    size = abs(P).max(initial=0.0)
+    if not np.isfinite(P).all() or (abs(P - P.T) > 1e-9 * size).any():
+        raise ValueError(f"P0={P0}; expected a covariance, symmetric and finite")
+    if (np.linalg.eigvalsh(P) < -1e-9 * size).any():
+        raise ValueError(f"P0={P0}; expected a covariance, without eigenvalues below 0")
+
+
+def independent(*std: float) -> tuple[tuple[float, ...], ...]:
+    """Return the covariance, as rows, of independent components with these standard deviations.
+
+    Raises:
+        ValueError: if one of them is not finite or below 0.
+    """
+    if not (np.isfinite(std).all() and min(std, default=0.0) >= 0):
+        raise ValueError(f"standard deviations {std}; expected numbers of at least 0")
+    return tuple(tuple(row) for row in np.diag(np.square(std, dtype=float)).tolist())
 
 
 def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:
@@ -346,18 +408,39 @@ NOISE_FLOOR = 1e-3
 
 _TIMES = 9
 """Number of times, evenly spread over an episode, at which `output_scale` evaluates the output."""
+_STATES = 16
+"""Number of initial states at which it does."""
 
 
 def output_scale(system: System) -> np.ndarray:
     """Return the scale of each output, (ny,), in its unit.
 
-    It is the largest change of the output, to first order, when one state at the benchmark's x̂₀
-    changes by its scale, over `_TIMES` times of the episode and their inputs; one if no state
-    changes the output.
+    It is the largest change of the output, to first order, when one state changes by its scale: the
+    largest over `_STATES` states of the benchmark's initial set, and `_TIMES` times of the episode
+    and their inputs; one if no state changes the output.
     """
     setup, scale = system.setups["benchmark"], vector(system.scale, system.nx, "scale")
-    t = np.linspace(0.0, setup.duration, _TIMES)
-    x = np.tile(vector(setup.xhat0, system.nx, "xhat0"), (_TIMES, 1))
+    t = np.repeat(np.linspace(0.0, setup.duration, _TIMES), _STATES)
+    x = np.tile(initial_states(system, setup, _STATES), (_TIMES, 1))
     H = system.h_jacobian(t, x, np.asarray(system.input(t)))
     size = abs(H * scale).max(axis=(0, -1))
     return np.where(size > 0, size, 1.0)
+
+
+def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
+    """Return states (count, nx) of a setup's initial set, the same at every call: uniform in the
+    box, of which the admissible ones are taken, or the fixed initial state.
+
+    Raises:
+        ValueError: in one line, if too few of the states drawn are admissible.
+    """
+    low, high = (vector(getattr(setup, n), system.nx, n) for n in ("x0_low", "x0_high"))
+    if setup.fixed_x0:
+        return np.repeat(low[None], count, axis=0)
+    drawn = np.random.default_rng(0).uniform(low, high, (1000 * count, system.nx))
+    x0 = drawn[np.asarray(system.admissible(drawn))][:count]
+    if len(x0) < count:
+        raise ValueError(
+            f"{type(system).__name__}: {len(x0)} of {len(drawn)} states of the box are admissible"
+        )
+    return x0

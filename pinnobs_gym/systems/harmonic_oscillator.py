@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import (
+    Array,
+    PoorPrior,
+    Setup,
+    System,
+    independent,
+    matrix,
+    stack,
+)
 
 
 @dataclass(frozen=True)
@@ -31,8 +39,9 @@ class HarmonicOscillator(System):
         "benchmark": Setup(
             x0_low=(-2.0, -2.0, 0.5),
             x0_high=(2.0, 2.0, 6.0),
-            xhat0=(1.0, 1.0, 2.0),
-            P0_std=(1.5, 1.5, 2.0),
+            xhat0=(0.0, 0.0, 3.293),
+            P0=((1.420, 0.0, 0.0), (0.0, 1.398, 0.0), (0.0, 0.0, 2.405)),
+            poor_prior=PoorPrior((1.0, 1.0, 2.0), independent(1.5, 1.5, 2.0)),
             duration=20.0,
             dt=0.02,
             noise_std=0.02,
@@ -42,7 +51,7 @@ class HarmonicOscillator(System):
             x0_low=(0.0, 1.0, 3.0),
             x0_high=(0.0, 1.0, 3.0),
             xhat0=(0.0, 1.0, -1.0),
-            P0_std=(1.5, 1.5, 2.0),
+            P0=independent(1.5, 1.5, 2.0),
             duration=20.0,
             dt=2e-3,
             truth_step=0.2,

@@ -7,7 +7,15 @@ from dataclasses import dataclass, field
 
 from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import (
+    Array,
+    PoorPrior,
+    Setup,
+    System,
+    independent,
+    matrix,
+    stack,
+)
 
 
 @dataclass(frozen=True)
@@ -82,8 +90,15 @@ class InductionMotor(System):
         "benchmark": Setup(
             x0_low=(-5.0, -5.0, -0.5, -0.5, 0.0),
             x0_high=(5.0, 5.0, 0.5, 0.5, 200.0),
-            xhat0=(0.0, 0.0, 0.0, 0.0, 0.0),
-            P0_std=(3.0, 3.0, 0.3, 0.3, 120.0),
+            xhat0=(0.0, 0.0, 0.0, 0.0, 100.0),
+            P0=(
+                (8.333, 0.0, 0.0, 0.0, 0.0),
+                (0.0, 8.333, 0.0, 0.0, 0.0),
+                (0.0, 0.0, 0.08333, 0.0, 0.0),
+                (0.0, 0.0, 0.0, 0.08333, 0.0),
+                (0.0, 0.0, 0.0, 0.0, 3333.0),
+            ),
+            poor_prior=PoorPrior((0.0, 0.0, 0.0, 0.0, 0.0), independent(3.0, 3.0, 0.3, 0.3, 120.0)),
             duration=1.0,
             dt=1e-3,
             noise_std=0.5,
@@ -93,7 +108,7 @@ class InductionMotor(System):
             x0_low=(1.0, 0.0, 2.0, 3.0, 0.0),
             x0_high=(1.0, 0.0, 2.0, 3.0, 0.0),
             xhat0=(2.0, 1.0, 0.0, 2.0, 0.0),
-            P0_std=(3.0, 3.0, 2.0, 2.0, 120.0),
+            P0=independent(3.0, 3.0, 2.0, 2.0, 120.0),
             duration=20.0,
             dt=2e-3,
             truth_step=2.4e-3,

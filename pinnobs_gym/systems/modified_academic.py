@@ -6,7 +6,15 @@ from dataclasses import dataclass
 
 from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import (
+    Array,
+    PoorPrior,
+    Setup,
+    System,
+    independent,
+    matrix,
+    stack,
+)
 
 
 @dataclass(frozen=True)
@@ -30,8 +38,9 @@ class ModifiedAcademic(System):
         "benchmark": Setup(
             x0_low=(-3.0, -1.5),
             x0_high=(3.0, 1.5),
-            xhat0=(3.0, 1.0),
-            P0_std=(3.0, 1.5),
+            xhat0=(0.0, 0.0),
+            P0=((3.0, 0.0), (0.0, 0.8033)),
+            poor_prior=PoorPrior((3.0, 1.0), independent(3.0, 1.5)),
             duration=20.0,
             dt=0.02,
             noise_std=0.02,
@@ -41,7 +50,7 @@ class ModifiedAcademic(System):
             x0_low=(2.0, -1.0),
             x0_high=(2.0, -1.0),
             xhat0=(3.0, 1.0),
-            P0_std=(3.0, 1.5),
+            P0=independent(3.0, 1.5),
             duration=20.0,
             dt=2e-3,
             truth_step=0.05,

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pinnobs_gym.simulation.system import Array, Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import (
+    Array,
+    PoorPrior,
+    Setup,
+    System,
+    independent,
+    matrix,
+    stack,
+)
 
 
 @dataclass(frozen=True)
@@ -28,8 +36,9 @@ class ReverseDuffing(System):
         "benchmark": Setup(
             x0_low=(-2.2, -1.8),
             x0_high=(2.2, 1.8),
-            xhat0=(1.0, 1.0),
-            P0_std=(1.5, 1.2),
+            xhat0=(0.0, 0.0),
+            P0=((1.682, 0.0), (0.0, 1.002)),
+            poor_prior=PoorPrior((1.0, 1.0), independent(1.5, 1.2)),
             duration=20.0,
             dt=0.02,
             noise_std=0.02,
@@ -39,7 +48,7 @@ class ReverseDuffing(System):
             x0_low=(2.0, -1.0),
             x0_high=(2.0, -1.0),
             xhat0=(1.0, 1.0),
-            P0_std=(1.5, 1.2),
+            P0=independent(1.5, 1.2),
             duration=20.0,
             dt=2e-3,
             truth_step=0.095,

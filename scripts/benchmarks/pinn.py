@@ -11,7 +11,7 @@ import torch
 from plain_network import Network
 
 from benchmarks import Figure, at_most, cpu_seconds
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, TrainedNetwork
 from pinnobs_gym.simulation.record import Prior, Record
@@ -50,7 +50,7 @@ class Case:
     def of(name: str) -> Case:
         """Return the episode shown in the paper."""
         source = EpisodeSource(name, "paper")
-        played = source.play(source.draw([Stream(np.random.SeedSequence(0))]))
+        played = source.play(source.draw(source.streams([0])))
         record = source.record(played)
         return Case(source.system, record, played.x[: record.num_samples, 0])
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from benchmarks import Figure, at_least, cpu_seconds, median_ratio
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.training.loop import train
 from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
@@ -23,7 +23,7 @@ ITERATIONS = 60
 def figures(repeats: int) -> Iterator[Figure]:
     """Measure PINN-Obs on many records."""
     source = EpisodeSource("ReverseDuffing")
-    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(MANY)]
+    streams = source.streams(range(MANY))
     record = source.record(source.play(source.draw(streams)))
     yield at_once(source, record, repeats)
     yield stacked_evaluations(source, record, repeats)

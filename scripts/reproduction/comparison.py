@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.kkl import KKL
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.files import append_lines
@@ -103,13 +103,13 @@ class Comparison:
 
 def compared() -> EpisodeSource:
     """Where the records that are compared come from."""
-    return EpisodeSource("ReverseDuffing", noise_std=0.0)
+    return EpisodeSource("ReverseDuffing", condition="poor_prior", noise_std=0.0)
 
 
 def played(records: int) -> tuple[Record, np.ndarray]:
     """Return the records, and their true states (records, num_samples, nx)."""
     source = compared()
-    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(records)]
+    streams = source.streams(range(records))
     episodes = source.play(source.draw(streams))
     record = source.record(episodes)
     return record, episodes.x[: record.num_samples].swapaxes(0, 1)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.systems import SYSTEMS
 from reproduction.running import REPEATS, SETUP, Job
 from reproduction.tables import Case, Printed, Table, recipe
@@ -47,14 +48,14 @@ def starts(table: Table) -> str:
     """Describe the records of a table: initial states and estimates, and samples."""
     parts, sizes = [], set()
     for name in dict.fromkeys(case.system for case in table.cases):
-        _, setup = SYSTEMS.resolve(name).configured(SETUP)
-        x0, xhat0 = (_vector(value) for value in (setup.x0_low, setup.xhat0))
+        system, setup = SYSTEMS.resolve(name).configured(SETUP)
+        x0, xhat0 = _vector(setup.x0_low), _vector(prior_moments(system, setup)[0])
         parts.append(f"{name} x₀ = {x0}, x̂₀ = {xhat0}")
         sizes.add(f"{setup.num_steps:,} samples over {setup.duration:g} s")
     return f"Records of {' or '.join(sorted(sizes))}: {'; '.join(parts)}."
 
 
-def _vector(values: Sequence[float] | float) -> str:
+def _vector(values: Sequence[float] | np.ndarray) -> str:
     return "[" + ", ".join(f"{value:g}" for value in np.atleast_1d(values)) + "]"
 
 

@@ -73,7 +73,7 @@ class Branching(System):
     state_names = ("x",)
     output_names = ("y",)
     scale = (1.0,)
-    setups = {"benchmark": Setup((-1,), (1,), (0,), (1,), duration=1, dt=0.1)}
+    setups = {"benchmark": Setup((-1,), (1,), duration=1, dt=0.1)}
 
     def f(self, t, x, u):
         return stack(x, 1.0 if x[..., 0] < 0 else -1.0)

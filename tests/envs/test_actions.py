@@ -134,7 +134,7 @@ def test_typical_errors_of_a_linear_plant_are_kalmans() -> None:
     assert estimates.P is not None
     after = np.einsum("tii->ti", estimates.P[0])
     assert (sigma[:30] ** 2 >= after * (1 - 1e-9)).all()  # predictions are worse than estimates
-    np.testing.assert_allclose(sigma[0], setup.P0_std, rtol=1e-9)
+    np.testing.assert_allclose(sigma[0], np.sqrt(np.diag(setup.P0)), rtol=1e-9)
 
 
 def test_kalman_gains_are_actions() -> None:

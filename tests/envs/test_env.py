@@ -301,8 +301,8 @@ def test_x0_outside_the_set_warns() -> None:
 def test_option_xhat0_and_the_prior() -> None:
     env, envs = make(DUFFING), make_vec(DUFFING, 2)
     _, info = env.reset(seed=0)
-    assert info["xhat0"].tolist() == [1.0, 1.0]
-    assert info["P0"] == pytest.approx(np.diag([1.5**2, 1.2**2]))
+    assert info["xhat0"].tolist() == [0.0, 0.0]
+    assert info["P0"].tolist() == [[1.682, 0.0], [0.0, 1.002]]
     _, moved = env.reset(seed=0, options={"xhat0": [0.5, -0.5]})
     assert moved["xhat0"].tolist() == [0.5, -0.5]
     assert np.array_equal(moved["state"], info["state"])
@@ -640,7 +640,7 @@ def test_a_masked_reset_leaves_the_other_rows_alone() -> None:
     np.testing.assert_array_equal(prior[1:], untouched_prior[1:])
     np.testing.assert_array_equal(following[1:], untouched[1:])
     assert not np.array_equal(following[0], untouched[0])
-    np.testing.assert_array_equal(default, np.tile([1.0, 2.0], (3, 1)))
+    np.testing.assert_array_equal(default, np.zeros((3, 2)))
 
 
 def test_the_prior_is_told_again_after_an_autoreset() -> None:
@@ -652,7 +652,7 @@ def test_the_prior_is_told_again_after_an_autoreset() -> None:
         assert "xhat0" not in infos
     *_, infos = envs.step(actions)
     np.testing.assert_array_equal(infos["_xhat0"], [True, True])
-    np.testing.assert_array_equal(infos["xhat0"], np.tile([1.0, 2.0], (2, 1)))
+    np.testing.assert_array_equal(infos["xhat0"], np.zeros((2, 2)))
     np.testing.assert_array_equal(envs.record().prior.mean, infos["xhat0"])
 
 

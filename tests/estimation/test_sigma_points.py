@@ -90,7 +90,7 @@ class Walk(System):
     state_names = ("x1", "x2")
     output_names = ("y1",)
     scale = (1.0, 1.0)
-    setups = {"benchmark": Setup((0, 0), (0, 0), (1, 1), (1, 1), duration=4.0, dt=1.0)}
+    setups = {"benchmark": Setup((-1, -1), (1, 1), duration=4.0, dt=1.0)}
 
     def f(self, t, x, u):
         return stack(x, x[..., 1], 0.0)

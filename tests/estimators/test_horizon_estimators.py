@@ -37,7 +37,7 @@ def test_least_squares_are_the_normal_equations_on_a_linear_system():
         x0, cov = closed_form(record, i, (0.1, 0.2))
         Phi = np.eye(2)
         for k in range(record.num_samples):
-            np.testing.assert_allclose(estimates.xhat[i, k], Phi @ x0, rtol=1e-9, atol=1e-11)
+            np.testing.assert_allclose(estimates.xhat[i, k], Phi @ x0, rtol=1e-9, atol=1e-10)
             np.testing.assert_allclose(estimates.P[i, k], Phi @ cov @ Phi.T, rtol=1e-9, atol=1e-14)
             Phi = runge_kutta_matrix(0.1) @ Phi
 
@@ -50,10 +50,10 @@ def test_least_squares_find_what_scipy_finds():
     std = np.sqrt(own.output_variance)
 
     for i in range(3):
-        mean, P0_std = record.prior.mean[i], np.sqrt(np.diag(record.prior.cov[i]))
+        mean, std0 = record.prior.mean[i], np.sqrt(np.diag(record.prior.cov[i]))
 
-        def residuals(x0, i=i, mean=mean, P0_std=P0_std):
-            x, errors = x0, [(x0 - mean) / P0_std]
+        def residuals(x0, i=i, mean=mean, std0=std0):
+            x, errors = x0, [(x0 - mean) / std0]
             for k in range(record.num_samples):
                 if k:
                     x = model_step(duffing, record.t[k - 1], record.t[k], x)

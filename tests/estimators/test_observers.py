@@ -1,7 +1,7 @@
 """Ensembles, particles, strong tracking and constant-gain observers."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,10 +10,12 @@ from linear import A, H, Linear, linear_record, record_of, runge_kutta_matrix
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.observer_gains import (
     default_rate,
+    design_states,
     injection,
     lmi_gain,
-    operating_point,
+    operating_points,
     placed_gain,
+    placed_gains,
     settling_gain,
 )
 from pinnobs_gym.estimators.ekf import EKF
@@ -25,7 +27,7 @@ from pinnobs_gym.estimators.sliding_mode import SlidingMode
 from pinnobs_gym.estimators.strong_tracking_ekf import StrongTrackingEKF
 from pinnobs_gym.scoring.cramer_rao import exact_bayes
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import Setup, System, stack
+from pinnobs_gym.simulation.system import Setup, System, independent, output_scale, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 
@@ -78,15 +80,26 @@ def test_many_particles_are_the_kalman_filter_on_a_linear_system():
 
 
 @dataclass(frozen=True)
+class Apart(Linear):
+    """The second state neither is measured nor acts on the first."""
+
+    output_names = ("y1",)
+
+    def f(self, t, x, u):
+        return stack(x, -x[..., 0], -2 * x[..., 1])
+
+    def h(self, t, x, u):
+        return x[..., :1]
+
+
+@dataclass(frozen=True)
 class Cubed(System):
     """x at rest, its cube measured: a posterior that is not Gaussian."""
 
     state_names = ("x1",)
     output_names = ("y1",)
     scale = (1.0,)
-    setups = {
-        "benchmark": Setup((-1.0,), (1.0,), (0.0,), (0.6,), duration=0.4, dt=0.1, noise_std=0.3)
-    }
+    setups = {"benchmark": Setup((-1.0,), (1.0,), duration=0.4, dt=0.1, noise_std=0.3)}
 
     def f(self, t, x, u):
         return stack(x, 0.0)
@@ -166,32 +179,70 @@ def test_high_gain_forgets_no_more_than_there_was():
     assert np.trace(P[0], axis1=1, axis2=2).max() < 2 * (np.trace(record.prior.cov[0]) + 2)
 
 
-def poles(system, L):
-    t, x = operating_point(system)
+def poles(system, gains):
+    """Poles (num_gains, num_points, nx) of each of the gains at each of the operating points."""
+    t, x = operating_points(system)
     u = system.input(np.asarray(t))
     A, C = system.f_jacobian(np.asarray(t), x, u), system.h_jacobian(t, x, u)
-    return np.linalg.eigvals(A - L @ C)
+    return np.linalg.eigvals(A - gains[:, None] @ C)
 
 
 @pytest.mark.parametrize("name", SYSTEMS.classes())
-def test_the_default_gain_places_poles_to_the_left_of_the_rate(name):
+def test_gains_place_poles_to_the_left_of_the_rate(name):
     system = SYSTEMS.resolve(name)()
     rate = default_rate(system)
-    assert poles(system, placed_gain(system, rate)).real.max() <= -0.999 * rate
+    gains, _, _ = placed_gains(system, rate)
+    assert len(gains) == 16
+    at_own_point = np.einsum("iij->ij", poles(system, gains))
+    assert at_own_point.real.max() <= -0.999 * rate
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_the_gain_that_is_taken_is_the_best_in_the_worst_case(name):
+    system = SYSTEMS.resolve(name)()
+    gains, _, _ = placed_gains(system, default_rate(system))
+    slowest = poles(system, gains).real.max(axis=(1, 2))
+    own = placed_gain(system, default_rate(system))
+    assert poles(system, own[None]).real.max() == pytest.approx(slowest.min(), rel=1e-6)
 
 
 def test_poles_that_are_asked_for_are_placed():
     system = SYSTEMS.resolve("ReverseDuffing")()
-    gain = placed_gain(system, 1.0, (-2.0, -3.0))
-    np.testing.assert_allclose(np.sort(poles(system, gain).real), [-3, -2], rtol=1e-9)
+    gains, _, _ = placed_gains(system, 1.0, (-2.0, -3.0))
+    found = np.einsum("iij->ij", poles(system, gains)).real
+    np.testing.assert_allclose(np.sort(found), [[-3, -2]] * 16, rtol=1e-6)
+    assert (placed_gain(system, 1.0, (-2.0, -3.0)) == gains).all(axis=(1, 2)).any()
     with pytest.raises(ValueError, match=r"poles=\(-1.0,\); ReverseDuffing has nx=2"):
         placed_gain(system, 1.0, (-1.0,))
 
 
-def test_the_motor_cannot_be_observed_at_rest_and_says_so():
-    motor = SYSTEMS.resolve("InductionMotor")(u1_amplitude=0.0, u2_amplitude=0.0, T_L=0.0)
+def test_a_state_that_leaves_no_trace_is_said_to_have_none():
     with pytest.raises(ValueError, match="is not observable, so its poles cannot be placed"):
-        placed_gain(motor, 1.0)
+        placed_gain(Apart(), 1.0)
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_designs_do_not_depend_on_the_prior(name):
+    """Nor do they meet the prior's mean, which may be an equilibrium without observability."""
+    cls = SYSTEMS.resolve(name)
+    benchmark = cls.setups["benchmark"]
+    nowhere = replace(benchmark, xhat0=(np.nan,) * cls().nx, P0=independent(*[0.0] * cls().nx))
+
+    @dataclass(frozen=True)
+    class Elsewhere(cls):
+        setups = {"benchmark": nowhere}
+
+    rate = default_rate(cls())
+    for design in (placed_gain, settling_gain):
+        np.testing.assert_array_equal(design(Elsewhere(), rate), design(cls(), rate))
+    np.testing.assert_array_equal(output_scale(Elsewhere()), output_scale(cls()))
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_gains_are_designed_for_admissible_states(name):
+    x = design_states(SYSTEMS.resolve(name)())
+    assert len(x) == 16
+    assert EpisodeSource(name).contains(x).all()
 
 
 def test_luenbergers_error_decays_as_its_poles_say():

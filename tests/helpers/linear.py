@@ -7,8 +7,8 @@ import numpy as np
 from array_api_compat import array_namespace
 from filterpy.kalman import KalmanFilter
 
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
-from pinnobs_gym.simulation.system import Setup, System, stack
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.simulation.system import Setup, System, independent, stack
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,13 @@ class Linear(System):
     scale = (1.0, 1.0)
     setups = {
         "benchmark": Setup(
-            (-1.0, -1.0), (1.0, 1.0), (0.3, -0.2), (0.8, 0.5), duration=2.0, dt=0.1, noise_std=0.1
+            (-1.0, -1.0),
+            (1.0, 1.0),
+            duration=2.0,
+            dt=0.1,
+            noise_std=0.1,
+            xhat0=(0.3, -0.2),
+            P0=independent(0.8, 0.5),
         )
     }
 
@@ -42,7 +48,7 @@ def runge_kutta_matrix(dt):
 
 
 def record_of(source, batch):
-    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(batch)]
+    streams = source.streams(range(batch))
     return source.record(source.play(source.draw(streams)))
 
 

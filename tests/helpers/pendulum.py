@@ -7,7 +7,7 @@ from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import Setup, System, stack
+from pinnobs_gym.simulation.system import Setup, System, independent, stack
 
 DT = 0.0125
 
@@ -22,7 +22,13 @@ class NoisyPendulum(System):
     scale = (np.sqrt(DT**3 / 3), np.sqrt(DT))
     setups = {
         "benchmark": Setup(
-            (1.5, 0.0), (1.5, 0.0), (1.5, 0.0), (0.1, 0.1), duration=2.0, dt=DT, noise_std=0.3
+            (1.5, 0.0),
+            (1.5, 0.0),
+            duration=2.0,
+            dt=DT,
+            noise_std=0.3,
+            xhat0=(1.5, 0.0),
+            P0=independent(0.1, 0.1),
         )
     }
 

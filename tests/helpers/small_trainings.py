@@ -13,7 +13,7 @@ from pinnobs_gym.estimation.learned.mlp import Architecture
 from pinnobs_gym.estimation.learned.trained_file import identity
 from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import Setup, System, independent, matrix, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.log import Log
@@ -23,7 +23,7 @@ from trainers.pinn_obs import PinnObsTrainer
 
 def box(nx):
     corner = (0.0,) * nx
-    return Setup(x0_low=corner, x0_high=corner, xhat0=corner, P0_std=corner, duration=1, dt=0.05)
+    return Setup(corner, corner, duration=1, dt=0.05, xhat0=corner, P0=independent(*corner))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from linear import (
 )
 from scipy.linalg import expm
 
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring.cramer_rao import cramer_rao, exact_bayes, expected_scores, step_error
 from pinnobs_gym.scoring.metrics import error_scores
@@ -28,7 +28,7 @@ from pinnobs_gym.systems import SYSTEMS
 def played(name, batch, **changes):
     """True states (batch, num_samples, nx), and the record."""
     source = EpisodeSource(name, **changes)
-    episodes = source.play(source.draw([Stream(np.random.SeedSequence(i)) for i in range(batch)]))
+    episodes = source.play(source.draw(source.streams(range(batch))))
     return source, episodes.x[:-1].swapaxes(0, 1), source.record(episodes)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pinnobs_gym import evaluate
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring import curves, rows, thinning
@@ -88,7 +88,7 @@ def test_scored_episodes_leave_their_errors_and_the_reference(tmp_path):
     assert own is not None
 
     source = EpisodeSource("ReverseDuffing")
-    episodes = source.play(source.draw([Stream(np.random.SeedSequence(seed)) for seed in range(3)]))
+    episodes = source.play(source.draw(source.streams(range(3))))
     record, x = source.record(episodes), episodes.x[:-1].swapaxes(0, 1)
     estimator = EKF.for_setup(source.system, source.setup)
     estimates = estimator.run(record)

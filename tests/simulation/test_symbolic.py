@@ -25,7 +25,7 @@ class Pendulum(System):
     output_names = ("y",)
     input_names = ("u",)
     scale = (1.0, 1.0)
-    setups = {"benchmark": Setup((-1, -1), (1, 1), (0, 0), (1, 1), duration=1, dt=0.1)}
+    setups = {"benchmark": Setup((-1, -1), (1, 1), duration=1, dt=0.1)}
 
     @property
     def rate(self):

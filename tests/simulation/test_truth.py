@@ -17,7 +17,7 @@ from waiting import PATIENCE
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.model import model_step, model_step_jacobian
-from pinnobs_gym.simulation.system import Setup, System, matrix, stack
+from pinnobs_gym.simulation.system import Setup, System, independent, matrix, stack
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.academic import Academic
@@ -193,7 +193,7 @@ BENCHMARK = Setup(
     x0_low=(1.0, 0.0),
     x0_high=(1.0, 0.0),
     xhat0=(0.0, 0.0),
-    P0_std=(1.0, 1.0),
+    P0=independent(1.0, 1.0),
     duration=3.0,
     dt=0.05,
 )

@@ -258,7 +258,7 @@ class Cubic(System):
     state_names = ("x",)
     output_names = ("y",)
     scale = (1.0,)
-    setups = {"benchmark": Setup((-1.0,), (1.0,), (0.0,), (1.0,), duration=5.0, dt=0.05)}
+    setups = {"benchmark": Setup((-1.0,), (1.0,), duration=5.0, dt=0.05)}
 
     def f(self, t, x, u):
         return stack(x, x[..., 0] - x[..., 0] ** 3)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from linear import Linear, Modulated, fed_through
 
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS
 from pinnobs_gym.estimation.kalman import update_with
@@ -67,7 +67,7 @@ def gain_of(system: System, size: float = 0.0, variant: str = "kalman", noise_st
 
 def played(name, seeds, duration=None, **changes):
     source = EpisodeSource(name, duration=duration, **changes)
-    streams = [Stream(np.random.SeedSequence(seed)) for seed in seeds]
+    streams = source.streams(seeds)
     episodes = source.play(source.draw(streams))
     return source, source.record(episodes), episodes.x[:-1].swapaxes(0, 1)
 
@@ -340,8 +340,9 @@ def test_records_that_cannot_be_trained_on_are_refused(tmp_path):
         train(system, SMALL, record=replace(record, t=record.t**1.1))
 
 
-def test_a_loss_that_soon_is_not_finite_from_any_seed_ends_in_one_line():
+def test_a_loss_that_is_not_finite_from_any_seed_ends_in_one_line(monkeypatch):
     system, record = short_record()
+    monkeypatch.setattr(PinnGainTrainer, "_loss", lambda self, P, errors: np.nan * errors.sum())
     with pytest.raises(FloatingPointError, match="from seed 0 and the 3 after it") as caught:
-        train(system, replace(SMALL, iterations=100, learning_rate=1e30), record=record)
+        train(system, replace(SMALL, iterations=100), record=record)
     assert "\n" not in str(caught.value)

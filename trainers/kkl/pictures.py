@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
+from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import truth
@@ -51,7 +52,7 @@ def _plane(system: System, trained: TrainedKKL) -> tuple[np.ndarray, np.ndarray,
     margin = 0.25 * (high - low)
     sides = [np.linspace(low[i] - margin[i], high[i] + margin[i], GRID) for i in range(2)]
     x = np.empty((GRID, GRID, system.nx))
-    x[:] = vector(system.setups["benchmark"].xhat0, system.nx, "xhat0")
+    x[:], _ = prior_moments(system, system.setups["benchmark"])
     x[..., 1], x[..., 0] = np.meshgrid(sides[1], sides[0], indexing="ij")
     return sides[0], sides[1], x
 

@@ -115,7 +115,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
             algorithm=self.config.algorithm,
             action_mode=self.config.action_mode,
             stack=self.config.stack,
-            setup=setup_of(self.game.source.setup),
+            setup=setup_of(self.game.source.system, self.game.source.setup),
             sb3=stable_baselines3.__version__,
             steps=self.steps,
         )

@@ -16,6 +16,7 @@ from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.simulation.record import Prior, read_log
+from pinnobs_gym.simulation.system import independent
 from pinnobs_gym.systems import SYSTEMS
 
 
@@ -45,8 +46,10 @@ class Estimate:
         env_id(self.system)  # checks and registers the user's own system
         cls = SYSTEMS.resolve(self.system)
         system, setup = cls.configured(noise_std=self.noise_std)
-        given = {"xhat0": self.xhat0, "P0_std": self.P0_std}
-        setup = replace(setup, **{name: value for name, value in given.items() if value})
+        if self.xhat0:
+            setup = replace(setup, xhat0=self.xhat0)
+        if self.P0_std:
+            setup = replace(setup, P0=independent(*self.P0_std))
         prior = Prior.of(system, setup, 1)
         system, record = read_log(self.log, system, prior)
         kind = ESTIMATORS.resolve(self.estimator)

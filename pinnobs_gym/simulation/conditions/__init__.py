@@ -18,7 +18,7 @@ from pinnobs_gym.simulation.conditions.measurement import (
     SampleTime,
 )
 from pinnobs_gym.simulation.conditions.plant import LoadStep, Mismatch, ProcessNoise
-from pinnobs_gym.simulation.conditions.start import FarGuess, OutsideSet
+from pinnobs_gym.simulation.conditions.start import FarGuess, GivenPoorPrior, OutsideSet
 from pinnobs_gym.simulation.system import Setup, System
 
 
@@ -72,6 +72,7 @@ CONDITIONS: dict[str, Condition] = {
     "nominal": Condition(),
     **{f"noise{factor:g}": Noise(factor) for factor in (0, 0.1, 0.5, 5, 15)},
     **{f"dt{factor:g}": SampleTime(factor) for factor in (0.5, 2, 5)},
+    "poor_prior": GivenPoorPrior(),
     "xhat0_far": FarGuess(),
     "x0_outside": OutsideSet(),
     **{f"mismatch{percent}": Mismatch(percent / 100) for percent in (10, 30)},

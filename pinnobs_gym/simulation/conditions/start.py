@@ -8,28 +8,50 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.simulation.conditions.base import Condition
+from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.system import Setup, System, vector
 
 
 @dataclass(frozen=True)
-class FarGuess(Condition):
-    """An initial estimate further away: each component is moved by one prior standard deviation
-    away from the middle of the initial set. P₀ is unchanged."""
+class GivenPoorPrior(Condition):
+    """Another prior: the setup's `Setup.poor_prior` in place of its x̂₀ and P₀."""
 
+    reference = False
+    known_to_estimators = "the other x̂₀ and P₀"
+
+    @property
+    def summary(self) -> str:
+        return "a prior that is not that of the initial set"
+
+    def setup(self, system: System, setup: Setup) -> Setup:
+        if setup.poor_prior is None:
+            raise ValueError(
+                f"condition 'poor_prior' needs a setup with a poor_prior; "
+                f"that of {type(system).__name__} has none"
+            )
+        return replace(setup, xhat0=setup.poor_prior.xhat0, P0=setup.poor_prior.P0)
+
+
+@dataclass(frozen=True)
+class FarGuess(Condition):
+    """An initial estimate further away: each component of x̂₀ is moved by a number of prior standard
+    deviations away from the middle of the box of initial states; upwards if it is the middle. P₀ is
+    unchanged."""
+
+    deviations: float = 2.0
     reference = False
     known_to_estimators = "x̂₀"
 
     @property
     def summary(self) -> str:
-        return "x̂₀ moved by √P₀ away from the middle of the initial set"
+        return f"x̂₀ moved by {self.deviations:g} σ of the prior in each state"
 
     def setup(self, system: System, setup: Setup) -> Setup:
-        low, high, xhat0, P0_std = (
-            vector(getattr(setup, name), system.nx, name)
-            for name in ("x0_low", "x0_high", "xhat0", "P0_std")
-        )
+        low, high = (vector(getattr(setup, n), system.nx, n) for n in ("x0_low", "x0_high"))
+        xhat0, P0 = prior_moments(system, setup)
         away = np.where(xhat0 >= (low + high) / 2, 1.0, -1.0)
-        return replace(setup, xhat0=tuple((xhat0 + away * P0_std).tolist()))
+        moved = xhat0 + self.deviations * away * np.sqrt(np.diag(P0))
+        return replace(setup, xhat0=tuple(moved.tolist()))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from pinnobs_gym.estimation.smoother import backward, flows
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import stack
+from pinnobs_gym.simulation.system import independent, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
@@ -32,7 +32,11 @@ class Spring(System):
     state_names = ("position", "velocity")
     output_names = ("y",)
     scale = (1.0, 2.0)
-    setups = {"benchmark": Setup((-1, -1), (1, 1), (0.5, 0.0), (1.0, 2.0), 3.0, 0.1, noise_std=0.1)}
+    setups = {
+        "benchmark": Setup(
+            (-1, -1), (1, 1), 3.0, 0.1, noise_std=0.1, xhat0=(0.5, 0.0), P0=independent(1.0, 2.0)
+        )
+    }
 
     def f(self, t, x, u):
         return stack(x, x[..., 1], -4 * x[..., 0] - 0.3 * x[..., 1])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_trainings import same_weights, train_pinn_obs
 
-from pinnobs_gym.envs.episodes import EpisodeSource, Stream
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.loop import Interrupt
@@ -25,7 +25,7 @@ SMALL = PinnObsConfig(depth=2, width=8, iterations=25, points=40)
 
 def records(name="ReverseDuffing", batch=3):
     source = EpisodeSource(name)
-    streams = [Stream(np.random.SeedSequence(seed)) for seed in range(batch)]
+    streams = source.streams(range(batch))
     record = source.record(source.play(source.draw(streams)))
     return source.system, record, source.setup.noise_std
 
