@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from pinnobs_gym.estimation.hints import check_settings
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_scale, vector
+from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_noise, output_scale
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class BaseEstimator(ABC):
     tunable: ClassVar[Mapping[str, Range]] = {}
     """Search ranges of the settings that ``pinnobs tune`` searches."""
     recipe: ClassVar[Mapping[str, Any]] = {}
-    """Default choices for this estimator in the Config of the trainer `needs_training`."""
+    """Default choices for this estimator in the Config of its trainer, see `trainer_config`."""
     exempt_from: ClassVar[Mapping[str, str]] = {}
     """Checks of `pinnobs_gym.estimation.checks.check_estimator` that do not apply to the estimator,
     by name, with the reason in one line."""
@@ -99,10 +101,24 @@ class BaseEstimator(ABC):
     environment. φ is the model's flow from the previous sample; a raised minus marks quantities
     before the correction by y_k."""
 
+    def __post_init__(self) -> None:
+        check_settings(self, self.setting_fields())
+
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
         """Return the estimator for a model, with a setup's noise level and the given settings."""
         return cls(system, noise_std=setup.noise_std, **options)
+
+    @classmethod
+    def trainer_config(cls, changes: Mapping[str, Any]) -> Any:
+        """Return the Config of the estimator's trainer: that of its `recipe`, with some settings
+        changed as by `pinnobs_gym.training.trainer.Trainer.configured`.
+
+        Raises:
+            ValueError: in one line, if a setting is unknown or a value is not allowed.
+        """
+        trainer = TRAINERS.resolve(str(cls.needs_training or cls.trains_on_record))
+        return trainer.configured({**cls.recipe, **changes})
 
     @abstractmethod
     def run(self, record: Record) -> Estimates:
@@ -118,11 +134,7 @@ class BaseEstimator(ABC):
         Raises:
             ValueError: in one line, if the noise level is negative or not finite.
         """
-        benchmark = self.system.setups["benchmark"].noise_std
-        known_noise = benchmark if self.noise_std is None else self.noise_std
-        std = vector(known_noise, self.system.ny, "noise_std")
-        if not (np.isfinite(std).all() and (std >= 0).all()):
-            raise ValueError(f"noise_std={known_noise}; expected numbers of at least 0")
+        std = output_noise(self.system, self.noise_std)
         return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
 
     @property
@@ -138,8 +150,13 @@ class BaseEstimator(ABC):
     @property
     def options(self) -> dict[str, Any]:
         """The estimator's settings by name, without the model and the noise level."""
-        own = {f.name for f in fields(BaseEstimator)}
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in own and f.repr}
+        return {f.name: getattr(self, f.name) for f in self.setting_fields()}
+
+    @classmethod
+    def setting_fields(cls) -> list[Field[Any]]:
+        """Return the fields of the estimator's settings."""
+        shared = {f.name for f in fields(BaseEstimator)}
+        return [f for f in fields(cls) if f.name not in shared and f.repr]
 
 
 @dataclass(frozen=True)

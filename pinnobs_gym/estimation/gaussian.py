@@ -26,6 +26,7 @@ class GaussianEstimator(BaseEstimator):
     tunable = {"process_noise": Range(1e-7, 1e-1, log=True)}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.process_noise < np.inf:
             raise ValueError(f"process_noise={self.process_noise}; expected a number of at least 0")
 

@@ -47,6 +47,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
 """
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("max_iterations", "first_iterations", "shortest"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}; expected at least 1")

@@ -61,6 +61,7 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
     knows = ("model", "prior", "initial set")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.design not in ("poles", "lmi"):
             raise ValueError(f"design={self.design!r}; expected 'poles' or 'lmi'")
         if self.rate is not None and not 0 < self.rate < np.inf:

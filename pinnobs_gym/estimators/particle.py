@@ -79,6 +79,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     tunable = {"discount": Range(0.8, 0.999)}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.particles < 2:
             raise ValueError(f"particles={self.particles}; expected at least 2")
         if not 1 / 3 < self.discount <= 1:

@@ -247,7 +247,7 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
 class PinnObs(OfflineEstimator):
     """PINN-Obs trained separately on every record, with the network's x̂(t) as estimates."""
 
-    config: Any = field(default_factory=lambda: TRAINERS.resolve("pinn_obs").configured({}))
+    config: Any = field(default_factory=lambda: PinnObs.trainer_config({}))
     """The recipe; all rows use its seed."""
     folder: Path | None = field(default=None, repr=False)
     """Folder for one subfolder ``row-<i>`` per row, with log, checkpoint and trained network;

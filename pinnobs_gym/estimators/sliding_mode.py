@@ -50,6 +50,7 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
     }
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("rate", "switching", "layer"):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:

@@ -317,7 +317,7 @@ def independent(*std: float) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in np.diag(np.square(std, dtype=float)).tolist())
 
 
-def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:
+def vector(value: Sequence[float] | np.ndarray | float, size: int, name: str) -> np.ndarray:
     """Return the value as a float array (size,); a single number is repeated.
 
     Raises:
@@ -329,6 +329,23 @@ def vector(value: Sequence[float] | float, size: int, name: str) -> np.ndarray:
     if array.shape != (size,):
         raise ValueError(f"{name} has shape {array.shape}; expected {size} number(s)")
     return array
+
+
+def output_noise(system: System, noise_std: Sequence[float] | float | None) -> np.ndarray:
+    """Return the standard deviation of the output noise as an array (ny,), in output units; that of
+    the setup ``benchmark`` if None.
+
+    Raises:
+        ValueError: in one line, if it is not finite, negative or of another size.
+    """
+    known = system.setups["benchmark"].noise_std if noise_std is None else noise_std
+    try:
+        given = np.asarray(known, dtype=float)
+    except (TypeError, ValueError):
+        given = np.array(np.nan)
+    if not (np.isfinite(given).all() and (given >= 0).all()):
+        raise ValueError(f"noise_std={known}; expected numbers of at least 0")
+    return vector(given, system.ny, "noise_std")
 
 
 def stack(like: Array, *components: Array | float) -> Array:

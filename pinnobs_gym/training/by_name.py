@@ -30,6 +30,8 @@ def trainer_of(
     """
     cls, source = TRAINERS.resolve(name), game.source
     first = first_episode(config.seed) if episode is None else episode
+    if first < 0:
+        raise ValueError(f"episode={first}; expected a whole number of at least 0")
     data: dict[str, Any] = {"game": game, "episode": first}
     if config.records:
         record = game.record(range(first, first + config.records))

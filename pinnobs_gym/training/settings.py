@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from numbers import Integral
 from typing import Any, ClassVar, TypeVar
+
+from pinnobs_gym.estimation.hints import check_settings
+
+SEEDS = 2**32
+"""Number of seeds of a training, from 0 on: those that every library of random numbers takes."""
 
 
 @dataclass(frozen=True)
@@ -12,14 +18,15 @@ class TrainingConfig:
     """Base class of the settings of a trainer.
 
     A trainer's Config derives from it. Each field has a type annotation and a default; a preset is
-    a function that returns a complete Config, see `Trainer.presets`.
+    a function that returns a complete Config, see `Trainer.presets`. Values are checked against the
+    annotations; a Config that checks more in ``__post_init__`` calls `check_shared` first.
     """
 
     may_change: ClassVar[tuple[str, ...]] = ()
     """Settings that may differ when a training is resumed, besides `ALWAYS_MAY_CHANGE`."""
 
     seed: int = 0
-    """Seed of all random numbers of a training."""
+    """Seed of all random numbers of a training, from 0 to 2³² − 1."""
     budget: float | None = None
     """CPU seconds after which training stops, including those before a resumption."""
     checkpoint_every: int = 100
@@ -32,14 +39,20 @@ class TrainingConfig:
         """Number of recorded episodes to train on; 0 if the trainer plays episodes itself."""
         return 1
 
+    def __post_init__(self) -> None:
+        self.check_shared()
+
     def check_shared(self) -> None:
-        """Check the settings that all trainers share.
+        """Check the types of all settings, and the values of those that all trainers share. A list
+        becomes a tuple where that is the type.
 
         Raises:
             ValueError: in one line, naming the setting, its value and what was expected.
         """
+        check_settings(self, fields(self))
         check_whole(self, ("checkpoint_every", "log_every"))
-        check_whole(self, ("seed",), least=0)
+        expected = f"a whole number from 0 to {SEEDS - 1}"
+        check_setting(self, "seed", expected, lambda v: v in range(SEEDS))
         check_setting(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
 
 
@@ -94,15 +107,8 @@ def check_whole(config: object, names: Iterable[str], least: int = 1) -> None:
     """
     for name in names:
         expected = f"a whole number of at least {least}"
-        check_setting(config, name, expected, lambda v: v == int(v) and v >= least)
+        check_setting(config, name, expected, lambda v: _is_whole(v) and v >= least)
 
 
-def check_choice(config: object, name: str, known: Iterable[str]) -> None:
-    """Check that a setting is one of the known words.
-
-    Raises:
-        ValueError: as `check_setting` does.
-    """
-    *others, last = words = tuple(known)
-    expected = f"{', '.join(others)} or {last}"
-    check_setting(config, name, expected, lambda v: v in words)
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)

@@ -12,7 +12,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.trained import Ending, Trained
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System, output_noise
 from pinnobs_gym.training.settings import TrainingConfig, changed
 
 if TYPE_CHECKING:
@@ -75,11 +75,10 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         episode: int = TRAINING_SEED,
         condition: str = "nominal",
     ) -> None:
-        known_noise = system.setups["benchmark"].noise_std if noise_std is None else noise_std
         if (record is None) == (game is None):
             raise ValueError(f"trainer {self.name!r} takes either a record or a game")
         self.system, self.config = system, config
-        self.noise_std = vector(known_noise, system.ny, "noise_std")
+        self.noise_std = output_noise(system, noise_std)
         self.episode = episode
         self.condition = condition if game is None else game.name.condition
         self.iteration = 0
@@ -102,7 +101,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         """
         settings = dict(changes)
         name = settings.pop("preset", next(iter(cls.presets)))
-        if name not in cls.presets:
+        if name not in tuple(cls.presets):  # whatever the name is, also a list
             raise ValueError(f"preset={name!r}; expected one of {', '.join(cls.presets)}")
         return changed(cls.presets[name](), settings)
 

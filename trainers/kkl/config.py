@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, Literal, TypeAlias, TypeVar
 
 from pinnobs_gym.estimation.learned.kkl_dynamics import (
     Design,
@@ -19,7 +19,7 @@ from pinnobs_gym.estimation.learned.kkl_dynamics import (
 )
 from pinnobs_gym.estimation.learned.kkl_maps import Activation
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_setting, check_whole
+from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 from trainers.kkl.fitting import Method
 from trainers.kkl.labels import frequency
 
@@ -102,10 +102,6 @@ class KKLConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         self.check_shared()
-        choices = {"design": Design, "mode": Mode, "start": Start, "activation": Activation}
-        choices |= {"method": Method, "device": Device, "sweep": Sweep, "dtype": Precision}
-        for name, kind in choices.items():
-            check_choice(self, name, get_args(kind))
         whole = ("trajectories", "samples", "depth", "width", "batch", "iterations", "check_every")
         check_whole(self, whole)
         check_setting(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import get_args
 
 from pinnobs_gym.estimation.learned.gain_network import Variant
-from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_setting, check_whole
+from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,6 @@ class PinnGainConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         self.check_shared()
-        check_choice(self, "variant", get_args(Variant))
         whole = ("width", "iterations", "streams", "chunk", "held_out", "check_every")
         check_whole(self, whole)
         expected = f"a whole number over held_out={self.held_out}"

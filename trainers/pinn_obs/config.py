@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 from pinnobs_gym.estimation.learned.mlp import Activation, Architecture, Precision
-from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_setting, check_whole
+from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
 Optimiser: TypeAlias = Literal["adam", "ssbroyden"]
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
@@ -75,10 +75,8 @@ class PinnObsConfig(TrainingConfig):
             self, "improvement", "a number of at least 0 and under 1", lambda v: 0 <= v < 1
         )
         check_setting(self, "train_fraction", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
-        check_choice(self, "optimiser", get_args(Optimiser))
-        check_choice(self, "device", get_args(Device))
+        check_whole(self, ("points",), least=10 if self.optimiser == "ssbroyden" else 0)
         if self.optimiser == "ssbroyden":
-            check_whole(self, ("points",), least=10)
             check_setting(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
             check_setting(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
         if not self.guide:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
-from pinnobs_gym.training.settings import TrainingConfig, check_choice, check_setting, check_whole
+from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
 Algorithm: TypeAlias = Literal["ppo", "sac", "td3", "recurrent_ppo"]
 Mode: TypeAlias = Literal["gain", "correction", "normalized"]
@@ -68,8 +68,6 @@ class RLConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         self.check_shared()
-        check_choice(self, "algorithm", get_args(Algorithm))
-        check_choice(self, "action_mode", get_args(Mode))
         whole = ("steps", "rows", "rollout", "batch", "epochs", "width", "stack")
         check_whole(self, (*whole, "held_out", "check_every"))
         check_setting(self, "learning_rate", "a positive number", lambda v: 0 < v < math.inf)
