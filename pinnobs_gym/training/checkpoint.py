@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.estimation.hints import check_field
 from pinnobs_gym.estimation.learned.trained_file import (
     check_same,
     identity,
@@ -50,8 +51,13 @@ def load_checkpoint(trainer: Trainer[Any, Any], path: Path) -> None:
         for name, array in _record(trainer).items():
             if not np.array_equal(saved["record"][name], array, equal_nan=True):
                 raise ValueError(f"{path} was trained on another record: its {name} differs")
-        trainer.continue_from(int(saved["iteration"]), float(saved["seconds"]))
-        trainer.load_state(saved["state"])
+        try:
+            check_field("iteration", saved["iteration"], int)
+            check_field("seconds", saved["seconds"], float)
+            trainer.continue_from(saved["iteration"], saved["seconds"])
+            trainer.load_state(saved["state"])
+        except ValueError as error:
+            raise TypeError(error) from None
     except (KeyError, TypeError, AttributeError, RuntimeError, IndexError) as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(f"{path} is not a checkpoint of this trainer: {reason}") from None

@@ -6,8 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_type_hints
 
+from pinnobs_gym.estimation.hints import as_tuple, check_field, field_hints
 from pinnobs_gym.estimation.learned.trained_file import (
     check_same,
     identity,
@@ -111,19 +112,27 @@ def content_of(value: Any) -> Any:
 
 
 def from_content(kind: type, content: Mapping[str, Any]) -> Any:
-    """Create an object of a dataclass from its `content_of`."""
-    hints = get_type_hints(kind)
+    """Create an object of a dataclass from its `content_of`.
+
+    Raises:
+        KeyError: if a field is missing.
+        TypeError: in one line, if a value is not of its field's type, or is not allowed.
+    """
+    hints = field_hints(kind)
     values = {}
     for field in fields(kind):
-        value = content[field.name]
-        within = (hints[field.name], *get_args(hints[field.name]))  # also within an optional type
-        kinds = [hint for hint in within if isinstance(hint, type) and is_dataclass(hint)]
+        value, hint = content[field.name], hints.get(field.name, Any)
+        within = (hint, *get_args(hint))  # also within an optional type
+        kinds = [each for each in within if isinstance(each, type) and is_dataclass(each)]
         if kinds and value is not None:
             value = from_content(kinds[0], value)
-        elif isinstance(value, list) and any(get_origin(hint) is tuple for hint in within):
-            value = tuple(value)  # JSON has lists only
-        values[field.name] = value
-    return kind(**values)
+        values[field.name] = as_tuple(value, hint)  # JSON has lists only
+    try:
+        for name, value in values.items():
+            check_field(name, value, hints.get(name, Any))
+        return kind(**values)
+    except ValueError as error:
+        raise TypeError(error) from None
 
 
 class LearnedEstimator(ABC):
