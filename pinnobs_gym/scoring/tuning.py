@@ -15,6 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.metrics import score
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.provenance import estimator_code, game_hash
+from pinnobs_gym.training.settings import SEEDS
 
 if TYPE_CHECKING:
     import optuna
@@ -57,6 +58,8 @@ class Search:
             raise ValueError(f"estimator {name!r} declares no settings to search")
         if self.episodes < 1:
             raise ValueError(f"episodes={self.episodes}; expected at least 1")
+        if self.seed not in range(SEEDS):
+            raise ValueError(f"seed={self.seed}; expected a whole number from 0 to {SEEDS - 1}")
 
     def error(self, settings: Mapping[str, Any]) -> float:
         """Return the geometric mean of the NRMSE over the episodes with these settings.

@@ -6,6 +6,7 @@ import pytest
 
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.leaderboard import suites
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.job import trained
@@ -68,6 +69,19 @@ def test_a_file_is_read_and_options_change_it(write):
         ('conditions = ["fog"]', "conditions: 'fog' on Academic: unknown condition 'fog'"),
         ('conditions = ["load_step"]', "conditions: 'load_step' on Academic: condition 'load_st"),
         ('conditions = ["all", "gap"]', "conditions: conditions all gap: 'all' stands alone"),
+        ("training_seeds = [4294967296]", "expected a list of whole numbers from 0 to 4294967295"),
+        (
+            'estimators = [{name = "pinn_obs", settings = {transfer = "False"}}]',
+            "estimators: settings of 'pinn_obs': transfer='False'; expected True or False",
+        ),
+        (
+            'estimators = [{name = "ekf", settings = {gate = "0.9"}}]',
+            "estimators: settings of 'ekf': gate='0.9'; expected None or a number",
+        ),
+        (
+            'estimators = [{name = "enkf", settings = {members = 10.0}}]',
+            "estimators: settings of 'enkf': members=10.0; expected a whole number",
+        ),
         (
             'estimators = [{name = "ekf", settings = {huuber = 1}}]',
             "estimators: settings of 'ekf': setting 'huuber'; expected one of gate, huber, pat",
@@ -204,3 +218,20 @@ def test_of_two_trainings_at_the_same_time_the_first_counts(tmp_path, monkeypatc
     path, before = found[1]
     assert list((tmp_path / "trained").iterdir()) == [path]
     assert written(path) == before
+
+
+@pytest.mark.parametrize("settings", [{}, {"iterations": 1}])
+def test_what_trains_on_each_record_trains_by_its_own_recipe(tmp_path, monkeypatch, settings):
+    recipe = {"depth": 1, "width": 3, "iterations": 2}
+    monkeypatch.setattr(PinnObs, "recipe", recipe)
+    suite = Suite(
+        systems=("ReverseDuffing",),
+        estimators=(Entry("pinn_obs", settings=settings),),
+        conditions=("nominal",),
+        trained_episodes=1,
+    )
+    (job,) = jobs_of(suite, tmp_path)
+    job.run()
+    (row,) = rows.read(tmp_path / "rows.jsonl")
+    config = row["options"]["config"]
+    assert {name: config[name] for name in recipe} == {**recipe, **settings}

@@ -13,7 +13,6 @@ from typing import Any, Self
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.evaluation import Results, StoredKey, make_estimator, run_episodes
 from pinnobs_gym.scoring.provenance import (
@@ -120,7 +119,7 @@ def run_job(job: Job) -> None:
     options = dict(job.settings)
     chosen: BaseEstimator | type[BaseEstimator] = cls
     if cls.trains_on_record is not None:
-        recipe = TRAINERS.resolve(cls.trains_on_record).configured(job.training)
+        recipe = cls.trainer_config(job.training)
         stem = job.game.name.file_stem
         code = training_code(cls.trains_on_record, job.game.source)
         place = f"{stem}-{cls.trains_on_record}-{_digest([recipe, code])}-episode{job.seed}"
@@ -141,7 +140,7 @@ def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:
     """Return the estimator trained on nominal episodes that are never scored; load it if it was
     trained before."""
     name, game = str(cls.needs_training), job.game.nominal
-    recipe = TRAINERS.resolve(name).configured({**cls.recipe, **job.training})
+    recipe = cls.trainer_config(job.training)
     code = training_code(name, game.source)
     label = f"{game.name.file_stem}-{name}-{_digest([recipe, code])}"
     path = job.folder / "trained" / f"{label}.pt"

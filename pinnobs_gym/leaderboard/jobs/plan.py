@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
-from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
 from pinnobs_gym.scoring.rows import Stored, game_of
 from pinnobs_gym.simulation.conditions import fitting
@@ -167,13 +166,11 @@ def _check_settings(
     training: Mapping[str, Any],
 ) -> None:
     """Check the settings of an estimator, or those of its trainer."""
-    trainer = cls.needs_training or cls.trains_on_record
     try:
-        if trainer is not None:
-            TRAINERS.resolve(trainer).configured({**cls.recipe, **training})
+        if cls.needs_training or cls.trains_on_record:
+            cls.trainer_config(training)
             return
-        aside = {f.name for f in fields(BaseEstimator)}
-        known = sorted(f.name for f in fields(cls) if f.init and f.repr and f.name not in aside)
+        known = sorted(f.name for f in cls.setting_fields() if f.init)
         for setting in entry.settings:
             if setting not in known:
                 raise ValueError(f"setting {setting!r}; expected one of {', '.join(known)}")

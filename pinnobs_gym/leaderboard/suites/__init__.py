@@ -19,6 +19,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pinnobs_gym.training.settings import SEEDS
+
 FOLDER = Path(__file__).parent
 
 
@@ -173,7 +175,10 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "episodes": ("at least 1", _whole(1)),
     "trained_episodes": ("at least 1", _whole(1)),
     "seed": ("at least 0", _whole(0)),
-    "training_seeds": ("whole numbers of at least 0", _whole(0)),
+    "training_seeds": (
+        f"whole numbers from 0 to {SEEDS - 1}",
+        lambda v: type(v) is int and 0 <= v < SEEDS,
+    ),
     "budgets": (
         "positive numbers of seconds",
         lambda v: type(v) in (int, float) and 0 < v < float("inf"),
