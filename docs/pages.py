@@ -138,7 +138,10 @@ def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
     base = {f.name for f in fields(BaseEstimator)}
     lines = _settings(cls, {f.name for f in fields(cls) if f.name not in base and f.repr})
     if lines:
-        parts += ["\n## Settings\n", "On the command line `--set name=value`.\n"]
+        parts += [
+            "\n## Settings\n",
+            "On the command line `--set name=value`, a list with commas.\n",
+        ]
         parts.append(markdown_table(("name", "default", "meaning"), lines))
     if cls.tunable:
         ranges = [(f"`{n}`", f"{r.low:g} to {r.high:g}") for n, r in cls.tunable.items()]

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
-from dataclasses import fields
-from typing import Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import is_dataclass
+from typing import Any, TypeVar, get_args, get_origin
 
 import tyro
 from rich.text import Text
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.estimation.hints import field_hints, fits, in_words
 
 T = TypeVar("T")
 
@@ -20,9 +26,13 @@ T = TypeVar("T")
 def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any) -> T:
     """Parse a command's options from its arguments; ``options`` are passed to `tyro.cli`.
 
+    The values of an option that takes several add up if it is repeated.
+
     Raises:
-        ValueError: in one line, if the arguments are invalid.
+        ValueError: in one line, if the arguments are invalid, or if an option that takes one value
+            is repeated.
     """
+    arguments = _joined(arguments, _lists(kind))
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
@@ -32,6 +42,52 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
             raise
     message = _first_of(errors.getvalue()).removeprefix("Error parsing config: ")
     raise ValueError(f"{message}; see pinnobs {command} --help") from None
+
+
+def by_option(arguments: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Split arguments at the options among them. Returns each option's name, empty for what comes
+    before the first, with the arguments after it."""
+    groups: list[tuple[str, list[str]]] = [("", [])]
+    for argument in arguments:
+        if re.match(r"--?[A-Za-z]", argument) and not re.fullmatch(r"-(inf|nan)", argument):
+            option, equals, value = argument.partition("=")
+            groups.append((option.replace("_", "-"), [value] * bool(equals)))
+        else:
+            groups[-1][1].append(argument)
+    return groups
+
+
+def _joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
+    """Return the arguments with each option only once, with all its values if it is one of
+    ``lists``.
+
+    Raises:
+        ValueError: in one line, if another option is repeated.
+    """
+    joined: dict[str, list[str]] = {}
+    for option, values in by_option(arguments):
+        once = option.replace("--no-", "--", 1)
+        if option in lists and option in joined:
+            joined[option] += values
+        elif {once, once.replace("--", "--no-", 1)} & joined.keys():
+            raise ValueError(f"{once} is given twice; expected once")
+        else:
+            joined[option] = values
+    return [part for option, values in joined.items() for part in (option, *values)][1:]
+
+
+def _lists(kind: Any) -> set[str]:
+    """Return the options of a dataclass of options that take several values."""
+    found: set[str] = set()
+    made = get_origin(kind) or kind  # a generic class, or the class itself
+    parameters = dict(zip(getattr(made, "__parameters__", ()), get_args(kind), strict=False))
+    for name, hint in field_hints(made).items():
+        within = parameters.get(hint, hint)
+        if is_dataclass(within):
+            found |= _lists(within)
+        elif any(tuple in (each, get_origin(each)) for each in (within, *get_args(within))):
+            found.add("--" + name.replace("_", "-"))
+    return found
 
 
 def _first_of(box: str) -> str:
@@ -50,43 +106,48 @@ def _first_of(box: str) -> str:
 def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, Any]:
     """Parse ``name=value`` settings of an estimator, or of the trainer that it runs on the record.
 
+    A value is parsed by the type of its field, with the rules of the other options; the items of a
+    list are separated by commas or spaces.
+
     Raises:
-        ValueError: in one line, naming the invalid setting and the known names.
+        ValueError: in one line, naming the invalid setting and what was expected.
     """
-    base = {f.name for f in fields(BaseEstimator)}
-    own = {f.name: f for f in fields(cls) if f.name not in base and f.repr}
+    types = field_hints(cls)
+    own = {f.name: types.get(f.name, Any) for f in cls.setting_fields() if f.init}
     trained_by = cls.trains_on_record
-    hints = {n: h for n, h in get_type_hints(cls).items() if n in own}
-    trainer: Any = None if trained_by is None else TRAINERS.resolve(trained_by)
-    recipe: dict[str, Any] = {}
     nested: dict[str, Any] = {}
-    if trainer is not None:  # its settings are those of its recipe, the field ``config``
-        hints.pop("config")
-        kinds = get_type_hints(type(trainer.configured({})))
-        nested = {"preset": str} | {n: h for n, h in kinds.items() if get_origin(h) is not ClassVar}
+    if trained_by is not None:  # its settings are those of its recipe, the field ``config``
+        own.pop("config")
+        nested = {"preset": str, **field_hints(type(cls.trainer_config({})))}
     values: dict[str, Any] = {}
+    given: dict[str, str] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
-        if equals and name in hints:
-            values[name] = _parsed(setting, text, hints[name])
-        elif equals and name in nested:
-            recipe[name] = _parsed(setting, text, nested[name])
-        else:
-            listed = ", ".join(sorted([*hints, *nested])) or "none"
+        hint = {**nested, **own}.get(name)
+        if not equals or hint is None:
+            listed = ", ".join(sorted([*own, *nested])) or "none"
             raise ValueError(f"setting {setting!r}; expected name=value with a name of: {listed}")
-    if trainer is not None and recipe:
-        values["config"] = trainer.configured(recipe)
+        value = _parsed(name, text, hint)
+        if name in values and value != values[name]:
+            raise ValueError(f"setting {name!r} is given twice: {given[name]!r} and {text!r}")
+        values[name], given[name] = value, text
+    if nested:
+        recipe = {name: values.pop(name) for name in nested if name in values}
+        values["config"] = cls.trainer_config(recipe)
     return values
 
 
-def _parsed(setting: str, text: str, hint: Any) -> Any:
-    """Convert the text to the type of the field: an int, a float or a string."""
-    kinds = get_args(hint) or (hint,)
-    for kind in (int, float):
-        if kind in kinds:
-            try:
-                return kind(text)
-            except ValueError:
-                expected = "a whole number" if kind is int else "a number"
-                raise ValueError(f"setting {setting!r}; expected {expected}") from None
-    return text
+def _parsed(name: str, text: str, hint: Any) -> Any:
+    """Convert the text of a setting to the type of its field, with tyro's rules for one option."""
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        raise ValueError(f"setting {name!r} can be given in Python only")
+    parts = [text] if spec.nargs == 1 else [part for part in re.split(r"[\s,]+", text) if part]
+    try:
+        if set(parts) <= set(spec.choices or parts):
+            value = spec.instance_from_str(parts)
+            if fits(value, hint):
+                return value
+    except ValueError:
+        pass
+    raise ValueError(f"setting {name + '=' + text!r}; expected {in_words(hint)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, Generic, TypeVar
 import tyro
 
 from pinnobs_gym.cli.console import console
-from pinnobs_gym.cli.options import parse
+from pinnobs_gym.cli.options import by_option, parse
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
@@ -101,9 +100,8 @@ def run(arguments: Sequence[str]) -> int:
 
 def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> Train[Any]:
     """Parse the command line of a training, with the preset's values as defaults."""
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", default=next(iter(cls.presets)))
-    preset: str = first.parse_known_args(arguments)[0].preset
+    given = [v for option, values in by_option(arguments) if option == "--preset" for v in values]
+    preset = given[0] if given else next(iter(cls.presets))
     config = cls.configured({"preset": preset})
     kind: Any = Train[type(config)]
     return parse(
