@@ -77,6 +77,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
     ) -> None:
         if (record is None) == (game is None):
             raise ValueError(f"trainer {self.name!r} takes either a record or a game")
+        config.check_shared()  # a Config with a __post_init__ of its own may have left it out
         self.system, self.config = system, config
         self.noise_std = output_noise(system, noise_std)
         self.episode = episode

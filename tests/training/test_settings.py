@@ -88,6 +88,16 @@ def test_a_trainer_refuses_a_noise_level_that_is_none(noise):
         )
 
 
+def test_a_config_that_forgets_the_shared_checks_is_checked_by_its_trainer():
+    class Forgetful(type(TRAINERS.resolve("pinn_obs").configured({}))):
+        def __post_init__(self):
+            pass
+
+    game = Game.of("Academic")
+    with pytest.raises(ValueError, match=r"width=8\.0; expected a whole number"):
+        trainer_of("pinn_obs", Forgetful(width=8.0), game)
+
+
 def test_a_negative_episode_is_named():
     config = TRAINERS.resolve("pinn_obs").configured({})
     with pytest.raises(ValueError, match="episode=-3; expected a whole number of at least 0"):
