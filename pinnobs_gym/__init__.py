@@ -42,16 +42,16 @@ _HOMES = {
 
 
 def register(cls: type) -> type:
-    """Register your own system or estimator under its name; usable as a decorator.
+    """Register your own system, estimator or trainer under its name; usable as a decorator.
 
     A `System` becomes an env (``pinnobs/<class name>-v<version>``) that every estimator, trainer
-    and command accepts. An estimator is registered under its class attribute ``name``.
+    and command accepts. An estimator or a trainer is registered under its class attribute ``name``.
 
     Returns:
         The class itself.
 
     Raises:
-        TypeError: in one line, if the class is neither a `System` nor an estimator, or is abstract.
+        TypeError: in one line, if the class is no `System`, estimator or trainer, or is abstract.
         ValueError: if the name is taken.
     """
     from pinnobs_gym.estimation.estimator import BaseEstimator
@@ -63,7 +63,12 @@ def register(cls: type) -> type:
     elif isinstance(cls, type) and issubclass(cls, BaseEstimator):
         ESTIMATORS.register(cls)
     else:
-        raise TypeError(f"{cls!r} is neither a System nor an Estimator")
+        from pinnobs_gym.registry import TRAINERS
+        from pinnobs_gym.training.trainer import Trainer
+
+        if not (isinstance(cls, type) and issubclass(cls, Trainer)):
+            raise TypeError(f"{cls!r} is neither a System, an Estimator nor a Trainer")
+        TRAINERS.register(cls)
     return cls
 
 

@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import pkgutil
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,9 +34,9 @@ class Registry(Generic[T]):
     """The named classes of one kind.
 
     The registry contains the classes of the package's modules whose source assigns one of the
-    ``attributes``, those of installed packages in the entry-point group with the package's name,
-    and those given to `register`. The name of a class is its attribute ``name``, or else its own
-    name.
+    ``attributes``, those of installed packages in the entry-point group of the kind, such as
+    ``pinnobs_gym.systems``, and those given to `register`. The name of a class is its attribute
+    ``name``, or else its own name.
 
     Args:
         kind: name of the kind in messages, such as ``"system"``.
@@ -79,7 +80,7 @@ class Registry(Generic[T]):
         """Import and return the classes announced by installed packages, with a warning for each
         that cannot be imported."""
         classes = []
-        for point in entry_points(group=self._package):
+        for point in entry_points(group=f"pinnobs_gym.{self._kind}s"):
             try:
                 classes.append(self.register(point.load()))
             except Exception as error:  # whatever another package raises
@@ -109,8 +110,12 @@ class Registry(Generic[T]):
         self._known[name] = cls  # a reloaded class replaces its earlier version
         return cls
 
-    def resolve(self, spec: str | type[T]) -> type[T]:
+    def resolve(self, spec: str | type[T], near: type | None = None) -> type[T]:
         """Return the class for a name, a ``module:Class`` path or the class itself.
+
+        Args:
+            spec: the name, path or class.
+            near: a class of any kind; a name is first looked for `beside` it.
 
         Raises:
             ValueError: in one line; for an unknown name it lists the known ones.
@@ -119,6 +124,8 @@ class Registry(Generic[T]):
             return self.register(spec)
         if ":" in spec:
             return self._imported(spec)
+        if near is not None and (found := self.beside(near).get(spec)) is not None:
+            return self.register(found)
         if spec not in self._known and spec in self.sources:
             self._import_class(spec)
         if spec not in self._known:
@@ -133,6 +140,23 @@ class Registry(Generic[T]):
                 )
             raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}")
         return self._known[spec]
+
+    def beside(self, cls: type) -> dict[str, type[T]]:
+        """Return the classes of this kind that a class of any kind has beside it, by name: those
+        that its module, or the module of one of its bases, defines or imports."""
+        found: dict[str, type[T]] = {}
+        for name in dict.fromkeys(base.__module__ for base in cls.__mro__):
+            module = sys.modules.get(name)
+            for value in () if module is None else tuple(vars(module).values()):
+                if self._is_concrete(value):
+                    found.setdefault(self.name_of(value), value)
+        return found
+
+    def spec_of(self, cls: type[T]) -> str:
+        """Return what a command takes for a class: its name if the package has it, or else its
+        path."""
+        name = self.name_of(cls)
+        return name if name in self.sources else f"{cls.__module__}:{cls.__qualname__}"
 
     def name_of(self, cls: type[T]) -> str:
         """Return the name under which a class is registered."""
@@ -262,3 +286,24 @@ TRAINERS: Registry[Any] = Registry(
 )
 """All trainers by name. The registry is defined here for estimators, which know trainers only by
 name."""
+
+
+def trainer_class(estimator: Any) -> Any:
+    """Return the trainer of an estimator's class, which it names in ``needs_training`` or
+    ``trains_on_record``: by ``module:Class``, by a name `beside` it, or by a name in `TRAINERS`.
+
+    Raises:
+        ValueError: in one line, if there is none.
+    """
+    spec = estimator.needs_training or estimator.trains_on_record
+    return TRAINERS.resolve(spec, near=estimator)
+
+
+def trainer_name(estimator: Any) -> str | None:
+    """Return the name of the trainer that an estimator's class needs, None if it needs none.
+
+    Raises:
+        ValueError: in one line, if the trainer is given by ``module:Class`` and cannot be imported.
+    """
+    spec: str | None = estimator.needs_training
+    return spec if spec is None or ":" not in spec else TRAINERS.resolve(spec).name

@@ -24,7 +24,7 @@ import tyro
 from loky import ProcessPoolExecutor, as_completed
 from reproduction import comparison, report
 from reproduction.comparison import METHODS, Comparison
-from reproduction.running import Job, run
+from reproduction.running import PaperJob, run
 from reproduction.tables import TABLES, Table, recipe
 from rich import box
 from rich.console import Console
@@ -61,7 +61,7 @@ class Options:
     out: Path = Path("runs/paper")
     """Folder of the results."""
 
-    def chosen(self) -> list[Job]:
+    def chosen(self) -> list[PaperJob]:
         """Return the jobs of the table.
 
         Raises:
@@ -81,7 +81,7 @@ class Options:
         chosen = [
             (cases[n], recipe(self.preset, cases[n], seed, budget)) for n in self.only or cases
         ]
-        return [Job(case, self.preset, config, self.out) for case, config in chosen]
+        return [PaperJob(case, self.preset, config, self.out) for case, config in chosen]
 
     def compared(self) -> Comparison:
         """Return the comparison.
@@ -106,7 +106,7 @@ def _number(budget: str) -> float | None:
         raise ValueError(f"budget={budget!r}; expected CPU seconds or none") from None
 
 
-def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Row | str]]:
+def run_jobs(jobs: Sequence[PaperJob], processes: int) -> Iterator[tuple[PaperJob, Row | str]]:
     """Run jobs, one thread each, and yield each with its row or error message as it ends.
 
     A single job shows its own progress bar.
@@ -123,14 +123,14 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Row | s
         pool.shutdown(kill_workers=True)
 
 
-def _attempt(job: Job, progress: bool = False) -> tuple[Job, Row | str]:
+def _attempt(job: PaperJob, progress: bool = False) -> tuple[PaperJob, Row | str]:
     try:
         return job, run(job, progress)
     except Exception as error:
         return job, f"{type(error).__name__}: {error}"
 
 
-def work(jobs: Sequence[Job], processes: int, results: Path) -> int:
+def work(jobs: Sequence[PaperJob], processes: int, results: Path) -> int:
     """Run jobs, store and report the row of each as it ends; return the number of failures."""
     failed = 0
     columns = (SpinnerColumn(), TextColumn("cases"), MofNCompleteColumn(), TimeElapsedColumn())
@@ -176,12 +176,12 @@ def reproduce(options: Options) -> int:
     known = report.read(results)
     missing = [job for job in jobs if not report.is_done(job, known)]
     if len(missing) < len(jobs):
-        console.print(f"{len(jobs) - len(missing)} of {len(jobs)} cases are there already")
+        console.print(f"{len(jobs) - len(missing)} of {len(jobs)} cases already exist")
     status = 0
     try:
         status = int(bool(missing) and work(missing, options.jobs, results) > 0)
     except KeyboardInterrupt:
-        print("stopped; run again to go on", file=sys.stderr)
+        print("stopped; the same command continues it", file=sys.stderr)
         status = 130
     show(TABLES[options.table], report.read(results), options.out / f"{options.table}.md")
     return status
@@ -196,7 +196,7 @@ def compare(options: Options) -> int:
         for done in comparison.run(chosen, results, set(comparison.read(results))):
             console.print(done)
     except KeyboardInterrupt:
-        print("stopped; run again to go on", file=sys.stderr)
+        print("stopped; the same command continues it", file=sys.stderr)
         status = 130
     rows = comparison.read(results)
     shown = RichTable(title="Comparison", title_justify="left", box=box.SIMPLE)

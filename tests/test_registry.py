@@ -213,7 +213,7 @@ def test_register_refuses_what_is_incomplete_or_taken():
 
     with pytest.raises(TypeError, match=r"WrongSize: x0_low .* shape \(2,\); expected 1"):
         pinnobs_gym.register(WrongSize)
-    with pytest.raises(TypeError, match="neither a System nor an Estimator"):
+    with pytest.raises(TypeError, match="neither a System, an Estimator nor a Trainer"):
         pinnobs_gym.register(int)
     ReverseDuffing = type("ReverseDuffing", (NoSetups,), {"setups": WrongSize.setups})
     with pytest.raises(ValueError, match="'ReverseDuffing' is already"):

@@ -29,8 +29,8 @@ def usage() -> str:
         [
             *lines,
             "",
-            "pinnobs COMMAND --help says more. A system or estimator of your own is given as "
-            "module:Class.",
+            "pinnobs COMMAND --help says more. A system, estimator or trainer of your own is given "
+            "as module:Class.",
             "With PINNOBS_TRACEBACK=1 in the environment an error shows where it came from.",
         ]
     )

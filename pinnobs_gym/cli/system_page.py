@@ -57,9 +57,9 @@ def page(cls: type[System], env_id: str) -> str:
         "Parameters:\n",
         _parameters(cls),
         "\n## Conditions\n",
-        "Names for `condition`, joined by `+`; `estimators told` is what is known of it.\n",
+        "Names for `condition`, joined by `+`; `known to estimators` is what is known of it.\n",
         _table(
-            ("name", "what changes", "estimators told"),
+            ("name", "what changes", "known to estimators"),
             [
                 (name, CONDITIONS[name].summary, CONDITIONS[name].known_to_estimators)
                 for name in fitting(system, setup)

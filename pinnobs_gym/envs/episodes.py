@@ -211,7 +211,7 @@ class EpisodeBuffer:
             self._waiting[row].clear()
 
     def any(self, rows: Iterable[int]) -> bool:
-        """Return whether an episode waits for one of these rows."""
+        """Return whether any of these rows has an episode that is not yet started."""
         return any(self._waiting[row] for row in rows)
 
     def _draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:

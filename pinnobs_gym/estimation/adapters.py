@@ -1,4 +1,4 @@
-"""Adapters for offline estimators, and for objects that estimate a single episode."""
+"""An adapter for objects that estimate a single episode."""
 
 from __future__ import annotations
 

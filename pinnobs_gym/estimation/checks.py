@@ -61,8 +61,8 @@ def check_estimator(estimator: BaseEstimator) -> None:
 
     Its class declares them: `BaseEstimator.exempt_from` gives the name of each check and, in a
     line, why it does not hold. `OfflineEstimator` declares those of estimators that see the whole
-    record first. A name there that is not a check's fails the check ``exemptions``, from which
-    nothing is exempt.
+    record first. If it names an unknown check, the check ``exemptions`` fails; no estimator can be
+    exempt from that one.
 
     Raises:
         CheckFailed: if any check fails, with a line for each: its name, the finding and the
@@ -71,8 +71,13 @@ def check_estimator(estimator: BaseEstimator) -> None:
     """
     if not isinstance(estimator, BaseEstimator):
         raise TypeError(f"{estimator!r} is not an instance of an Estimator; expected one")
-    left_out = set(estimator.exempt_from) - {"exemptions"}
-    held_to = {n: check for n, check in ESTIMATOR_CHECKS.items() if n not in left_out}
+    declared: Any = estimator.exempt_from
+    left_out = declared if isinstance(declared, Mapping) else {}  # else `exemptions` fails
+    held_to = {
+        name: check
+        for name, check in ESTIMATOR_CHECKS.items()
+        if name not in left_out or name == "exemptions"
+    }
     run_all(held_to, estimator)
 
 
@@ -137,8 +142,13 @@ def _estimator_immutable(estimator: BaseEstimator) -> None:
 
 @add_check(ESTIMATOR_CHECKS, "exemptions")
 def _estimator_exemptions(estimator: BaseEstimator) -> None:
-    """Every exemption is from a check that there is, and says why."""
-    for name, reason in estimator.exempt_from.items():
+    """Every name in `exempt_from` is that of a check, and its reason is one line."""
+    declared: Any = estimator.exempt_from
+    require(
+        isinstance(declared, Mapping),
+        f"exempt_from={declared!r}; expected a mapping from names of checks to reasons",
+    )
+    for name, reason in declared.items():
         known = ", ".join(check for check in ESTIMATOR_CHECKS if check != "exemptions")
         require(name in known.split(", "), f"exempt_from names {name!r}; known are {known}")
         one_line = isinstance(reason, str) and reason.strip() and "\n" not in reason
@@ -345,9 +355,21 @@ def _estimator_diverging_row(estimator: BaseEstimator) -> None:
 
 @add_check(ESTIMATOR_CHECKS, "save_load")
 def _estimator_save_load(estimator: BaseEstimator) -> None:
-    """A saved estimator gives the same estimates after loading."""
-    if not isinstance(estimator, Saved):
+    """A saved estimator gives the same estimates after loading.
+
+    An estimator that needs training, or has one of ``save`` and ``load``, has both. Others are not
+    held to this check, and pass.
+    """
+    cls = type(estimator)
+    lacking = [name for name in ("save", "load") if not callable(getattr(cls, name, None))]
+    if len(lacking) == 2 and cls.needs_training is None:
         return
+    why = "since it needs training" if len(lacking) == 2 else "or neither"
+    require(
+        not lacking,
+        f"{cls.__name__} has no {' and no '.join(lacking)}; expected save and load, {why}",
+    )
+    assert isinstance(estimator, Saved)
     record = _record(estimator)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "saved"

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from pinnobs_gym.estimation.hints import check_settings
-from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_noise, output_scale
 
@@ -84,11 +84,12 @@ class BaseEstimator(ABC):
     track: ClassVar[str]
     """``online`` (causal) or ``offline`` (uses the whole record); the two are ranked separately."""
     trains_on_record: ClassVar[str | None] = None
-    """Name of the trainer that the estimator runs on every record, if any."""
+    """Trainer that the estimator runs on every record, if any, given as in `needs_training`."""
     knows: ClassVar[tuple[str, ...]] = ("model", "prior", "noise")
     """The information given to the estimator in addition to the outputs and inputs."""
     needs_training: ClassVar[str | None] = None
-    """Name of the trainer whose result the estimator requires, if any."""
+    """Trainer whose result the estimator requires, if any: its name or ``module:Class``. A name is
+    first looked for in the estimator's own module."""
     tunable: ClassVar[Mapping[str, Range]] = {}
     """Search ranges of the settings that ``pinnobs tune`` searches."""
     recipe: ClassVar[Mapping[str, Any]] = {}
@@ -117,8 +118,7 @@ class BaseEstimator(ABC):
         Raises:
             ValueError: in one line, if a setting is unknown or a value is not allowed.
         """
-        trainer = TRAINERS.resolve(str(cls.needs_training or cls.trains_on_record))
-        return trainer.configured({**cls.recipe, **changes})
+        return trainer_class(cls).configured({**cls.recipe, **changes})
 
     @abstractmethod
     def run(self, record: Record) -> Estimates:

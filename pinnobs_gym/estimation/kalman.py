@@ -93,6 +93,17 @@ def kalman_gain(P: Array, H: Array, R: Array) -> tuple[Array, Array]:
     return divide(HP.swapaxes(0, 1), S), S
 
 
+def innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return S = HPHᵀ + R, shape (ny, ny, batch); the arguments are those of `joseph_update`."""
+    return sandwich(H, P) + R
+
+
+def cautious(P: np.ndarray, H: np.ndarray, R: np.ndarray, fraction: float) -> np.ndarray:
+    """Return R with a fraction of HPHᵀ added, (ny, ny, batch or 1), which shortens an update
+    (Boutayeb & Aubry 1999); the other arguments are those of `joseph_update`."""
+    return R + fraction * sandwich(H, P) if fraction else R
+
+
 def gain_of_deviations(
     X: np.ndarray, Y: np.ndarray, R: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

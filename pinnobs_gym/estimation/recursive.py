@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -14,7 +14,19 @@ from pinnobs_gym.estimation.estimator import Estimator, State
 @dataclass(frozen=True)
 class RecursiveEstimator(Estimator):
     """An online estimator whose update is a prediction to the time of the sample, followed by a
-    correction with the outputs. At the first sample the prior serves as the prediction."""
+    correction with the outputs. At the first sample the prior serves as the prediction.
+
+    Subclasses define `reset`, `predict` and `correct`. One that defines `update` is refused with a
+    TypeError; it derives from `Estimator` instead.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if cls.update is not RecursiveEstimator.update:
+            raise TypeError(
+                f"{cls.__name__} defines update; expected predict and correct, or a subclass of "
+                "Estimator"
+            )
 
     @abstractmethod
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
@@ -44,5 +56,5 @@ class RecursiveEstimator(Estimator):
     @final
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         if state.t is not None:
-            state = self.predict(state, t, u)
-        return self.correct(state, t, y, u)
+            state = self._state_from("predict", self.predict(state, t, u))
+        return self._state_from("correct", self.correct(state, t, y, u))

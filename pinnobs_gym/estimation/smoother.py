@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimation.kalman import kalman_gain, observe, predict, update_with
+from pinnobs_gym.estimation.kalman import cautious, kalman_gain, observe, predict, update_with
 from pinnobs_gym.simulation.matrices import divide_factored, factor, identity, product, sandwich
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.record import Record
@@ -90,7 +90,7 @@ def forward(
         if about is not None:
             innovation = innovation - np.einsum("pib,bi->bp", H[k], x - about[k])
         # Update.
-        noise = R + caution * sandwich(H[k], P) if caution else R
+        noise = cautious(P, H[k], R, caution)
         K[k], _ = kalman_gain(P, H[k], noise)
         x, P = update_with(K[k], x, P, innovation, H[k], noise)
         after.xhat[k], after.P[k] = x, P

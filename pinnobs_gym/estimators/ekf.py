@@ -8,9 +8,9 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
-from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.estimation.kalman import innovation_covariance, joseph_update, observe
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import sandwich, squared_size
+from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
 
@@ -117,7 +117,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
     ) -> tuple[np.ndarray, EKFMemory]:
         """Return P, reset where the gate restarts the filter, and the updated memory."""
         present = H.any(axis=1).sum(axis=0)  # number of outputs that are not missing
-        nis = squared_size(innovation, sandwich(H, P) + memory.R)
+        nis = squared_size(innovation, innovation_covariance(P, H, memory.R))
         beyond = ~(nis <= memory.bounds[present])
         count = np.where(present > 0, np.where(beyond, memory.beyond + 1, 0), memory.beyond)
         restart = count >= self.patience
@@ -129,6 +129,6 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
     ) -> np.ndarray:
         """Return R (ny, ny, batch) with enlarged variances for outputs with large innovations."""
         assert self.huber is not None
-        std = np.sqrt(np.einsum("iib->ib", sandwich(H, P) + R))
+        std = np.sqrt(np.einsum("iib->ib", innovation_covariance(P, H, R)))
         excess = np.maximum(abs(innovation.T) / (self.huber * std), 1.0)
         return R * excess[:, None]

@@ -206,7 +206,7 @@ class KKLAutoencoder(KKL):
         + r""" \\
 T &: \; \min \sum_k \Bigl\| T(x_{k+m}) - \Phi^m T(x_k)
 - \sum_{j=k}^{k+m-1} \Phi^{k+m-1-j} (\Gamma_0 y_j + \Gamma_1 y_{j+1}) \Bigr\|^2 \\
-T^* &: \; \min \textstyle\sum_k \| T^*(z_k) - x_k \|^2, \qquad z_k \text{ as } T \text{ says}
+T^* &: \; \min \textstyle\sum_k \| T^*(z_k) - x_k \|^2, \qquad z_k \text{ computed from } T
 """
     )
     needs_training = "kkl_autoencoder"

@@ -10,7 +10,7 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import factor
+from pinnobs_gym.simulation.matrices import factor, moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -108,11 +108,11 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         missing = np.isnan(y)
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
-        yhat, S = _moments(np.exp(log_weights), outputs)
+        yhat, S = moments(np.exp(log_weights), outputs)
         S = S + np.diag(self.output_variance)
         x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
         weights = np.exp(log_weights)
-        xhat, P = _moments(weights, x)
+        xhat, P = moments(weights, x)
         # Resample the episodes whose effective number of particles, 1/Σw², is below half.
         rows = np.flatnonzero((weights**2).sum(axis=0) > 2 / self.particles)
         if len(rows):
@@ -166,7 +166,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         rng = np.random.default_rng([self.seed, 1, *stream])
         old, weights, count = x[:, rows], np.exp(log_weights[:, rows]), self.particles
         shrinkage = (3 * self.discount - 1) / (2 * self.discount)
-        mean, P = _moments(weights, old)
+        mean, P = moments(weights, old)
         # Systematic resampling: the number of copies of each particle.
         ends = np.clip(np.ceil(np.cumsum(weights, axis=0) * count - rng.random()), 0, count)
         ends[-1] = count
@@ -181,15 +181,6 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         x[:, rows] = shrinkage * drawn + (1 - shrinkage) * mean + noise
         log_weights[:, rows] = -np.log(count)
         return x, log_weights
-
-
-def _moments(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted means (batch, nx) and covariances (batch, nx, nx) of x (num_particles,
-    batch, nx)."""
-    mean = np.einsum("nb,nbi->bi", weights, x)
-    deviations = (x - mean).transpose(2, 0, 1)
-    P = np.einsum("inb,jnb->bij", weights * deviations, deviations)
-    return mean, P
 
 
 def _normalised(log_weights: np.ndarray) -> np.ndarray:

@@ -10,14 +10,13 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
-from pinnobs_gym.estimation.kalman import kalman_gain, observe, update_with
+from pinnobs_gym.estimation.kalman import observe
 from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
-    corrected_gain,
     memory_size,
     recurrent_gain,
-    remembered,
     shapes,
+    update_with_network,
 )
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
@@ -112,16 +111,12 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         scale, _, R = fixed
         xhat, P = state.xhat, covariances(state)
         innovation, H = observe(self.system, t, xhat, y, u)
-        K, S = kalman_gain(P, H, R)
-        e, variance = np.ascontiguousarray(innovation.T), np.einsum("iib->ib", S)
-        share = np.maximum(1 - np.einsum("iib->ib", R) / variance, 0.0)
-        x = np.ascontiguousarray(xhat.T)
-        layers = self.trained.layers
-        K = corrected_gain(layers, scale, x, P, e, variance, K, share, memory)
-        memory = remembered(memory, e, variance, ~np.isnan(y).T)
-        xhat, P = update_with(K, xhat, P, innovation, H, R)
+        x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
+        x, P, S, memory = update_with_network(
+            self.trained.layers, scale, x, P, e, H, R, memory, ~np.isnan(y).T
+        )
         P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S, (fixed, memory))
+        return State(x.T, t, u, P, innovation, S, (fixed, memory))
 
     def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         """Apply `correct` with the recurrent network's gain, without a covariance."""

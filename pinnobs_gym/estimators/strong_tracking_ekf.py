@@ -8,9 +8,8 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
-from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.estimation.kalman import cautious, joseph_update, observe
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import sandwich
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -71,8 +70,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         P, (_, R, _, _) = covariances(state), state.memory
         innovation, H = observe(self.system, t, state.xhat, y, u)
-        if self.output_factor:
-            R = R + self.output_factor * sandwich(H, P)
+        R = cautious(P, H, R, self.output_factor)
         xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
         P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, state.memory)

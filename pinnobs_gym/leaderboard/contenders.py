@@ -11,7 +11,7 @@ import numpy as np
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.distinct import name_of
 from pinnobs_gym.leaderboard.intervals import log_ratio
-from pinnobs_gym.leaderboard.runs import Run, rows_of
+from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
 from pinnobs_gym.leaderboard.standings import Standing, standing
 from pinnobs_gym.scoring.rows import Row
 
@@ -25,7 +25,7 @@ class Contender:
     one choice of settings."""
 
     name: str
-    games: Mapping[GameName, Sequence[Run]]
+    games: Mapping[GameName, Sequence[ScoredRun]]
     """Runs of each game, in the order of their `label`; several runs where training seeds
     differ."""
     ratios: Mapping[GameName, np.ndarray]
@@ -38,7 +38,7 @@ class Contender:
         return max((run.track for run in self.runs), key=len)
 
     @property
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[ScoredRun]:
         """Runs of all games."""
         return [run for runs in self.games.values() for run in runs]
 
@@ -48,10 +48,10 @@ class Contender:
         return runs[0].standing if len(runs) == 1 else standing(rows_of(runs))
 
 
-def contenders(runs: Iterable[Run]) -> list[Contender]:
+def contenders(runs: Iterable[ScoredRun]) -> list[Contender]:
     """Group runs into contenders by name and training budget, those with the most rows first. The
     rows must be `distinct`."""
-    groups: dict[str, dict[GameName, list[Run]]] = defaultdict(lambda: defaultdict(list))
+    groups: dict[str, dict[GameName, list[ScoredRun]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         groups[name_of(run.rows[0])][run.game].append(run)
     named = {
@@ -62,7 +62,7 @@ def contenders(runs: Iterable[Run]) -> list[Contender]:
     return [Contender(name, games, _ratios(games, peer)) for name, games in named.items()]
 
 
-def among(contenders: Iterable[Contender], wanted: Callable[[Run], bool]) -> list[Contender]:
+def among(contenders: Iterable[Contender], wanted: Callable[[ScoredRun], bool]) -> list[Contender]:
     """Return the contenders restricted to games whose runs are wanted, those with the most rows
     first. Contenders without such a game are left out."""
     restricted = []
@@ -82,14 +82,14 @@ def label(game: GameName) -> str:
     return game.system + condition + setup
 
 
-def _order(games: Mapping[GameName, Sequence[Run]]) -> tuple[int, int]:
+def _order(games: Mapping[GameName, Sequence[ScoredRun]]) -> tuple[int, int]:
     """Return the sort key of contenders: the most rows first, then the earliest row."""
     runs = [run for group in games.values() for run in group]
     return -sum(len(run.rows) for run in runs), min(run.position for run in runs)
 
 
 def _ratios(
-    games: Mapping[GameName, Sequence[Run]], peer: Mapping[GameName, Sequence[Run]]
+    games: Mapping[GameName, Sequence[ScoredRun]], peer: Mapping[GameName, Sequence[ScoredRun]]
 ) -> dict[GameName, np.ndarray]:
     """Compute `Contender.ratios` of a contender's games."""
     ratios = {}

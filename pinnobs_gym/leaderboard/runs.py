@@ -13,7 +13,7 @@ from pinnobs_gym.scoring.rows import Row, game_of
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class ScoredRun:
     """The episodes of one game that one estimator played with one configuration."""
 
     game: GameName
@@ -48,17 +48,17 @@ class Run:
         return standing(self.rows)
 
 
-def runs_of(rows: Iterable[Row]) -> list[Run]:
+def runs_of(rows: Iterable[Row]) -> list[ScoredRun]:
     """Group scored episodes into runs, in the order of their first rows."""
-    runs: dict[tuple[GameName, str, str, str], Run] = {}
+    runs: dict[tuple[GameName, str, str, str], ScoredRun] = {}
     for position, row in enumerate(rows):
         key = (game_of(row), row["game_hash"], row["estimator"], row["estimator_hash"])
         if key not in runs:
-            runs[key] = Run(key[0], [], position)
+            runs[key] = ScoredRun(key[0], [], position)
         runs[key].rows.append(row)
     return list(runs.values())
 
 
-def rows_of(runs: Iterable[Run]) -> list[Row]:
+def rows_of(runs: Iterable[ScoredRun]) -> list[Row]:
     """Return the rows of all these runs."""
     return list(chain.from_iterable(run.rows for run in runs))

@@ -11,7 +11,7 @@ import numpy as np
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.intervals import Interval
-from pinnobs_gym.leaderboard.runs import Run
+from pinnobs_gym.leaderboard.runs import ScoredRun
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.scoring.rows import Row, game_of
 
@@ -31,9 +31,9 @@ class Table:
         return ", ".join(self.game)
 
 
-def tables(runs: Iterable[Run], failures: Iterable[Row] = ()) -> list[Table]:
+def tables(runs: Iterable[ScoredRun], failures: Iterable[Row] = ()) -> list[Table]:
     """Return a table per game, including games with failures only; failed jobs are in the notes."""
-    played: dict[GameName, list[Run]] = defaultdict(list)
+    played: dict[GameName, list[ScoredRun]] = defaultdict(list)
     for run in runs:
         played[run.game].append(run)
     failed: dict[GameName, list[str]] = defaultdict(list)
@@ -43,7 +43,7 @@ def tables(runs: Iterable[Run], failures: Iterable[Row] = ()) -> list[Table]:
     return [table(game, played[game], failed[game]) for game in games]
 
 
-def table(game: GameName, runs: Iterable[Run], notes: Sequence[str] = ()) -> Table:
+def table(game: GameName, runs: Iterable[ScoredRun], notes: Sequence[str] = ()) -> Table:
     """Return the table of a game's runs, with notes. Within a track, estimators are sorted by
     median NRMSE over the whole episode, with diverged episodes as infinite."""
     runs = list(runs)
@@ -59,7 +59,7 @@ def _failed(row: Row) -> str:
     return f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}."
 
 
-def _uneven(runs: Sequence[Run]) -> str:
+def _uneven(runs: Sequence[ScoredRun]) -> str:
     """Return a warning if estimators of one track were not run on the same episodes."""
     for track in dict.fromkeys(run.track for run in runs):
         episodes = {

@@ -11,6 +11,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.scoring.metrics import by_sample, window
+from pinnobs_gym.simulation.matrices import moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import Setup, System, vector
@@ -156,7 +157,7 @@ def exact_bayes(
     while start < n:
         # Importance weights of the initial states given all outputs up to the last sample.
         weight = _reweighted(system, record, R, x0, log_weight, (start, min(stop, n)), result)
-        mean, cov = _moments(weight, x0)
+        mean, cov = moments(weight, x0)
         # Student proposal at their mean, wider than their covariance.
         spread = np.linalg.cholesky(2.0 * cov + 1e-18 * np.diag((high - low) ** 2))
         student = rng.standard_normal((draws, 1, nx, 1))
@@ -205,17 +206,9 @@ def _reweighted(
             weight = np.exp(log_weight - log_weight.max(axis=0))
             # Normalise, and store the moments and the effective sample size.
             weight /= weight.sum(axis=0)
-            result.mean[:, k], result.cov[:, k] = _moments(weight, x)
+            result.mean[:, k], result.cov[:, k] = moments(weight, x)
             result.ess[:, k] = 1 / (weight**2).sum(axis=0)
     return weight
-
-
-def _moments(weight: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weighted means (batch, nx) and covariances (batch, nx, nx) of x (draws, batch,
-    nx)."""
-    mean = np.einsum("nb,nbi->bi", weight, x)
-    error = x - mean
-    return mean, np.einsum("nb,nbi,nbj->bij", weight, error, error, optimize=True)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
 from pinnobs_gym.scoring.playing import Played, play
@@ -215,9 +216,8 @@ def make_estimator(
     cls = ESTIMATORS.resolve(estimator)
     if cls.needs_training is not None:
         name = ESTIMATORS.name_of(cls)
-        raise ValueError(
-            f"estimator {name!r} has to be trained first: pinnobs train {cls.needs_training}"
-        )
+        trainer = TRAINERS.spec_of(trainer_class(cls))
+        raise ValueError(f"estimator {name!r} has to be trained first: pinnobs train {trainer}")
     try:
         return cls.for_setup(system, setup, **options)
     except TypeError as error:

@@ -15,7 +15,7 @@ import numpy as np
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.code_hash import Unreadable, code_hash, content, digest
 from pinnobs_gym.simulation.system import System
 
@@ -45,18 +45,17 @@ def estimator_code(cls: type[BaseEstimator]) -> str:
     """Return the hash of the code of an estimator and, if it trains on each record, of its trainer;
     ``unreadable`` if the code cannot be read."""
     try:
-        trainer = cls.trains_on_record
-        return code_hash(cls, *(() if trainer is None else (TRAINERS.resolve(trainer),)))
+        return code_hash(cls, *(() if cls.trains_on_record is None else (trainer_class(cls),)))
     except Unreadable:
         return "unreadable"
 
 
-def training_code(trainer: str, source: EpisodeSource) -> str:
+def training_code(trainer: type, source: EpisodeSource) -> str:
     """Return the hash of what a trained estimator depends on beside the settings: the code of its
     trainer, and that of the episodes. If it cannot be read, the hash is another each time."""
     try:
         return code_hash(
-            TRAINERS.resolve(trainer),
+            trainer,
             type(source.system),
             "pinnobs_gym.envs.episodes",
             "pinnobs_gym.training.loop",

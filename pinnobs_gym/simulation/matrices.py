@@ -111,6 +111,14 @@ def product(a: Array, b: Array) -> Array:
     return (a[:, :, None] * b[None]).sum(1)
 
 
+def moments(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted means (batch, n) and covariances (batch, n, n) of points x (num_points,
+    batch, n) with weights (num_points, batch), which sum to one. Here the batch is first."""
+    mean = np.einsum("mb,mbi->bi", weights, x)
+    deviations = (x - mean).transpose(2, 0, 1)
+    return mean, np.einsum("imb,jmb->bij", weights * deviations, deviations)
+
+
 @lru_cache(maxsize=16)
 def identity(size: int, batch: int) -> np.ndarray:
     """Return read-only identity matrices, shape (size, size, batch)."""

@@ -70,7 +70,7 @@ class ReverseDuffing(System):
         return matrix(x, [[1.0, 0.0]])
 
     def admissible(self, x0: Array) -> Array:
-        """States neither at rest nor of more energy than tested: 0.25 ≤ H ≤ 2.5."""
+        """Energy in the tested range: 0.25 ≤ H ≤ 2.5."""
         energy = self.invariants(x0)[..., 0]
         return (energy >= 0.25) & (energy <= 2.5)
 

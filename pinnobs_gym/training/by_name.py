@@ -16,14 +16,17 @@ from pinnobs_gym.training.trainer import Trainer, first_episode
 
 
 def trainer_of(
-    name: str, config: TrainingConfig, game: Game, episode: int | None = None
+    name: str | type[Trainer[Any, Any]],
+    config: TrainingConfig,
+    game: Game,
+    episode: int | None = None,
 ) -> Trainer[Any, Any]:
     """Create the trainer of a name for a game, ready for its first iteration.
 
     It is given the record of ``config.records`` episodes, or the game itself if that is 0.
 
     Args:
-        name: name of the trainer.
+        name: name, ``module:Class`` or class of the trainer.
         config: its Config.
         game: source of the episodes.
         episode: seed of the first episode; `first_episode` of the training seed if None.
@@ -40,12 +43,16 @@ def trainer_of(
 
 
 def train_by_name(
-    name: str, config: TrainingConfig, game: Game, episode: int | None = None, **options: Any
+    name: str | type[Trainer[Any, Any]],
+    config: TrainingConfig,
+    game: Game,
+    episode: int | None = None,
+    **options: Any,
 ) -> Trained:
     """Train with the trainer of a name, and return the trained object; see `trainer_of`.
 
     Args:
-        name: name of the trainer.
+        name: name, ``module:Class`` or class of the trainer.
         config: its Config.
         game: source of the episodes.
         episode: seed of the first episode; `first_episode` of the training seed if None.

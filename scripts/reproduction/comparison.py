@@ -92,9 +92,9 @@ class Comparison:
             "the network's own x̂(t). pinn_obs_replay is the observer with the learned L(t) on the "
             "same record, online; its gain is trained to transfer, where the recipe can. The KKL "
             "observers are each trained once, on simulated episodes of the benchmark's set with "
-            "their true states, without noise, and run online on every record from z₀ = 0; T* is "
-            "not told the time. Training is CPU seconds of one thread, for PINN-Obs those of one "
-            "record (the median).",
+            "their true states, without noise, and run online on every record from z₀ = 0; time "
+            "is not an input of T*. Training is CPU seconds of one thread, for PINN-Obs those of "
+            "one record (the median).",
             "The paper's: one bar for each method and metric. It does not state its initial "
             "states, z₀, window or noise, and whether they are of one record; its figures of "
             "PINN-Obs cannot include the sample at t₀ (see the table of examples).",

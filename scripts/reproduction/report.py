@@ -13,7 +13,7 @@ import numpy as np
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.systems import SYSTEMS
-from reproduction.running import REPEATS, SETUP, Job
+from reproduction.running import REPEATS, SETUP, PaperJob
 from reproduction.tables import Case, Printed, Table, recipe
 
 HEADER = (
@@ -89,9 +89,9 @@ def read(path: Path) -> list[Row]:
 def of_case(case: Case, rows: Iterable[Row]) -> list[Row]:
     """Return the rows of a case, of any table, ordered by preset, seed and budget."""
 
-    def job(row: Row) -> Job:
+    def job(row: Row) -> PaperJob:
         free = {name: row["config"][name] for name in ("seed", "budget")}
-        return Job(case, row["preset"], recipe(row["preset"], case, **free), Path())
+        return PaperJob(case, row["preset"], recipe(row["preset"], case, **free), Path())
 
     def order(row: Row) -> tuple[str, int, float]:
         return row["preset"], row["config"]["seed"], _budget(row)
@@ -99,7 +99,7 @@ def of_case(case: Case, rows: Iterable[Row]) -> list[Row]:
     return sorted((row for row in rows if job(row).key == row["key"]), key=order)
 
 
-def is_done(job: Job, rows: Iterable[Row]) -> bool:
+def is_done(job: PaperJob, rows: Iterable[Row]) -> bool:
     """Return whether the result of a job is known.
 
     It is known from the job's own row, or from a training with another budget that finished within

@@ -37,7 +37,7 @@ CHECKPOINT = "checkpoint.pt"
 
 
 @dataclass(frozen=True)
-class Job:
+class PaperJob:
     """The training of a case."""
 
     case: Case
@@ -94,7 +94,7 @@ def _digest(case: Case, config: PinnObsConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def run(job: Job, progress: bool = False) -> Row:
+def run(job: PaperJob, progress: bool = False) -> Row:
     """Train a case, from its checkpoint if it has one, draw its figures, and measure.
 
     Returns:
@@ -142,12 +142,12 @@ def run(job: Job, progress: bool = False) -> Row:
     }
 
 
-def _game(job: Job) -> Game:
+def _game(job: PaperJob) -> Game:
     """Return the game of the paper's setup."""
     return Game.of(job.case.system, SETUP)
 
 
-def _scores(job: Job, game: Game, trained: TrainedNetwork) -> Row:
+def _scores(job: PaperJob, game: Game, trained: TrainedNetwork) -> Row:
     """Score the network and its replay, and draw a figure of each."""
     scores: Row = {}
     for prefix, picture, cls in (

@@ -250,9 +250,9 @@ def test_a_failed_job_is_told_left_out_and_tried_again_if_asked(folder, capsys):
         "from pinnobs_gym.estimators.ekf import EKF\n"
         "class Broken(EKF):\n"
         "    name = 'broken'\n"
-        "    def update(self, state, t, y, u):\n"
+        "    def correct(self, state, t, y, u):\n"
         "        if Path('mended').exists():\n"
-        "            return super().update(state, t, y, u)\n"
+        "            return super().correct(state, t, y, u)\n"
         "        raise RuntimeError('out of luck')\n"
     )
     estimators = ["--estimators", "failing_module:Broken", "ekf"]
@@ -293,7 +293,7 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert len(list(Path("tr").glob("*.png"))) == 4
     before = trained.read_bytes()
     assert run("train", "pinn_obs", *where, *small) == 2
-    assert "is there already; --resume goes on with it" in capsys.readouterr().err
+    assert "already exists; --resume continues it" in capsys.readouterr().err
     assert trained.read_bytes() == before
     assert run("train", "pinn_obs", *where, *small[:4], "--iterations", "30", "--resume") == 0
     assert "after 30 iterations" in capsys.readouterr().out
@@ -327,18 +327,18 @@ def test_an_estimators_fault_is_one_line(folder, capsys):
         "from pinnobs_gym.estimators.ekf import EKF\n"
         "class Faulty(EKF):\n"
         "    name = 'faulty'\n"
-        "    def update(self, state, t, y, u):\n"
+        "    def correct(self, state, t, y, u):\n"
         "        {}['missing']\n"
         "class Forgetful(EKF):\n"
         "    name = 'forgetful'\n"
-        "    def update(self, state, t, y, u):\n"
+        "    def correct(self, state, t, y, u):\n"
         "        pass\n"
     )
     where = ["evaluate", "--system", "Academic", "--episodes", "1"]
     assert run(*where, "--estimator", "faulty_module:Faulty") == 1
     assert "error: KeyError: 'missing' (PINNOBS_TRACEBACK=1 shows" in capsys.readouterr().err
     assert run(*where, "--estimator", "faulty_module:Forgetful") == 2
-    assert "Forgetful.update returned NoneType; expected a State" in capsys.readouterr().err
+    assert "Forgetful.correct returned NoneType; expected a State" in capsys.readouterr().err
 
 
 def test_a_recipe_can_be_set(folder, capsys):

@@ -323,15 +323,15 @@ class WholeRecordMean(EKF):
 class Sticky(EKF):
     """Takes a missing sample into its estimate."""
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().correct(state, t, y, u)
         return replace(new, xhat=new.xhat + 0.0 * y.sum(axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True)
 class Coupled(EKF):
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().correct(state, t, y, u)
         return replace(new, xhat=new.xhat + 1e-6 * new.xhat.mean(axis=0))
 
 
@@ -339,16 +339,16 @@ class Coupled(EKF):
 class ResetsAll(EKF):
     """One row that diverges takes all others with it."""
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().correct(state, t, y, u)
         far = abs(y).max(initial=0.0, where=np.isfinite(y)) > 1e100 or np.isinf(y).any()
         return replace(new, xhat=np.zeros_like(new.xhat)) if far else new
 
 
 @dataclass(frozen=True)
 class Raises(EKF):
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().correct(state, t, y, u)
         if not np.isfinite(new.xhat).all():
             raise FloatingPointError("diverged")
         return new
@@ -363,15 +363,15 @@ class Random(EKF):
 
 @dataclass(frozen=True)
 class OverwritesOutputs(EKF):
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         y[np.isnan(y)] = 0.0
-        return super().update(state, t, y, u)
+        return super().correct(state, t, y, u)
 
 
 @dataclass(frozen=True)
 class OverwritesPrior(OpenLoop):
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        new = super().predict(state, t, u)
         state.xhat[...] = new.xhat
         return replace(new, xhat=state.xhat)
 
@@ -381,26 +381,26 @@ class OverwritesState(OpenLoop):
     def reset(self, prior: Prior) -> State:
         return State(prior.mean.copy())
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        new = super().predict(state, t, u)
         state.xhat[...] = new.xhat
         return replace(new, xhat=state.xhat)
 
 
 @dataclass(frozen=True)
 class WrongShape(EKF):
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        new = super().update(state, t, y, u)
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        new = super().correct(state, t, y, u)
         return replace(new, S=np.zeros((len(y), 2 * y.shape[-1])))
 
 
 @dataclass(frozen=True)
 class RegularOnly(EKF):
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         dt = self.system.setups["benchmark"].dt
         if state.t is not None and abs(t - state.t - dt) > 1e-9:
             raise ValueError("irregular")
-        return super().update(state, t, y, u)
+        return super().correct(state, t, y, u)
 
 
 @dataclass(frozen=True)
@@ -431,8 +431,8 @@ class LosesCovariance(EKF):
 class Standing(OpenLoop):
     """Stays where the prior is, whatever the model says."""
 
-    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        return State(state.xhat, t, u)
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        return state
 
 
 @dataclass(frozen=True)
@@ -453,6 +453,39 @@ class ExemptWithoutReason(EKF):
 @dataclass(frozen=True)
 class ExemptFromSayingSo(EKF):
     exempt_from: ClassVar = {"exemptions": "it is free"}
+
+
+@dataclass(frozen=True)
+class ExemptByNone(EKF):
+    exempt_from: Any = None
+
+
+@dataclass(frozen=True)
+class ExemptByList(EKF):
+    exempt_from: ClassVar[Any] = ["model_alone"]
+
+
+@dataclass(frozen=True)
+class ExemptByWord(EKF):
+    exempt_from: ClassVar[Any] = "model_alone"
+
+
+@dataclass(frozen=True)
+class SavesOnly(EKF):
+    def save(self, path: Any) -> None:
+        path.write_text("")
+
+
+@dataclass(frozen=True)
+class LoadsOnly(EKF):
+    @classmethod
+    def load(cls, path: Any, system: System) -> LoadsOnly:
+        return cls(system)
+
+
+@dataclass(frozen=True)
+class TrainedUnsaved(EKF):
+    needs_training = "pinn_gain"
 
 
 class Mutable(EKF):
@@ -526,6 +559,16 @@ def test_sound_estimator_passes(make: Callable[[System], Estimator]) -> None:
             ExemptFromSayingSo,
             "exemptions",
             "exempt_from names 'exemptions'; known are immutable, s",
+        ),
+        (ExemptByNone, "exemptions", "exempt_from=None; expected a mapping from names of checks"),
+        (ExemptByList, "exemptions", r"exempt_from=\['model_alone'\]; expected a mapping"),
+        (ExemptByWord, "exemptions", "exempt_from='model_alone'; expected a mapping"),
+        (SavesOnly, "save_load", "SavesOnly has no load; expected save and load, or neither"),
+        (LoadsOnly, "save_load", "LoadsOnly has no save; expected save and load, or neither"),
+        (
+            TrainedUnsaved,
+            "save_load",
+            "TrainedUnsaved has no save and no load; expected save and load, since it needs",
         ),
         (Coupled, "rows_independent", "row 0 in a batch and alone differ"),
         (ResetsAll, "diverging_row", "other rows with and without outputs of 1e\\+300"),

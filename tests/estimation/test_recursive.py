@@ -46,6 +46,30 @@ def test_the_first_sample_corrects_the_prior_and_each_other_a_prediction():
     np.testing.assert_allclose(found, np.stack(expected, axis=1), rtol=1e-12)
 
 
+def test_an_update_of_its_own_is_refused():
+    with pytest.raises(TypeError, match=r"^Own defines update; expected predict and correct, or"):
+
+        class Own(ConstantGain):
+            def update(self, state, t, y, u):
+                return state
+
+    class Mixin:
+        def update(self, state, t, y, u):
+            return state
+
+    with pytest.raises(TypeError, match=r"^Mixed defines update; expected predict and correct"):
+        type("Mixed", (Mixin, ConstantGain), {})
+
+
+@pytest.mark.parametrize("method", ["predict", "correct"])
+@pytest.mark.parametrize("value", [None, np.zeros((1, 2))], ids=["nothing", "array"])
+def test_a_step_that_returns_no_state_is_named(method, value):
+    wrong = type("Wrong", (ConstantGain,), {method: lambda self, *args: value})
+    kind = type(value).__name__
+    with pytest.raises(TypeError, match=rf"^Wrong\.{method} returned {kind}; expected a State$"):
+        wrong(Linear()).run(linear_record())
+
+
 def test_it_conforms():
     check_estimator(ConstantGain(Linear()))
 

@@ -11,6 +11,7 @@ from edited import EDITS, FILES, write
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.provenance import (
     canonical,
     estimator_code,
@@ -97,10 +98,12 @@ def test_without_a_source_nothing_is_ever_the_same():
 
 def test_a_training_depends_on_its_trainer_and_on_its_plant():
     source = EpisodeSource(ReverseDuffing)
-    own = training_code("pinn_gain", source)
-    assert own == training_code("pinn_gain", EpisodeSource(ReverseDuffing, noise_std=0.1))
-    assert own != training_code("kkl_pinn", source)
-    assert own != training_code("pinn_gain", EpisodeSource("Academic"))
+    own = training_code(TRAINERS.resolve("pinn_gain"), source)
+    assert own == training_code(
+        TRAINERS.resolve("pinn_gain"), EpisodeSource(ReverseDuffing, noise_std=0.1)
+    )
+    assert own != training_code(TRAINERS.resolve("kkl_pinn"), source)
+    assert own != training_code(TRAINERS.resolve("pinn_gain"), EpisodeSource("Academic"))
 
 
 def test_canonical_values_are_plain():

@@ -122,7 +122,7 @@ def weighted():
 def test_a_case_of_two_tables_is_trained_once():
     (wide,) = (case for case in TABLES["depth"].cases if case.name == "9x20")
     (tanh,) = (case for case in TABLES["activation"].cases if case.name == "tanh")
-    jobs = [running.Job(case, "fast", of("fast", case), Path()) for case in (wide, tanh)]
+    jobs = [running.PaperJob(case, "fast", of("fast", case), Path()) for case in (wide, tanh)]
     assert jobs[0].key == jobs[1].key
     assert jobs[0].folder == jobs[1].folder
 

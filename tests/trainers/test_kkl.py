@@ -335,6 +335,11 @@ def a_network(activation="tanh", seed=0):
     return Mlp(*scalings, 2, 7, activation, torch.Generator().manual_seed(seed))
 
 
+def test_a_network_of_unknown_activation_is_refused():
+    with pytest.raises(ValueError, match=r"^activation='sine'; expected one of tanh, silu, relu$"):
+        a_network("sine")
+
+
 @pytest.mark.parametrize("activation", get_args(Activation))
 def test_derivatives_of_the_network(activation):
     net = a_network(activation)

@@ -14,7 +14,12 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS
 from pinnobs_gym.estimation.kalman import update_with
-from pinnobs_gym.estimation.learned.gain_network import Variant, memory_size, shapes
+from pinnobs_gym.estimation.learned.gain_network import (
+    Variant,
+    memory_size,
+    shapes,
+    update_with_network,
+)
 from pinnobs_gym.estimation.learned.trained_file import identity
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
@@ -125,6 +130,27 @@ def test_online_and_training_compute_the_same(name, variant):
     assert (found.P is None) == (variant == "gru")
 
 
+def test_online_and_training_count_a_share_below_zero_as_zero():
+    """HPHᵀ is below zero by rounding alone; the root of its share of S enters the network."""
+    gain, rng = gain_of(ReverseDuffing(), 0.1), np.random.default_rng(0)
+    arrays = (
+        np.ones((2, 1)),
+        rng.standard_normal((2, 1)),
+        np.array([[1.0, 1.0 + 1e-6], [1.0 + 1e-6, 1.0]])[..., None],
+        rng.standard_normal((1, 1)),
+        np.array([[1.0, -1.0]])[..., None],
+        np.full((1, 1, 1), 0.01),
+        np.ones((1, 1)),
+        np.ones((1, 1), dtype=bool),
+    )
+    found = update_with_network(gain.trained.layers, *arrays)
+    weights = [(torch.tensor(W), torch.tensor(b)) for W, b in gain.trained.layers]
+    other = update_with_network(weights, *map(torch.tensor, arrays))
+    for a, b in zip(found, other, strict=True):
+        np.testing.assert_allclose(b.numpy(), a, rtol=1e-12)
+        assert np.isfinite(a).all()
+
+
 def test_a_known_part_of_the_outputs_changes_no_training():
     """Smoothing, streams and held-out episodes see h at each sample's own time and input."""
     _, record, _ = played(Linear, range(10), 2.0)
@@ -190,7 +216,7 @@ def test_on_a_linear_system_P_is_the_covariance_of_any_gain(monkeypatch):
         gains.append(K[..., 0])
         return update_with(K, *others)
 
-    monkeypatch.setattr("pinnobs_gym.estimators.pinn_gain.update_with", spy)
+    monkeypatch.setattr("pinnobs_gym.estimation.learned.gain_network.update_with", spy)
     source, record, _ = played(Linear, range(1))
     system = source.system
     gain = gain_of(system, 1.0, noise_std=(0.1, 0.1))

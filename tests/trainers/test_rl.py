@@ -278,7 +278,10 @@ def test_bad_checkpoints(tmp_path: Path) -> None:
         ({"stack": 3}, "stack=3; expected 1, since there is a prediction"),
         ({"gamma": 1.5}, "gamma=1.5; expected a number from 0 to 1"),
         ({"batch": 500}, "batch=500; expected a divisor of rows·rollout = 4096"),
-        ({"algorithm": "sac"}, "buffer=0; expected a positive whole number with sac; its preset"),
+        (
+            {"algorithm": "sac"},
+            "buffer=0; expected a positive whole number with sac; the preset sac",
+        ),
     ],
 )
 def test_bad_settings(arguments: dict[str, Any], says: str) -> None:

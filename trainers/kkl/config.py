@@ -20,7 +20,7 @@ from pinnobs_gym.estimation.learned.kkl_dynamics import (
 from pinnobs_gym.estimation.learned.kkl_maps import Activation
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
-from trainers.kkl.fitting import Method
+from trainers.kkl.fitting import FitMethod
 from trainers.kkl.labels import frequency
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
@@ -71,7 +71,7 @@ class KKLConfig(TrainingConfig):
     """Neurons in each hidden layer."""
     activation: Activation = "tanh"
     """Activation of the hidden layers."""
-    method: Method = "gauss_newton"
+    method: FitMethod = "gauss_newton"
     """Averaged Gauss-Newton steps, or Adam."""
     learning_rate: float = 0.3
     """Initial step size; it decays as a half cosine."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from pinnobs_gym.estimation.learned.kkl_maps import Mlp
 from pinnobs_gym.estimation.learned.trained_file import with_tensors
 
-Method: TypeAlias = Literal["gauss_newton", "adam"]
+FitMethod: TypeAlias = Literal["gauss_newton", "adam"]
 
 AVERAGE = 0.9
 """Weight of the past in the averaged Gauss-Newton matrix."""
@@ -99,7 +99,7 @@ class Fit:
         self,
         net: Mlp,
         objective: Objective,
-        method: Method,
+        method: FitMethod,
         learning_rate: float,
         generator: torch.Generator,
     ) -> None:

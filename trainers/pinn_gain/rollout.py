@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pinnobs_gym.estimation.kalman import kalman_gain, update_with
 from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
-    corrected_gain,
     recurrent_gain,
-    remembered,
+    update_with_network,
 )
 from pinnobs_gym.simulation.matrices import sandwich
 from pinnobs_gym.simulation.model import model_step_jacobian
@@ -103,14 +101,8 @@ def update(
         sizes = model.scale, model.output_scale
         K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, state.memory)
         return FilterState(xhat + (K * innovation[None]).sum(1), P, memory)
-    # Kalman gain, corrected by the network.
-    K, S = kalman_gain(P, H, R)
-    variance = torch.diagonal(S).T
-    share = 1 - torch.diagonal(R).T / variance
-    args = (xhat, P, innovation, variance, K, share, state.memory)
-    K = corrected_gain(weights, model.scale, *args)
     present = torch.ones_like(innovation, dtype=torch.bool)
-    memory = remembered(state.memory, innovation, variance, present)
-    # Joseph's form, which is valid for any gain.
-    x_after, P = update_with(K, xhat.T, P, innovation.T, H, R)
-    return FilterState(x_after.T, P, memory)
+    xhat, P, _, memory = update_with_network(
+        weights, model.scale, xhat, P, innovation, H, R, state.memory, present
+    )
+    return FilterState(xhat, P, memory)

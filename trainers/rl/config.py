@@ -75,7 +75,7 @@ class RLConfig(TrainingConfig):
         check_setting(self, "log_std", "a finite number", math.isfinite)
         if self.action_mode != "normalized":
             check_setting(self, "stack", "1, since there is a prediction", lambda v: v == 1)
-        hint = f"with {self.algorithm}; its preset says all that goes with it"
+        hint = f"with {self.algorithm}; the preset {self.algorithm} sets all related settings"
         if self.algorithm in _ON_POLICY:
             check_setting(self, "buffer", f"0 {hint}", lambda v: v == 0)
             samples = self.rows * self.rollout

@@ -15,8 +15,8 @@ from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.files import check_writable
-from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.files import check_writable, file_name
+from pinnobs_gym.registry import TRAINERS, trainer_name
 from pinnobs_gym.scoring import acceptance
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.training.by_name import load, trainer_of
@@ -54,23 +54,24 @@ def run(arguments: Sequence[str]) -> int:
     """Train with the trainer named first, and return the command's exit status."""
     if not arguments or arguments[0].startswith("-"):
         raise ValueError(f"name a trainer first: pinnobs train {' | '.join(TRAINERS.sources)}")
-    name = arguments[0]
-    cls = TRAINERS.resolve(name)
-    chosen = _chosen_training(cls, arguments[1:])
+    spec = arguments[0]
+    cls = TRAINERS.resolve(spec)
+    chosen = _chosen_training(cls, spec, arguments[1:])
+    estimators = _estimators_of(cls)
     check_writable(chosen.out)
     game = Game.of(chosen.system, chosen.setup, chosen.condition)
     title = game.name.file_stem
     seed = chosen.config.seed
     episode = first_episode(seed) if chosen.episode is None else chosen.episode
-    stem = chosen.out / f"{title}-{name}-episode{episode}-seed{seed}"
+    stem = chosen.out / f"{title}-{file_name(cls.name)}-episode{episode}-seed{seed}"
     checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
     path = stem.with_name(stem.name + ".pt")
     for earlier in (checkpoint, path):
         if earlier.exists() and not chosen.resume:
             raise ValueError(
-                f"{earlier} is there already; --resume goes on with it, --out names another folder"
+                f"{earlier} already exists; --resume continues it, --out names another folder"
             )
-    trainer = trainer_of(name, chosen.config, game, episode)
+    trainer = trainer_of(cls, chosen.config, game, episode)
     with Log(chosen.out / "tensorboard" / stem.name) as log:
         result = train(trainer, log=log, checkpoint=checkpoint, resume=chosen.resume, progress=True)
     result.save(path)
@@ -84,21 +85,28 @@ def run(arguments: Sequence[str]) -> int:
     )
     for kind in pictures:
         console.print(f"picture: {stem.with_name(f'{stem.name}-{kind}.png')}", soft_wrap=True)
-    for label, kind_of in ESTIMATORS.classes().items():
-        if kind_of.needs_training == name:
-            estimator = load(kind_of, path, game)
-            own = _report_training(label, estimator, game, episode, result.loss)
-            picture = stem.with_name(f"{stem.name}-{label}.png")
-            write_figure(picture, own.figure(f"{label}: {title}"))
-            console.print(f"picture: {picture}", soft_wrap=True)
+    for label, kind_of in estimators.items():
+        estimator = load(kind_of, path, game)
+        own = _report_training(label, estimator, game, episode, result.loss)
+        picture = stem.with_name(f"{stem.name}-{label}.png")
+        write_figure(picture, own.figure(f"{label}: {title}"))
+        console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"trained file: {path}", soft_wrap=True)
     if checkpoint.exists():
-        console.print(f"checkpoint: {checkpoint} (go on with --resume)", soft_wrap=True)
+        console.print(f"checkpoint: {checkpoint} (--resume continues it)", soft_wrap=True)
     console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
     return 0
 
 
-def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> Train[Any]:
+def _estimators_of(trainer: type[Trainer[Any, Any]]) -> dict[str, type[BaseEstimator]]:
+    """Return the estimators that need a trainer, by name: registered ones, and those beside it."""
+    known = {**ESTIMATORS.classes(), **ESTIMATORS.beside(trainer)}
+    return {name: cls for name, cls in known.items() if trainer_name(cls) == trainer.name}
+
+
+def _chosen_training(
+    cls: type[Trainer[Any, Any]], spec: str, arguments: Sequence[str]
+) -> Train[Any]:
     """Parse the command line of a training, with the preset's values as defaults."""
     given = [v for option, values in by_option(arguments) if option == "--preset" for v in values]
     preset = given[0] if given else next(iter(cls.presets))
@@ -106,7 +114,7 @@ def _chosen_training(cls: type[Trainer[Any, Any]], arguments: Sequence[str]) -> 
     kind: Any = Train[type(config)]
     return parse(
         kind,
-        f"train {cls.name}",
+        f"train {spec}",
         arguments,
         default=Train(system=tyro.MISSING, config=config, preset=preset),
         config=(tyro.conf.OmitArgPrefixes,),

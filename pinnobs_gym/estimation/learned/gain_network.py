@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 
 from array_api_compat import array_namespace
 
+from pinnobs_gym.estimation.kalman import kalman_gain, update_with
 from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.simulation.system import Array
 
@@ -95,6 +96,47 @@ def corrected_gain(
     return K * xp.exp(largest * xp.tanh(factor)) + LARGEST_SHIFT * xp.tanh(shift) * (
         sd[:, None] / xp.sqrt(S)
     )
+
+
+def update_with_network(
+    layers: Sequence[tuple[Array, Array]],
+    scale: Array,
+    xhat: Array,
+    P: Array,
+    innovation: Array,
+    H: Array,
+    R: Array,
+    memory: Array,
+    present: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Apply the Kalman update with the gains of `corrected_gain`.
+
+    The batch is the last axis of all arrays.
+
+    Args:
+        layers: weights and biases of a tanh network, see `shapes`.
+        scale: the system's scale, shape (nx, 1).
+        xhat: predictions, shape (nx, batch).
+        P: covariances of the predictions, shape (nx, nx, batch).
+        innovation: y − h(t, x̂, u), shape (ny, batch); zero for a missing output.
+        H: output Jacobians, shape (ny, nx, batch); zero for a missing output.
+        R: covariance of the output noise, shape (ny, ny, batch or 1).
+        memory: moving averages of squared normalised innovations, shape (ny, batch).
+        present: which outputs are present, bool, shape (ny, batch).
+
+    Returns:
+        Estimates (nx, batch), their covariances (nx, nx, batch), the covariances of the innovations
+        (ny, ny, batch), and the next moving averages (ny, batch).
+    """
+    xp = array_namespace(innovation)
+    K, S = kalman_gain(P, H, R)
+    variance = _diagonal(S)
+    share = 1 - _diagonal(R) / variance
+    share = xp.where(share < 0, xp.zeros_like(share), share)  # below zero by rounding alone
+    K = corrected_gain(layers, scale, xhat, P, innovation, variance, K, share, memory)
+    memory = remembered(memory, innovation, variance, present)
+    after, P = update_with(K, xhat.T, P, innovation.T, H, R)
+    return after.T, P, S, memory
 
 
 def remembered(memory: Array, innovation: Array, S: Array, present: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, TypeAlias
@@ -52,6 +53,19 @@ class Scaling:
         return Scaling(np.concatenate([self.mean, other.mean]), root)
 
 
+def _silu_slope(pre: Tensor) -> Tensor:
+    gate = torch.sigmoid(pre)
+    return gate * (1 + pre * (1 - gate))
+
+
+_SLOPES: dict[str, Callable[[Tensor], Tensor]] = {
+    "tanh": lambda pre: 1 - torch.tanh(pre).square(),
+    "silu": _silu_slope,
+    "relu": lambda pre: (pre > 0).to(pre.dtype),
+}
+"""Derivatives of the activations of `Activation`, by name."""
+
+
 class Mlp:
     """Multilayer perceptron between scaled inputs and scaled outputs.
 
@@ -66,6 +80,9 @@ class Mlp:
         generator: random generator of the weights.
         dtype: precision.
         device: device of the parameters.
+
+    Raises:
+        ValueError: in one line, if the activation is unknown.
     """
 
     def __init__(
@@ -79,6 +96,9 @@ class Mlp:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
+        if activation not in _SLOPES:
+            expected = ", ".join(_SLOPES)
+            raise ValueError(f"activation={activation!r}; expected one of {expected}")
         self.inputs, self.outputs = inputs, outputs
         self.activation = activation
         sizes = [len(inputs.mean), *[width] * depth, len(outputs.mean)]
@@ -138,12 +158,8 @@ class Mlp:
         return both
 
     def _slope(self, pre: Tensor) -> Tensor:
-        if self.activation == "tanh":
-            return 1 - torch.tanh(pre).square()
-        if self.activation == "silu":
-            gate = torch.sigmoid(pre)
-            return gate * (1 + pre * (1 - gate))
-        return (pre > 0).to(pre.dtype)
+        """Return the derivative of the activation."""
+        return _SLOPES[self.activation](pre)
 
     def layers(self) -> Layers:
         """Return a copy of the weights for `perceptron`, with the scalings merged into the first

@@ -17,6 +17,7 @@ from pinnobs_gym.estimation.learned.trained_file import (
     with_tensors,
     write,
 )
+from pinnobs_gym.registry import trainer_name
 from pinnobs_gym.simulation.system import System
 
 Ending: TypeAlias = Literal["running", "finished", "budget", "interrupted"]
@@ -152,7 +153,7 @@ class LearnedEstimator(ABC):
         If it uses the output noise, that given to its trainer is taken.
         """
         kind: type[Trained] = get_type_hints(cls)["trained"]
-        trained = kind.load(path, system, cls.needs_training)
+        trained = kind.load(path, system, trainer_name(cls))
         made: Any = cls
         noise_std = trained.noise_std if "noise" in cls.knows else None
         return made(system, noise_std, trained=trained)

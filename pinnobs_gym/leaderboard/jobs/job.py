@@ -13,6 +13,8 @@ from typing import Any, Self
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.files import file_name
+from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.evaluation import Results, StoredKey, make_estimator, run_episodes
 from pinnobs_gym.scoring.provenance import (
@@ -72,9 +74,9 @@ class Job:
         aside = ("folder", "known", "fresh", "failed")
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in aside}
         cls = ESTIMATORS.resolve(self.estimator)
-        trainer = cls.needs_training
         code = [game_hash(self.game.source), estimator_code(cls)]
-        code += [] if trainer is None else [training_code(trainer, self.game.source)]
+        if cls.needs_training is not None:
+            code.append(training_code(trainer_class(cls), self.game.source))
         return _digest({**own, "code": code})
 
     def run(self) -> None:
@@ -119,10 +121,11 @@ def run_job(job: Job) -> None:
     options = dict(job.settings)
     chosen: BaseEstimator | type[BaseEstimator] = cls
     if cls.trains_on_record is not None:
+        trainer = trainer_class(cls)
         recipe = cls.trainer_config(job.training)
         stem = job.game.name.file_stem
-        code = training_code(cls.trains_on_record, job.game.source)
-        place = f"{stem}-{cls.trains_on_record}-{_digest([recipe, code])}-episode{job.seed}"
+        code = training_code(trainer, job.game.source)
+        place = f"{stem}-{file_name(trainer.name)}-{_digest([recipe, code])}-episode{job.seed}"
         options = {"config": recipe, "folder": job.folder / "trained" / place}
     elif cls.needs_training is not None:
         chosen = trained(cls, job)
@@ -139,14 +142,14 @@ def run_job(job: Job) -> None:
 def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:
     """Return the estimator trained on nominal episodes that are never scored; load it if it was
     trained before."""
-    name, game = str(cls.needs_training), job.game.nominal
+    trainer, game = trainer_class(cls), job.game.nominal
     recipe = cls.trainer_config(job.training)
-    code = training_code(name, game.source)
-    label = f"{game.name.file_stem}-{name}-{_digest([recipe, code])}"
+    code = training_code(trainer, game.source)
+    label = f"{game.name.file_stem}-{file_name(trainer.name)}-{_digest([recipe, code])}"
     path = job.folder / "trained" / f"{label}.pt"
     if not path.exists():
         with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = train_by_name(name, recipe, game, log=log)
+            result = train_by_name(trainer, recipe, game, log=log)
         if not path.exists():  # of two simultaneous trainings, the first counts
             result.save(path)
     return load(cls, path, job.game)

@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
+from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
 from pinnobs_gym.scoring.rows import Stored, game_of
 from pinnobs_gym.simulation.conditions import fitting
@@ -48,13 +49,13 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
             raise suite.wrong("estimators", message)
     quick, long = [], []
     for system in suite.systems or tuple(SYSTEMS.classes()):
-        for table, (entry, cls) in product(_tables(suite, system), chosen):
+        for planned, (entry, cls) in product(_planned_games(suite, system), chosen):
             if cls.needs_training or cls.trains_on_record:
-                if not table.untrained_only:
-                    long += _learning(suite, entry, cls, table.game, folder)
+                if not planned.untrained_only:
+                    long += _learning(suite, entry, cls, planned.game, folder)
             else:
-                _check_settings(suite, entry, cls, table.game, {})
-                quick.append(_job(suite, entry, table.game, folder, settings=entry.settings))
+                _check_settings(suite, entry, cls, planned.game, {})
+                quick.append(_job(suite, entry, planned.game, folder, settings=entry.settings))
     return long + quick
 
 
@@ -127,10 +128,15 @@ def _class(suite: Suite, entry: Entry) -> type[BaseEstimator]:
             raise ValueError(f"estimator {entry.name!r} knows one record; it cannot be ranked")
     except ValueError as error:
         raise suite.wrong("estimators", error) from error
+    if cls.needs_training or cls.trains_on_record:
+        try:
+            trainer_class(cls)
+        except ValueError as error:
+            raise suite.wrong("estimators", f"trainer of {entry.name!r}: {error}") from error
     return cls
 
 
-def _tables(suite: Suite, system: str) -> list[PlannedGame]:
+def _planned_games(suite: Suite, system: str) -> list[PlannedGame]:
     """Return the games of a system in a suite."""
     try:
         cls = SYSTEMS.resolve(system)
@@ -148,14 +154,14 @@ def _tables(suite: Suite, system: str) -> list[PlannedGame]:
         names = dict.fromkeys([*ranked, *fitting(model, setup)])
     else:
         names, ranked = suite.conditions or ranked, list(suite.conditions or ranked)
-    tables: dict[GameName, PlannedGame] = {}
+    planned: dict[GameName, PlannedGame] = {}
     for name in names:
         try:
             game = Game.of(cls, suite.setup, name)
         except ValueError as error:
             raise suite.wrong("conditions", f"{name!r} on {system}: {error}") from error
-        tables[game.name] = PlannedGame(game, name not in ranked)
-    return list(tables.values())
+        planned[game.name] = PlannedGame(game, name not in ranked)
+    return list(planned.values())
 
 
 def _check_settings(

@@ -10,7 +10,7 @@ from pathlib import Path
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.contenders import Contender
-from pinnobs_gym.leaderboard.runs import Run, rows_of
+from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
 from pinnobs_gym.leaderboard.site.columns import Columns
 from pinnobs_gym.leaderboard.site.over_episodes import ratios, settling
 from pinnobs_gym.leaderboard.site.over_samples import States, errors, reference, states
@@ -18,7 +18,7 @@ from pinnobs_gym.leaderboard.standings_table import Table
 from pinnobs_gym.scoring import curves
 from pinnobs_gym.scoring.curves import Curves
 
-Players = Mapping[str, Sequence[Run]]
+Players = Mapping[str, Sequence[ScoredRun]]
 """Runs of one game by the contender's name."""
 
 
@@ -53,7 +53,7 @@ def games_of(contenders: Iterable[Contender], folders: Sequence[Path]) -> list[G
     Raises:
         ValueError: in one line, if a file of curves is damaged.
     """
-    played: dict[GameName, dict[str, Sequence[Run]]] = defaultdict(dict)
+    played: dict[GameName, dict[str, Sequence[ScoredRun]]] = defaultdict(dict)
     for contender in contenders:
         for game, runs in contender.games.items():
             if runs[0].ranked or game.condition == "nominal":

@@ -8,7 +8,7 @@ from typing import Any
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import Contender
-from pinnobs_gym.leaderboard.runs import Run, rows_of, runs_of
+from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.standings import training_of
 from pinnobs_gym.scoring.rows import Row, Stored, game_of
 
@@ -113,18 +113,18 @@ def versions(rows: Iterable[Row]) -> dict[str, str]:
     return {name: ", ".join(sorted(those)) for name, those in sorted(by_package.items())}
 
 
-def commands(runs: Iterable[Run]) -> list[str]:
+def commands(runs: Iterable[ScoredRun]) -> list[str]:
     """Return command lines that reproduce these runs: one per setup for the default conditions, and
     one per set of other conditions for the systems played under it. They may produce more rows,
     since every named estimator plays every named system."""
-    usual: dict[str, list[Run]] = {}
-    others: dict[tuple[str, str], list[Run]] = {}
+    usual: dict[str, list[ScoredRun]] = {}
+    others: dict[tuple[str, str], list[ScoredRun]] = {}
     for run in runs:
         if run.ranked or run.game.condition == "nominal":
             usual.setdefault(run.game.setup, []).append(run)
         else:
             others.setdefault((run.game.setup, run.game.env_id), []).append(run)
-    alike: dict[tuple[str, ...], list[Run]] = {}
+    alike: dict[tuple[str, ...], list[ScoredRun]] = {}
     for (setup, _), some in others.items():
         played = {run.game.condition for run in some}
         alike.setdefault((setup, *sorted(played)), []).extend(some)
@@ -132,7 +132,7 @@ def commands(runs: Iterable[Run]) -> list[str]:
     return lines + [_command(some, conditions) for (_, *conditions), some in alike.items()]
 
 
-def _command(runs: Sequence[Run], conditions: Sequence[str] = ()) -> str:
+def _command(runs: Sequence[ScoredRun], conditions: Sequence[str] = ()) -> str:
     rows = rows_of(runs)
     words = ["pinnobs leaderboard"]
     systems = {run.game.system.rpartition("-v")[0] for run in runs}
