@@ -36,6 +36,11 @@ class Line:
     """Median over games."""
 
     @property
+    def knows(self) -> str:
+        """The information given to it, the most in any of its games."""
+        return max((standing.knows for standing in self.games.values()), key=len, default="")
+
+    @property
     def known_ratio(self) -> float:
         """The ratio; infinite if it is missing or undefined."""
         return np.inf if self.ratio is None or np.isnan(self.ratio.value) else self.ratio.value

@@ -27,14 +27,17 @@ NOTE = (
 def cells(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
     """Return the overview's header and rows as text."""
     games = sorted({game for line in found for game in line.games}, key=label)
-    header = ["estimator", "track", "/ ekf", "better", *map(label, games), "µs/step"]
+    header = ["estimator", "track", "/ ekf", "better", *map(label, games), "µs/step", "knows"]
     rows = []
     for line in found:
         shown = [_cell(line.games.get(game)) for game in games]
         ratio = "" if line.ratio is None else _factor(line.ratio)
         better = "" if line.better is None else f"{100 * line.better.value:.0f} %"
         rows.append(
-            [line.estimator, line.track, ratio, better, *shown, number(line.us_per_step, 2)]
+            [
+                *(line.estimator, line.track, ratio, better, *shown),
+                *(number(line.us_per_step, 2), line.knows),
+            ]
         )
     return header, rows
 

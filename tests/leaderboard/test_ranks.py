@@ -54,13 +54,13 @@ def test_lines_by_hand():
 def test_cells_by_hand():
     header, shown = ranks_table.cells(lines(played()))
     columns = ["estimator", "track", "/ ekf", "better", "Motor-v0 (load_step)", "X-v0", "µs/step"]
-    assert header == columns
+    assert header == [*columns, "knows"]
     assert shown[0][4:6] == ["0.05, div 25 %", "0.5"]
     assert shown[2][4:6] == ["0.1", "div 100 %"]
     assert shown[3][4:6] == ["", "0.25"]
     assert shown[0][3] == "88 %"
     text = markdown(board(Stored(played(), [])))
-    assert "| half | online | 0.5 (0.5-∞) | 88 % | 0.05, div 25 % | 0.5 | 1 |" in text
+    assert "| half | online | 0.5 (0.5-∞) | 88 % | 0.05, div 25 % | 0.5 | 1 | model |" in text
 
 
 def test_settings_and_budgets_are_told_apart_and_training_seeds_are_not():
