@@ -425,6 +425,8 @@ NOISE_FLOOR = 1e-3
 
 _TIMES = 9
 """Number of times, evenly spread over an episode, at which `output_scale` evaluates the output."""
+_MOST_DRAWS = 100
+"""How often ten states for each wanted one are drawn from a box."""
 _STATES = 16
 """Number of initial states at which it does."""
 
@@ -454,10 +456,15 @@ def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
     low, high = (vector(getattr(setup, n), system.nx, n) for n in ("x0_low", "x0_high"))
     if setup.fixed_x0:
         return np.repeat(low[None], count, axis=0)
-    drawn = np.random.default_rng(0).uniform(low, high, (1000 * count, system.nx))
-    x0 = drawn[np.asarray(system.admissible(drawn))][:count]
+    rng, x0 = np.random.default_rng(0), np.empty((0, system.nx))
+    for _ in range(_MOST_DRAWS):
+        if len(x0) >= count:
+            break
+        drawn = rng.uniform(low, high, (10 * count, system.nx))
+        x0 = np.concatenate([x0, drawn[np.asarray(system.admissible(drawn))]])
     if len(x0) < count:
         raise ValueError(
-            f"{type(system).__name__}: {len(x0)} of {len(drawn)} states of the box are admissible"
+            f"{type(system).__name__}: {len(x0)} of {_MOST_DRAWS * 10 * count} states of the box "
+            "are admissible"
         )
-    return x0
+    return x0[:count]
