@@ -320,30 +320,3 @@ def _scaled_broyden(b: float, h: float, n: int) -> tuple[float, float]:
     root = abs(sigma) ** (-1 / (n - 1)) if n > 1 and sigma else 1.0
     tau = min(rho * root, sigma) if theta <= 0 else rho * min(root, 1 / theta)
     return (1 - theta) / sigma, tau
-
-
-def minimise(
-    objective: Objective,
-    x: np.ndarray,
-    *,
-    iterations: int = 1000,
-    tolerance: float = 1e-8,
-    curvature: float = CURVATURE,
-    watch: Callable[[QuasiNewton], None] = lambda state: None,
-) -> QuasiNewton:
-    """Minimise from x (n,) until the largest component of the gradient is within the tolerance.
-
-    Args:
-        objective: the function and its gradient.
-        x: initial point.
-        iterations: largest number of iterations.
-        tolerance: tolerance of the gradient's components.
-        curvature: c₂ of the line search.
-        watch: called after each iteration.
-    """
-    state = QuasiNewton.start(objective, x, curvature)
-    for _ in range(iterations):
-        if abs(state.gradient).max() <= tolerance or not state.step(objective):
-            break
-        watch(state)
-    return state

@@ -3,7 +3,25 @@ import pytest
 from scipy.optimize import minimize, rosen, rosen_der
 
 from trainers.pinn_obs import quasi_newton
-from trainers.pinn_obs.quasi_newton import CURVATURE, SUFFICIENT_DECREASE, QuasiNewton, minimise
+from trainers.pinn_obs.quasi_newton import CURVATURE, SUFFICIENT_DECREASE, QuasiNewton
+
+
+def minimise(
+    objective,
+    x,
+    *,
+    iterations=1000,
+    tolerance=1e-8,
+    curvature=CURVATURE,
+    watch=lambda state: None,
+):
+    """Iterate until the largest component of the gradient is within the tolerance."""
+    state = QuasiNewton.start(objective, x, curvature)
+    for _ in range(iterations):
+        if abs(state.gradient).max() <= tolerance or not state.step(objective):
+            break
+        watch(state)
+    return state
 
 
 def rosenbrock(x):
