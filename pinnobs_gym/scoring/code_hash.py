@@ -164,17 +164,30 @@ def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
     return code, imports
 
 
-def _shape(node: Any) -> Any:
+def _shape(node: Any) -> list[str]:
     """Return the shape of a syntax tree: no positions, no docstrings, no empty fields, which
     differ between versions of Python."""
+    shape: list[str] = []
+    _append_shape(node, shape)
+    return shape
+
+
+def _append_shape(node: Any, shape: list[str]) -> None:
     if isinstance(node, ast.AST):
-        parts = (
-            (field, _shape(value)) for field, value in ast.iter_fields(node) if field != "kind"
-        )
-        return [type(node).__name__, *(part for part in parts if part[1] not in (None, []))]
-    if isinstance(node, list):
-        return [_shape(part) for part in node if not _is_text(part)]
-    return None if node is None else repr(node)
+        shape.append(type(node).__name__)
+        for name in node._fields:
+            value = getattr(node, name, None)
+            if not (value is None or (type(value) is list and not value) or name == "kind"):
+                shape.append(name)
+                _append_shape(value, shape)
+        shape.append(")")
+    elif isinstance(node, list):
+        for part in node:
+            if not _is_text(part):
+                _append_shape(part, shape)
+        shape.append("]")
+    else:
+        shape.append(repr(node))
 
 
 def _is_text(node: Any) -> bool:
@@ -184,7 +197,7 @@ def _is_text(node: Any) -> bool:
     return isinstance(node.value.value, str)
 
 
-def _imports(package: str, tree: ast.AST) -> Iterator[_Import]:
+def _imports(package: str, tree: ast.Module) -> Iterator[_Import]:
     """Yield what a module of a package imports, at its head or inside functions."""
     for node in _executed(tree):
         if isinstance(node, ast.Import):
@@ -196,12 +209,21 @@ def _imports(package: str, tree: ast.AST) -> Iterator[_Import]:
                 yield base, alias.name
 
 
-def _executed(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the nodes of a tree, without blocks for type checkers."""
-    yield node
-    for child in ast.iter_child_nodes(node):
-        if not (isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING")):
-            yield from _executed(child)
+_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
+"""The fields of statements that hold statements."""
+
+
+def _executed(tree: ast.Module) -> Iterator[ast.AST]:
+    """Yield the statements of a module, without blocks for type checkers."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            waiting += node.orelse
+            continue
+        for name in _BLOCKS:
+            waiting += getattr(node, name, ())
 
 
 def _home_of(base: str, name: str) -> str:

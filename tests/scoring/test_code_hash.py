@@ -100,6 +100,24 @@ def test_what_is_imported_counts_too(hash_of, imports, helper):
     assert hash_of({**files, helper: "K = 2"}) != before
 
 
+@pytest.mark.parametrize(
+    ("block", "counts"),
+    [
+        ("try:\n            from a_helper import K\n        finally:\n            pass", 1),
+        ("try:\n            pass\n        except ImportError:\n            import a_helper", 1),
+        ("with open('x'):\n            import a_helper", 1),
+        ("for _ in ():\n            pass\n        else:\n            import a_helper", 1),
+        ("match 1:\n            case 2:\n                import a_helper", 1),
+        ("if typing.TYPE_CHECKING:\n            import a_helper", 0),
+        ("if TYPE_CHECKING:\n            pass\n        else:\n            import a_helper", 1),
+    ],
+)
+def test_imports_count_in_any_block_but_those_for_type_checkers(hash_of, block, counts):
+    files = {"first_thing": text(inner=block), "a_helper": "K = 1"}
+    before = hash_of(files)
+    assert (hash_of({**files, "a_helper": "K = 2"}) != before) == bool(counts)
+
+
 def test_a_module_counts_as_it_was_loaded(hash_of, tmp_path):
     """An edit of the file alone does not change what runs."""
     before = hash_of({"first_thing": text()})
