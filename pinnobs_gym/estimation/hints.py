@@ -86,8 +86,7 @@ def check_field(name: str, value: Any, hint: Any) -> None:
 
 
 def check_settings(settings: Any, chosen: Iterable[Field[Any]]) -> None:
-    """Check the types of these fields of a dataclass, except where they have their defaults. A list
-    becomes a tuple where that is the type.
+    """Check the types of these fields of a dataclass, except where they have their defaults.
 
     Raises:
         ValueError: in one line, naming the field, its value and what was expected.
@@ -96,9 +95,7 @@ def check_settings(settings: Any, chosen: Iterable[Field[Any]]) -> None:
     for each in chosen:
         value = getattr(settings, each.name)
         if value is not each.default:
-            hint = hints.get(each.name, Any)
-            check_field(each.name, value, hint)
-            object.__setattr__(settings, each.name, as_tuple(value, hint))
+            check_field(each.name, value, hints.get(each.name, Any))
 
 
 def as_tuple(value: Any, hint: Any) -> Any:

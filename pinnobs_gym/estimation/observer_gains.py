@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.model import model_step, model_step_jacobian
 from pinnobs_gym.simulation.system import System, initial_states, vector
 
@@ -141,7 +141,7 @@ def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = N
     return L[np.argmin(slowest)]
 
 
-@lru_cache(maxsize=64)
+@cached_by_plant
 def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarray:
     """Return L (nx, ny) of the default design: one of the `placed_gains` times a factor of at most
     1.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import product
 
 import numpy as np
 
+from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.system import Setup, System, vector
 
 _POINTS = 2**22
@@ -35,7 +35,7 @@ def prior_moments(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]
     return mean, cov
 
 
-@lru_cache(maxsize=64)
+@cached_by_plant
 def set_moments(
     system: System, low: tuple[float, ...], high: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:

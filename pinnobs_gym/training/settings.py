@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from numbers import Integral
 from typing import Any, ClassVar, TypeVar
 
-from pinnobs_gym.estimation.hints import check_settings
+from pinnobs_gym.estimation.hints import as_tuple, check_settings, field_hints, fits
 
 SEEDS = 2**32
 """Number of seeds of a training, from 0 on: those that every library of random numbers takes."""
@@ -43,8 +43,7 @@ class TrainingConfig:
         self.check_shared()
 
     def check_shared(self) -> None:
-        """Check the types of all settings, and the values of those that all trainers share. A list
-        becomes a tuple where that is the type.
+        """Check the types of all settings, and the values of those that all trainers share.
 
         Raises:
             ValueError: in one line, naming the setting, its value and what was expected.
@@ -75,7 +74,13 @@ def changed(config: ConfigT, changes: Mapping[str, Any]) -> ConfigT:
     for name in changes:
         if name not in known:
             raise ValueError(f"setting {name!r}; expected one of {', '.join(known)}")
-    return replace(settings, **changes)
+    hints = field_hints(type(settings))
+    values = dict(changes)
+    for name, value in changes.items():
+        hint = hints.get(name, Any)
+        if fits(value, hint):  # an error shows the value as it was given
+            values[name] = as_tuple(value, hint)
+    return replace(settings, **values)
 
 
 def check_setting(config: object, name: str, expected: str, allowed: Callable[[Any], bool]) -> None:
