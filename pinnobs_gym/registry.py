@@ -9,7 +9,9 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import marshal
 import pkgutil
+import struct
 import sys
 import warnings
 from collections.abc import Iterator
@@ -184,6 +186,8 @@ class Registry(Generic[T]):
         """
         module, _, name = spec.partition(":")
         try:
+            if module not in sys.modules:
+                _discard_stale_neighbours(module)
             return self.register(getattr(importlib.import_module(module), name))
         except Exception as error:  # whatever the user's module raises
             for cls in self._known.values():  # a class defined in a function or a notebook's cell
@@ -229,6 +233,40 @@ class Registry(Generic[T]):
 
     def _is_concrete(self, cls: object) -> bool:
         return isinstance(cls, type) and issubclass(cls, self._base) and not inspect.isabstract(cls)
+
+
+def discard_stale_bytecode(source: Path) -> bool:
+    """Delete a module's compiled file if it is that of an earlier source; return whether it was.
+
+    Python takes a compiled file for that of the source if size and time of change in whole seconds
+    agree. It then runs the code of before for a source that was edited, in as many characters,
+    within a second of its compilation.
+    """
+    try:
+        compiled = Path(importlib.util.cache_from_source(str(source)))
+        edited, made = source.stat(), compiled.stat()
+        if made.st_mtime_ns > edited.st_mtime_ns:
+            return False  # compiled after the last edit
+        content = compiled.read_bytes()
+        flags, time, size = struct.unpack("<III", content[4:16])
+        taken = (int(edited.st_mtime) & 0xFFFFFFFF, edited.st_size & 0xFFFFFFFF)
+        if flags or (time, size) != taken:
+            return False  # Python compiles the source anew, or checks it by its hash
+        code = compile(source.read_bytes(), str(source), "exec", dont_inherit=True)
+        if marshal.loads(content[16:]) == code:
+            return False
+        compiled.unlink()
+    except (OSError, SyntaxError, ValueError, EOFError, TypeError, NotImplementedError):
+        return False  # without a compiled file, or one that Python does not take
+    return True
+
+
+def _discard_stale_neighbours(module: str) -> None:
+    """Discard stale bytecode of a module that is not imported yet, and of those in its folder."""
+    spec = importlib.util.find_spec(module)
+    if spec is not None and spec.origin is not None:
+        for source in Path(spec.origin).parent.glob("*.py"):
+            discard_stale_bytecode(source)
 
 
 def _scanned_sources(kind: str, package: str, attributes: tuple[str, ...]) -> dict[str, NameSource]:

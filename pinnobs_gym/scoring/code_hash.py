@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import pinnobs_gym
+from pinnobs_gym.registry import discard_stale_bytecode
 from pinnobs_gym.simulation.system import System
 
 _OWN = frozenset({"pinnobs_gym", "trainers"})
@@ -43,6 +44,7 @@ def code_hash(*subjects: type | str) -> str:
 
     Raises:
         Unreadable: in one line, if the source of a class or module cannot be read.
+        ValueError: in one line, if Python has loaded the compiled file of an earlier source.
     """
     names = {name for subject in subjects for name in _modules(subject)}
     home = {name.partition(".")[0] for name in names} | _OWN
@@ -153,6 +155,11 @@ def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
     file = getattr(module, "__file__", None) or (spec.origin if spec else None)
     if file is None or not file.endswith(".py"):
         raise Unreadable(f"module {name} has no source file")
+    if discard_stale_bytecode(Path(file)) and module is not None:
+        raise ValueError(
+            f"{file} was edited within a second of being compiled, and Python has loaded what it "
+            "held before; run again"
+        )
     try:
         tree = ast.parse(Path(file).read_bytes())
     except (OSError, SyntaxError) as error:

@@ -1,8 +1,13 @@
 """Hashes of code: what changes them, and what does not."""
 
 import importlib
+import itertools
+import os
+import py_compile
+import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,13 +42,14 @@ PLAIN = {
 def hash_of(tmp_path, monkeypatch):
     """Writes modules, imports the first and hashes its class."""
     monkeypatch.syspath_prepend(tmp_path)
-    before = set(sys.modules)
+    before, times = set(sys.modules), itertools.count(10**9, 10)
 
     def write(files):
         for name, text in files.items():
             path = tmp_path / f"{name}.py"
             path.parent.mkdir(exist_ok=True)
             path.write_text(text)
+            os.utime(path, (next(times),) * 2)  # as if some time after the last
         for name in set(sys.modules) - before:
             del sys.modules[name]
         importlib.invalidate_caches()
@@ -123,9 +129,61 @@ def test_a_module_counts_as_it_was_loaded(hash_of, tmp_path):
     before = hash_of({"first_thing": text()})
     module = sys.modules["first_thing"]
     (tmp_path / "first_thing.py").write_text(text(gain="4.0"))
+    os.utime(tmp_path / "first_thing.py", (2 * 10**9,) * 2)
     assert code_hash(module.Thing) == before
     importlib.reload(module)
     assert code_hash(module.Thing) != before
+
+
+@pytest.mark.parametrize("edit", ["4.0", "3.0"])
+def test_code_that_python_did_not_compile_anew_is_not_taken_for_the_source(tmp_path, edit):
+    """Edited within a second of its compilation, in as many characters: Python runs the old."""
+    source = tmp_path / "quick_module.py"
+    source.write_text("class Thing:\n    gain = 3.0\n")
+    second = int(source.stat().st_mtime) - 5
+    os.utime(source, ns=(second * 10**9, second * 10**9))
+    compiled = Path(py_compile.compile(str(source), doraise=True))
+    os.utime(compiled, ns=(second * 10**9 + 10**8,) * 2)
+    source.write_text(f"class Thing:\n    gain = {edit}\n")
+    os.utime(source, ns=(second * 10**9 + 5 * 10**8,) * 2)
+    run = """
+import quick_module
+from pinnobs_gym.scoring.code_hash import code_hash
+print(quick_module.Thing.gain)
+try:
+    code_hash(quick_module.Thing)
+except ValueError as error:
+    print(error)
+"""
+    call = [sys.executable, "-c", run]
+    first, again = (
+        subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert first.startswith("3.0")  # which is Python's
+    assert ("within a second of being compiled" in first) == (edit != "3.0")
+    assert again == f"{edit}\n"
+
+
+def test_a_plug_in_is_not_loaded_from_stale_bytecode(tmp_path):
+    source = tmp_path / "quick_part.py"
+    source.write_text("GAIN = 3\n")
+    os.utime(source, ns=(10**18,) * 2)
+    os.utime(py_compile.compile(str(source), doraise=True), ns=(10**18 + 10**8,) * 2)
+    source.write_text("GAIN = 4\n")
+    os.utime(source, ns=(10**18 + 5 * 10**8,) * 2)
+    (tmp_path / "quick_plug.py").write_text(
+        "from pinnobs_gym.estimators.open_loop import OpenLoop\n"
+        "from quick_part import GAIN\n\n\n"
+        "class Mine(OpenLoop):\n    name = 'quick_plug'\n    gain = GAIN\n"
+    )
+    run = """
+from pinnobs_gym.estimators import ESTIMATORS
+print(ESTIMATORS.resolve("quick_plug:Mine").gain)
+"""
+    call = [sys.executable, "-c", run]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout == "4\n"
 
 
 def test_an_estimator_counts_with_the_mathematics_that_it_imports_and_not_with_others(monkeypatch):
@@ -134,8 +192,6 @@ def test_an_estimator_counts_with_the_mathematics_that_it_imports_and_not_with_o
     def spy(path):
         read.append(path.name)
         return original(path)
-
-    from pathlib import Path
 
     from pinnobs_gym.scoring import code_hash as module
 
