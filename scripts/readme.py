@@ -80,7 +80,7 @@ def summary(scored: list[rows.Row]) -> str:
 
 def under_conditions(scored: list[rows.Row]) -> str:
     """Return the table of ranks under every condition."""
-    episodes = len({row["episode_seed"] for row in scored})
+    episodes = len({row["episode"] for row in scored})
     intro = (
         "Estimators that need no training under every condition, by `pinnobs leaderboard "
         f"--condition all --episodes {episodes}`."

@@ -1,25 +1,49 @@
-"""Estimators as compared in the overview: across games, and with the `PEER`."""
+"""Estimators as they are compared: all training seeds of one estimator together, across games."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.distinct import name_of
-from pinnobs_gym.leaderboard.intervals import log_ratio
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
 from pinnobs_gym.leaderboard.standings import Standing, standing
-from pinnobs_gym.scoring.rows import Row
 
-PEER = "ekf"
-"""The estimator with which all others are compared."""
+WINDOWS = ("steady", "transient")
+"""The windows that are ranked, each by itself (`pinnobs_gym.scoring.metrics.windows`)."""
+LOST = 1.0
+"""Smallest NRMSE that counts for a diverged episode in comparisons: an error of the whole scale."""
+LARGEST = 10.0
+"""Largest NRMSE that counts for any episode in comparisons."""
+SMALLEST = 1e-12
+"""Smallest NRMSE that counts, of an estimate that is exact."""
 
 
 @dataclass(frozen=True)
+class Errors:
+    """The errors of one estimator in one game, over the episodes that all its trainings played."""
+
+    episodes: tuple[str, ...]
+    logs: Mapping[str, np.ndarray]
+    """By window: the log of the NRMSE between `SMALLEST` and `LARGEST`, and at least `LOST` where
+    the episode diverged, shape (training seeds, episodes)."""
+    diverged: np.ndarray
+    """Which episodes diverged, bool, same shape."""
+
+    def of(self, episodes: Sequence[str]) -> Errors:
+        """Return the errors of some of the episodes, in their order."""
+        place = {episode: i for i, episode in enumerate(self.episodes)}
+        chosen = [place[episode] for episode in episodes]
+        logs = {window: values[:, chosen] for window, values in self.logs.items()}
+        return Errors(tuple(episodes), logs, self.diverged[:, chosen])
+
+
+@dataclass(frozen=True, eq=False)
 class Contender:
     """An estimator with all its training seeds and one training budget; if it is not trained, with
     one choice of settings."""
@@ -28,9 +52,6 @@ class Contender:
     games: Mapping[GameName, Sequence[ScoredRun]]
     """Runs of each game, in the order of their `label`; several runs where training seeds
     differ."""
-    ratios: Mapping[GameName, np.ndarray]
-    """log(NRMSE/NRMSE of the `PEER`) of each game with common episodes, shape (training seeds,
-    episodes), over the episodes played by the peer and all training seeds."""
 
     @property
     def track(self) -> str:
@@ -41,6 +62,11 @@ class Contender:
     def runs(self) -> list[ScoredRun]:
         """Runs of all games."""
         return [run for runs in self.games.values() for run in runs]
+
+    @cached_property
+    def errors(self) -> Mapping[GameName, Errors]:
+        """The errors in each game."""
+        return {game: _errors(runs) for game, runs in self.games.items()}
 
     def standing(self, game: GameName) -> Standing:
         """Return the summary of one of its games over all training seeds."""
@@ -54,12 +80,10 @@ def contenders(runs: Iterable[ScoredRun]) -> list[Contender]:
     groups: dict[str, dict[GameName, list[ScoredRun]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         groups[name_of(run.rows[0])][run.game].append(run)
-    named = {
-        name: dict(sorted(games.items(), key=lambda item: label(item[0])))
+    return [
+        Contender(name, dict(sorted(games.items(), key=lambda item: label(item[0]))))
         for name, games in sorted(groups.items(), key=lambda group: _order(group[1]))
-    }
-    peer = named.get(PEER, {})
-    return [Contender(name, games, _ratios(games, peer)) for name, games in named.items()]
+    ]
 
 
 def among(contenders: Iterable[Contender], wanted: Callable[[ScoredRun], bool]) -> list[Contender]:
@@ -68,9 +92,8 @@ def among(contenders: Iterable[Contender], wanted: Callable[[ScoredRun], bool]) 
     restricted = []
     for contender in contenders:
         games = {game: runs for game, runs in contender.games.items() if wanted(runs[0])}
-        ratios = {game: ratio for game, ratio in contender.ratios.items() if game in games}
         if games:
-            restricted.append(replace(contender, games=games, ratios=ratios))
+            restricted.append(replace(contender, games=games))
     return sorted(restricted, key=lambda contender: _order(contender.games))
 
 
@@ -88,22 +111,16 @@ def _order(games: Mapping[GameName, Sequence[ScoredRun]]) -> tuple[int, int]:
     return -sum(len(run.rows) for run in runs), min(run.position for run in runs)
 
 
-def _ratios(
-    games: Mapping[GameName, Sequence[ScoredRun]], peer: Mapping[GameName, Sequence[ScoredRun]]
-) -> dict[GameName, np.ndarray]:
-    """Compute `Contender.ratios` of a contender's games."""
-    ratios = {}
-    for game in games:
-        theirs = {row["episode_seed"]: _score(row) for row in rows_of(peer.get(game, ()))}
-        own: dict[object, dict[int, float]] = defaultdict(dict)
-        for row in rows_of(games[game]):
-            own[row["training_seed"]][row["episode_seed"]] = _score(row)
-        common = sorted(set(theirs).intersection(*own.values()))
-        if common:
-            mine = np.array([[scores[seed] for seed in common] for scores in own.values()])
-            ratios[game] = log_ratio(mine, np.array([theirs[seed] for seed in common]))
-    return ratios
-
-
-def _score(row: Row) -> float:
-    return np.inf if row["diverged"] else row["nrmse"]
+def _errors(runs: Sequence[ScoredRun]) -> Errors:
+    """Return the errors of a game's runs, a row of the arrays per training seed."""
+    played = [{row["episode"]: row for row in run.rows} for run in runs]
+    episodes = [episode for episode in played[0] if all(episode in run for run in played)]
+    rows = [[run[episode] for episode in episodes] for run in played]
+    shape = len(runs), len(episodes)
+    diverged = np.array([[row["diverged"] for row in run] for run in rows], bool).reshape(shape)
+    logs = {}
+    for window in WINDOWS:
+        error = np.array([[row[f"nrmse_{window}"] for row in run] for run in rows], float)
+        error = np.where(diverged, np.maximum(error.reshape(shape), LOST), error.reshape(shape))
+        logs[window] = np.log(np.clip(error, SMALLEST, LARGEST))
+    return Errors(tuple(episodes), logs, diverged)

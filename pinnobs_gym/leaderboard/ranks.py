@@ -8,13 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.contenders import PEER, Contender, among
-from pinnobs_gym.leaderboard.intervals import (
-    Interval,
-    bootstrapped,
-    improvement,
-    interquartile_mean,
-)
+from pinnobs_gym.leaderboard.contenders import Contender, among
+from pinnobs_gym.leaderboard.places import Place, Places, places
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.simulation.conditions import CONDITIONS
 
@@ -25,11 +20,8 @@ class Line:
 
     estimator: str
     track: str
-    ratio: Interval | None
-    """exp of the interquartile mean, over all systems and episodes, of log(NRMSE/NRMSE of the
-    `PEER`) on the same episode; None without common episodes."""
-    better: Interval | None
-    """Probability of a smaller NRMSE than the peer's on the same episode."""
+    places: Mapping[str, Place]
+    """Its place in each window; absent without episodes in common with the peer."""
     games: Mapping[GameName, Standing]
     """Summary of each game that it played."""
     us_per_step: float
@@ -40,73 +32,61 @@ class Line:
         """The information given to it, the most in any of its games."""
         return max((standing.knows for standing in self.games.values()), key=len, default="")
 
-    @property
-    def known_ratio(self) -> float:
-        """The ratio; infinite if it is missing or undefined."""
-        return np.inf if self.ratio is None or np.isnan(self.ratio.value) else self.ratio.value
+
+def lines(contenders: Iterable[Contender]) -> tuple[list[Line], Places]:
+    """Return a line per contender over the systems' ranked conditions, and their places.
+
+    Online estimators come before others, then those with the most games, then those with the best
+    rank in the steady window.
+    """
+    compared = among(contenders, lambda run: run.ranked)
+    found = places(compared)
+    unsorted = [_line(contender, found) for contender in compared]
+    order = {
+        line.estimator: (line.track != "online", line.track, -len(line.games)) for line in unsorted
+    }
+    key = lambda line: (*order[line.estimator], *found.order(line.estimator))  # noqa: E731
+    return sorted(unsorted, key=key), found
 
 
-def lines(contenders: Iterable[Contender]) -> list[Line]:
-    """Return a line per contender over the systems' ranked conditions: online before offline, then
-    those with the most games, then those with the smallest ratio."""
-    unsorted = [_line(contender) for contender in among(contenders, lambda run: run.ranked)]
-    return sorted(unsorted, key=lambda x: (x.track != "online", -len(x.games), x.known_ratio))
-
-
-def _line(contender: Contender) -> Line:
+def _line(contender: Contender, found: Places) -> Line:
     """Return the line of a contender."""
-    strata = list(contender.ratios.values())
     standings = {game: contender.standing(game) for game in contender.games}
+    own = {window: placed.get(contender.name) for window, placed in found.windows.items()}
     return Line(
         estimator=contender.name,
         track=contender.track,
-        ratio=bootstrapped(strata, interquartile_mean).exp if strata else None,
-        better=bootstrapped(strata, improvement) if strata else None,
+        places={window: place for window, place in own.items() if place is not None},
         games=standings,
         us_per_step=float(np.median([s.us_per_step for s in standings.values()])),
     )
 
 
-def log_ratios(contenders: Sequence[Contender]) -> dict[str, dict[str, float]]:
-    """Return the interquartile mean of log(NRMSE/NRMSE of the `PEER`) over all systems and
-    episodes, by condition and name.
-
-    Only online contenders that have a ratio for each of the peer's games under the condition are
-    included. Conditions are in the order of `CONDITIONS`.
-    """
+def by_condition(contenders: Sequence[Contender]) -> dict[str, Places]:
+    """Return the places of online contenders over the systems under each condition; conditions are
+    in the order of `CONDITIONS`."""
     online = [contender for contender in contenders if contender.track == "online"]
-    ratios = {}
-    for condition in sorted(
-        {run.game.condition for each in online for run in each.runs}, key=_condition_order
-    ):
-        players = among(online, lambda run, played=condition: run.game.condition == played)
-        needed = sum(len(player.games) for player in players if player.name == PEER)
-        whole = [player for player in players if 0 < needed == len(player.ratios)]
-        if whole:
-            ratios[condition] = {player.name: _mean_ratio(player) for player in whole}
-    return ratios
+    played = {run.game.condition for each in online for run in each.runs}
+    return {
+        condition: places(among(online, lambda run, c=condition: run.game.condition == c))
+        for condition in sorted(played, key=_condition_order)
+    }
+
+
+def worst_ranks(found: Mapping[str, Places]) -> dict[str, int | None]:
+    """Return the worst rank in the steady window under any condition of each estimator with a rank,
+    the best first: those ranked under more conditions, then those with the smaller worst rank."""
+    placed: dict[str, list[int]] = {}
+    for places_ in found.values():
+        for name in places_.windows.get("steady", {}):
+            rank = places_.rank("steady", name)
+            placed.setdefault(name, []).extend([] if rank is None else [rank])
+    names = [name for name in placed if placed[name]]
+    names.sort(key=lambda n: (-len(placed[n]), max(placed[n]), sum(placed[n])))
+    return {name: max(placed[name]) for name in names}
 
 
 def _condition_order(condition: str) -> tuple[int, str]:
     """Return the sort key of a condition: its place in `CONDITIONS`, with others last."""
     listed = list(CONDITIONS)
     return listed.index(condition) if condition in listed else len(listed), condition
-
-
-def _mean_ratio(contender: Contender) -> float:
-    """Return the interquartile mean of a contender's ratios; infinite if it is undefined."""
-    values = np.concatenate([ratio.ravel() for ratio in contender.ratios.values()])
-    value = float(interquartile_mean(values))
-    return np.inf if np.isnan(value) else value
-
-
-def ranks(ratios: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, int]]:
-    """Return each estimator's rank under every condition, by condition and name. The smallest of
-    `log_ratios` has rank 1, and ties share a rank."""
-    return {
-        condition: {
-            name: 1 + sum(other < value for other in values.values())
-            for name, value in values.items()
-        }
-        for condition, values in ratios.items()
-    }

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.standings import Standing, standing
+from pinnobs_gym.leaderboard.standings import Standing, is_identifiable, standing
 from pinnobs_gym.scoring.rows import Row, game_of
 
 
@@ -42,6 +43,16 @@ class ScoredRun:
         """Whether the system is ranked under the condition of this run."""
         return self.rows[0]["ranked"]
 
+    @property
+    def identifiable(self) -> bool:
+        """Whether the states can be told from the outputs in this game."""
+        return is_identifiable(self.rows[0])
+
+    @property
+    def per_record(self) -> bool:
+        """Whether the estimator is trained on each record that it estimates."""
+        return bool(self.rows[0]["training"].get("per_record"))
+
     @cached_property
     def standing(self) -> Standing:
         """The summary of its rows, computed on first use."""
@@ -57,6 +68,23 @@ def runs_of(rows: Iterable[Row]) -> list[ScoredRun]:
             runs[key] = ScoredRun(key[0], [], position)
         runs[key].rows.append(row)
     return list(runs.values())
+
+
+def apart(runs: Sequence[ScoredRun]) -> tuple[list[ScoredRun], list[ScoredRun]]:
+    """Return the runs of estimators that are made before any record is seen; and, if there are
+    others, the runs on the records on which those were trained: theirs, and those of all estimators
+    restricted to the same episodes."""
+    own: dict[GameName, list[set[str]]] = defaultdict(list)
+    for run in runs:
+        if run.per_record:
+            own[run.game].append({row["episode"] for row in run.rows})
+    common = {game: set.intersection(*episodes) for game, episodes in own.items()}
+    on_record = []
+    for run in runs:
+        wanted = None if run.per_record else common.get(run.game, set())
+        rows = [row for row in run.rows if wanted is None or row["episode"] in wanted]
+        on_record += [ScoredRun(run.game, rows, run.position)] if rows else []
+    return [run for run in runs if not run.per_record], on_record if own else []
 
 
 def rows_of(runs: Iterable[ScoredRun]) -> list[Row]:

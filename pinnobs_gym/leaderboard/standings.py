@@ -10,6 +10,7 @@ import numpy as np
 
 from pinnobs_gym.leaderboard.intervals import Interval, median, rate
 from pinnobs_gym.scoring.consistency import band
+from pinnobs_gym.scoring.identifiability import LIMIT
 from pinnobs_gym.scoring.metrics import DIVERGED
 from pinnobs_gym.scoring.rows import Row
 
@@ -21,24 +22,36 @@ class Standing:
     estimator: str
     track: str
     episodes: int
+    """Number of different episodes."""
+    trainings: int
+    """Number of training seeds; 1 without training."""
     diverged: Interval
     """Rate of diverged episodes, with Wilson's interval."""
     settling: Interval
     """Median settling time in s."""
-    nrmse: Interval
-    """Median NRMSE over the whole episode."""
-    tail: Interval
-    """Median NRMSE over the last quarter."""
-    tail_modulo: float | None
-    """Median NRMSE over the last quarter modulo indistinguishable states; None if it is the
+    transient: Interval
+    """Median NRMSE over the transient window (`pinnobs_gym.scoring.metrics.windows`)."""
+    steady: Interval
+    """Median NRMSE over the steady window."""
+    steady_modulo: float | None
+    """Median NRMSE over the steady window modulo indistinguishable states; None if it is the
     same."""
-    tail_90: float
-    """90th percentile of the NRMSE over the last quarter."""
-    reference_ratio: float | None
-    """Median of the NRMSE over the Cramér-Rao reference of the same episode; None without a
-    reference."""
-    reference_ratio_tail: float | None
-    """The same over the last quarter."""
+    steady_90: float
+    """90th percentile of the NRMSE over the steady window."""
+    first: float
+    """Median NRMSE of the first sample."""
+    whole: float
+    """Median NRMSE over the whole episode."""
+    late: float
+    """Median NRMSE over the last 75 %."""
+    tail: float
+    """Median NRMSE over the last 25 %."""
+    over_reference: float | None
+    """Root mean square over episodes of the NRMSE of the steady window, over that of the
+    Cramér-Rao reference of the same episodes; None without a reference."""
+    identifiable: bool
+    """Whether the states can be told from the outputs under the game's condition
+    (`pinnobs_gym.scoring.identifiability`)."""
     anees: Interval | None
     """Mean over episodes, with the band expected of consistent estimates; None without
     covariances."""
@@ -54,8 +67,6 @@ class Standing:
     """CPU seconds allotted to training; None without such a limit."""
     training: str
     """Short description of the training."""
-    seed: int | None
-    """Training seed; None without training, or of several seeds together."""
 
 
 def standing(rows: Sequence[Row]) -> Standing:
@@ -65,19 +76,24 @@ def standing(rows: Sequence[Row]) -> Standing:
     def values(name: str) -> np.ndarray:
         return np.where(diverged, np.inf, [row[name] for row in rows])
 
-    first = rows[0]
+    first, referred = rows[0], [row for row in rows if row["reference_steady"] is not None]
     return Standing(
         estimator=first["estimator"],
         track=first["track"],
-        episodes=len(rows),
+        episodes=len({row["episode"] for row in rows}),
+        trainings=len({row["training_seed"] for row in rows}),
         diverged=rate(int(diverged.sum()), len(rows)),
         settling=median(values("settling")),
-        nrmse=median(values("nrmse")),
-        tail=median(values("nrmse_tail")),
-        tail_modulo=_modulo(rows),
-        tail_90=float(np.quantile(values("nrmse_tail"), 0.9, method="higher")),
-        reference_ratio=_statistic(np.median, rows, "reference_ratio"),
-        reference_ratio_tail=_statistic(np.median, rows, "reference_ratio_tail"),
+        transient=median(values("nrmse_transient")),
+        steady=median(values("nrmse_steady")),
+        steady_modulo=_modulo(rows),
+        steady_90=float(np.quantile(values("nrmse_steady"), 0.9, method="higher")),
+        first=float(np.median(values("nrmse_first"))),
+        whole=float(np.median(values("nrmse"))),
+        late=float(np.median(values("nrmse_75"))),
+        tail=float(np.median(values("nrmse_tail"))),
+        over_reference=over_reference(referred) if referred else None,
+        identifiable=is_identifiable(first),
         anees=_anees(rows),
         coverage=_statistic(np.mean, rows, "coverage"),
         nis=_statistic(np.mean, rows, "nis"),
@@ -86,16 +102,31 @@ def standing(rows: Sequence[Row]) -> Standing:
         knows=", ".join(first["knows"]),
         budget=first["training"].get("config", {}).get("budget"),
         training=training_of(rows),
-        seed=first["training_seed"] if len({row["training_seed"] for row in rows}) == 1 else None,
     )
 
 
+def is_identifiable(row: Row) -> bool:
+    """Return whether the states can be told from the outputs in a row's game."""
+    return row["free_over_known"] is None or row["free_over_known"] <= LIMIT
+
+
 def _modulo(rows: Sequence[Row]) -> float | None:
-    tail = np.array([row["nrmse_tail"] for row in rows])
-    modulo = np.array([row["nrmse_tail_modulo"] for row in rows])
-    if not (modulo < tail).any():
+    steady = np.array([row["nrmse_steady"] for row in rows])
+    modulo = np.array([row["nrmse_steady_modulo"] for row in rows])
+    if not (modulo < steady).any():
         return None
-    return float(np.median(np.where(modulo <= DIVERGED, modulo, np.inf)))
+    lost = np.array([not row["nrmse_tail_modulo"] <= DIVERGED for row in rows])
+    return float(np.median(np.where(lost, np.inf, modulo)))
+
+
+def over_reference(rows: Sequence[Row]) -> float:
+    """Return the root mean square over episodes of the NRMSE of the steady window, over that of
+    their Cramér-Rao reference, which all of them have."""
+    error, bound = (
+        np.sum(np.square([row[name] for row in rows]))
+        for name in ("nrmse_steady_modulo", "reference_steady")
+    )
+    return float(np.sqrt(error / bound))
 
 
 def _statistic(statistic: Callable[..., Any], rows: Sequence[Row], name: str) -> float | None:
@@ -106,7 +137,8 @@ def _statistic(statistic: Callable[..., Any], rows: Sequence[Row], name: str) ->
 
 def _anees(rows: Sequence[Row]) -> Interval | None:
     mean = _statistic(np.mean, rows, "anees")
-    return None if mean is None else Interval(mean, *band(len(rows), rows[0]["nx"]))
+    episodes = len({row["episode"] for row in rows})
+    return None if mean is None else Interval(mean, *band(episodes, rows[0]["nx"]))
 
 
 def training_of(rows: Sequence[Row]) -> str:

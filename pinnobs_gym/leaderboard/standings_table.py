@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender, among
 from pinnobs_gym.leaderboard.intervals import Interval
-from pinnobs_gym.leaderboard.runs import ScoredRun
-from pinnobs_gym.leaderboard.standings import Standing
+from pinnobs_gym.leaderboard.places import places
+from pinnobs_gym.leaderboard.standings import Standing, is_identifiable
 from pinnobs_gym.scoring.rows import Row, game_of
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of a table."""
+
+    name: str
+    standing: Standing
+    ranks: Mapping[str, int | None]
+    """Rank in each window within its track; None if it is not ranked."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +32,7 @@ class Table:
     """The standings of one game, best first, online before offline."""
 
     game: GameName
-    standings: tuple[Standing, ...]
+    entries: tuple[Entry, ...]
     note: str = ""
     """Remarks on the table, possibly empty."""
 
@@ -31,11 +42,12 @@ class Table:
         return ", ".join(self.game)
 
 
-def tables(runs: Iterable[ScoredRun], failures: Iterable[Row] = ()) -> list[Table]:
+def tables(contenders: Iterable[Contender], failures: Iterable[Row] = ()) -> list[Table]:
     """Return a table per game, including games with failures only; failed jobs are in the notes."""
-    played: dict[GameName, list[ScoredRun]] = defaultdict(list)
-    for run in runs:
-        played[run.game].append(run)
+    played: dict[GameName, list[Contender]] = defaultdict(list)
+    for contender in contenders:
+        for game in contender.games:
+            played[game].append(contender)
     failed: dict[GameName, list[str]] = defaultdict(list)
     for row in failures:
         failed[game_of(row)].append(_failed(row))
@@ -43,31 +55,54 @@ def tables(runs: Iterable[ScoredRun], failures: Iterable[Row] = ()) -> list[Tabl
     return [table(game, played[game], failed[game]) for game in games]
 
 
-def table(game: GameName, runs: Iterable[ScoredRun], notes: Sequence[str] = ()) -> Table:
-    """Return the table of a game's runs, with notes. Within a track, estimators are sorted by
-    median NRMSE over the whole episode, with diverged episodes as infinite."""
-    runs = list(runs)
-    standings = [run.standing for run in runs]
-    standings.sort(key=lambda s: (s.track != "online", s.nrmse.value, s.tail.value))
-    return Table(game, tuple(standings), " ".join(filter(None, [_uneven(runs), *notes])))
+def table(game: GameName, contenders: Iterable[Contender], notes: Sequence[str] = ()) -> Table:
+    """Return the table of a game with notes. Within a track, estimators are sorted by their rank in
+    the steady window, those of one rank by their factor to the peer."""
+    players = among(contenders, lambda run: run.game == game)
+    found = places(players)
+    entries = [
+        Entry(each.name, each.standing(game), {w: found.rank(w, each.name) for w in WINDOWS})
+        for each in players
+    ]
+    entries.sort(
+        key=lambda e: (
+            *(e.standing.track != "online", e.standing.track, *found.order(e.name)),
+            e.standing.steady.value,
+        )
+    )
+    own = [_uneven(players), _unidentifiable(players), *notes]
+    return Table(game, tuple(entries), " ".join(filter(None, own)))
 
 
 def _failed(row: Row) -> str:
     """Return a sentence about a failed job."""
     many = row["episodes"] > 1
-    which = f"{row['episodes']} episodes" if many else f"episode {row['episode_seed']}"
+    which = f"{row['episodes']} episodes" if many else f"episode {row['episode']}"
     return f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}."
 
 
-def _uneven(runs: Sequence[ScoredRun]) -> str:
+def _uneven(players: Sequence[Contender]) -> str:
     """Return a warning if estimators of one track were not run on the same episodes."""
-    for track in dict.fromkeys(run.track for run in runs):
-        episodes = {
-            frozenset(row["episode_seed"] for row in run.rows) for run in runs if run.track == track
-        }
-        if len(episodes) > 1:
-            return f"Not all {track} estimators were run on the same episodes: ranks are uncertain."
+    for track in dict.fromkeys(player.track for player in players):
+        own = [player for player in players if player.track == track]
+        if len({frozenset(e.episodes) for player in own for e in player.errors.values()}) > 1:
+            return (
+                f"Not all {track} estimators were run on the same episodes: those that lack some "
+                f"have no rank."
+            )
     return ""
+
+
+def _unidentifiable(players: Sequence[Contender]) -> str:
+    """Return a remark if the states cannot be told from the outputs."""
+    first = next((run.rows[0] for player in players for run in player.runs), None)
+    if first is None or is_identifiable(first):
+        return ""
+    return (
+        "Not identifiable, so that nothing is ranked: the outputs do not tell the states from the "
+        "parameters that the condition changes, which enlarges the smallest error that can be "
+        f"reached {number(first['free_over_known'], 2)} times."
+    )
 
 
 HEADER = (

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import joseph_update, predict
-from pinnobs_gym.scoring.metrics import by_sample, window
+from pinnobs_gym.scoring.metrics import by_sample, window_nrmse, windows
 from pinnobs_gym.simulation.matrices import moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Record
@@ -72,22 +72,21 @@ def cramer_rao(
     return bound.transpose(3, 0, 1, 2)
 
 
-def expected_scores(
-    P: np.ndarray, scale: Sequence[float], scored: np.ndarray | None = None
-) -> dict[str, np.ndarray]:
-    """Return ``nrmse``, ``nrmse_75`` and ``nrmse_tail``, (batch,) each, expected of errors with
-    covariances P, for comparison with `metrics.error_scores`.
+def expected_nrmse(
+    P: np.ndarray, scale: Sequence[float], part: slice, scored: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the NRMSE over a window, (batch,), that is expected of errors with covariances P: the
+    root of its mean square.
 
     Args:
         P: covariances, shape (batch, num_samples, nx, nx).
         scale: scale of the errors, one number per state.
+        part: the samples of the window.
         scored: which errors count, bool, shape (batch, num_samples, nx); all if None.
     """
     variance = np.einsum("bkii->bki", P) / np.square(scale)
     counts = np.ones(variance.shape, dtype=bool) if scored is None else scored
-    total, number = np.where(counts, variance, 0.0).sum(axis=-1), counts.sum(axis=-1)
-    parts = {"nrmse": 1.0, "nrmse_75": 0.75, "nrmse_tail": 0.25}
-    return {name: window(total, number, part) for name, part in parts.items()}
+    return window_nrmse(np.where(counts, variance, 0.0).sum(axis=-1), counts.sum(axis=-1), part)
 
 
 def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -213,15 +212,11 @@ def _reweighted(
 
 @dataclass(frozen=True)
 class Reference:
-    """The scores expected of errors as large as the Cramér-Rao reference, for a batch of episodes;
-    NaN where it is below the error of a single step of the model."""
+    """The errors expected at the Cramér-Rao reference, for a batch of episodes."""
 
-    nrmse: np.ndarray
-    """NRMSE of the whole episode, shape (batch,)."""
-    nrmse_75: np.ndarray
-    """NRMSE of its last 75 %."""
-    nrmse_tail: np.ndarray
-    """NRMSE of its last 25 %."""
+    steady: np.ndarray
+    """NRMSE of the steady window, shape (batch,); NaN where it is below the error of a single step
+    of the model."""
     by_sample: np.ndarray
     """NRMSE of each sample, shape (batch, num_samples)."""
 
@@ -246,10 +241,12 @@ def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None
     P0, R = record.prior.cov[0], np.diag(std**2)
     P = cramer_rao(source.system, record.t, truth, P0, R, Q, np.isnan(record.y))
     counted = (source.system.scale, source.system.observable(truth))
-    expected = expected_scores(P, *counted)
+    part = windows(record.t, source.setup.transient_end)["steady"]
+    steady = expected_nrmse(P, source.system.scale, part, counted[1])
     if Q is None:
-        # Discard scores below the error of the model's own step.
+        # Discard references below the error of the model's own step.
         error = step_error(source.system, record.t, truth)
-        floor = expected_scores(error[..., None] * error[..., None, :], *counted)
-        expected = {n: np.where(v > floor[n], v, np.nan) for n, v in expected.items()}
-    return Reference(**expected, by_sample=by_sample(np.sqrt(np.einsum("bkii->bki", P)), *counted))
+        squares = error[..., None] * error[..., None, :]
+        floor = expected_nrmse(squares, source.system.scale, part, counted[1])
+        steady = np.where(steady > floor, steady, np.nan)
+    return Reference(steady, by_sample(np.sqrt(np.einsum("bkii->bki", P)), *counted))

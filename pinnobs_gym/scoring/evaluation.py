@@ -15,6 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
+from pinnobs_gym.scoring.identifiability import free_over_known
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.provenance import (
     canonical,
@@ -37,9 +38,9 @@ _LOGGER = logging.getLogger(__name__)
 
 StoredKey: TypeAlias = tuple[str, str, int | None, int]
 """What identifies a row among those of one estimator's name in one game: ``game_hash``,
-``estimator_hash``, ``training_seed`` and ``episode_seed``."""
+``estimator_hash``, ``training_seed`` and ``episode``."""
 stored_key: Callable[[Row], StoredKey] = itemgetter(
-    "game_hash", "estimator_hash", "training_seed", "episode_seed"
+    "game_hash", "estimator_hash", "training_seed", "episode"
 )
 """Return the `StoredKey` of a row."""
 
@@ -171,13 +172,13 @@ def run_episodes(
         label: name of the estimator in rows; its own if None.
     """
     common = _common(estimator, game) | {"estimator": label or estimator.label}
-    wanted = [{**common, "episode_seed": seed} for seed in seeds]
+    wanted = [{**common, "episode": rows_module.episode_of(seed)} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
     first_played = None
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
-        played = play(game, estimator, [row["episode_seed"] for row in batch])
+        played = play(game, estimator, [rows_module.seed_of(row) for row in batch])
         first_played = first_played or played
         done = [{**row, **scores} for row, scores in zip(batch, _scored(played), strict=True)]
         if results is not None:
@@ -244,6 +245,7 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "game_hash": game_hash(game.source),
         "ranked": game.name.condition == canonical_name(system.ranked_condition),
         "nx": system.nx,
+        "free_over_known": free_over_known(game),
         "estimator": estimator.label,
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
         "knows": [*estimator.knows, *(["condition"] if informed else [])],

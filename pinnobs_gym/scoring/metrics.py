@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
@@ -22,37 +22,49 @@ SETTLED = 0.05
 @dataclass(frozen=True)
 class Scores:
     """The scores of a batch of episodes, as arrays (batch,). Scores that do not apply are None or,
-    for single episodes, NaN. `error_scores` and `consistency` define them."""
+    for single episodes, NaN. `error_scores`, `state_errors` and `consistency` define them."""
 
     mae: np.ndarray
     mse: np.ndarray
     rmse: np.ndarray
     smape: np.ndarray
     nrmse: np.ndarray
+    nrmse_first: np.ndarray
+    nrmse_transient: np.ndarray
+    nrmse_steady: np.ndarray
     nrmse_75: np.ndarray
     nrmse_tail: np.ndarray
     settling: np.ndarray
     peak: np.ndarray
     nrmse_modulo: np.ndarray
+    nrmse_steady_modulo: np.ndarray
     nrmse_tail_modulo: np.ndarray
     diverged: np.ndarray
+    state_rmse: Mapping[str, Mapping[str, np.ndarray]]
+    """RMSE of each state by window and name; see `state_errors`."""
     anees: np.ndarray | None = None
     coverage: np.ndarray | None = None
     nis: np.ndarray | None = None
     innovation_correlation: np.ndarray | None = None
-    reference_ratio: np.ndarray | None = None
-    """NRMSE of the whole episode over that of its Cramér-Rao reference
-    (`pinnobs_gym.scoring.cramer_rao`), with the error taken modulo indistinguishable states."""
-    reference_ratio_tail: np.ndarray | None = None
-    """The same over the last 25 % of the episode."""
+    reference_steady: np.ndarray | None = None
+    """NRMSE of the steady window that is expected of errors as large as the Cramér-Rao reference of
+    the same episode (`pinnobs_gym.scoring.cramer_rao`)."""
 
-    def rows(self) -> list[dict[str, float | bool | None]]:
+    def rows(self) -> list[dict[str, Any]]:
         """Return the scores of each episode by name."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "state_rmse"}
         return [
             {name: _number(name, column, i) for name, column in columns.items()}
+            | {"state_rmse": self._states(i)}
             for i in range(len(self.nrmse))
         ]
+
+    def _states(self, i: int) -> dict[str, dict[str, float]]:
+        """Return the errors of each state in one episode, without states that do not count."""
+        return {
+            window: {name: v[i].item() for name, v in states.items() if not np.isnan(v[i])}
+            for window, states in self.state_rmse.items()
+        }
 
 
 def _number(name: str, column: np.ndarray | None, i: int) -> float | bool | None:
@@ -62,15 +74,22 @@ def _number(name: str, column: np.ndarray | None, i: int) -> float | bool | None
     return column[i].item()
 
 
-SCORES = tuple(f.name for f in fields(Scores) if f.default is MISSING and f.name != "diverged")
-"""The scores that every episode has, besides ``diverged``."""
+SCORES = tuple(
+    f.name
+    for f in fields(Scores)
+    if f.default is MISSING and f.name not in ("diverged", "state_rmse")
+)
+"""The scores that every episode has as a number, besides ``diverged`` and ``state_rmse``."""
 OPTIONAL_SCORES = tuple(f.name for f in fields(Scores) if f.default is None)
-"""The scores that apply to some episodes: those of `pinnobs_gym.scoring.consistency`, and the NRMSE
-of the whole episode and of its tail over their Cramér-Rao reference
-(`pinnobs_gym.scoring.cramer_rao`)."""
+"""The scores that apply to some episodes: those of `pinnobs_gym.scoring.consistency`, and the
+Cramér-Rao reference (`pinnobs_gym.scoring.cramer_rao`)."""
+STATE_WINDOWS = ("transient", "steady")
+"""The windows over which errors are given state by state."""
 
 
-def score(system: System, record: Record, truth: np.ndarray, estimates: Estimates) -> Scores:
+def score(
+    system: System, record: Record, truth: np.ndarray, estimates: Estimates, transient_end: float
+) -> Scores:
     """Score the estimates of a batch of episodes.
 
     Args:
@@ -78,23 +97,81 @@ def score(system: System, record: Record, truth: np.ndarray, estimates: Estimate
         record: the record given to the estimator.
         truth: true states at its samples, shape (batch, num_samples, nx), in state units.
         estimates: x̂(k|k) at its samples, and any covariances and innovations.
+        transient_end: `Setup.transient_end`, in s from the first sample.
 
     Returns:
-        All scores except those relative to the Cramér-Rao reference.
+        All scores except the Cramér-Rao reference.
 
     Raises:
         ValueError: if truth and estimates have different shapes.
     """
+    xhat, scored = np.asarray(estimates.xhat, dtype=float), system.observable(truth)
     errors: dict[str, Any] = error_scores(
         record.t,
         truth,
-        np.asarray(estimates.xhat, dtype=float),
+        xhat,
         system.scale,
-        scored=system.observable(truth),
+        transient_end=transient_end,
+        scored=scored,
         alternatives=system.indistinguishable(truth),
     )
     own: dict[str, Any] = consistency(truth, estimates, np.isnan(record.y))
-    return Scores(**errors, **own)
+    by_window = state_errors(windows(record.t, transient_end), truth, xhat, scored)
+    states = {
+        window: dict(zip(system.state_names, values.T, strict=True))
+        for window, values in by_window.items()
+    }
+    return Scores(**errors, **own, state_rmse=states)
+
+
+def windows(t: np.ndarray, transient_end: float) -> dict[str, slice]:
+    """Return the samples of each window of an episode.
+
+    Args:
+        t: sample times in s, shape (num_samples,).
+        transient_end: end of the transient window, in s from the first sample.
+
+    Returns:
+        Slices by name: ``first`` is the first sample, whose estimate has seen one output only;
+        ``transient`` the samples after it up to the end of the transient window, ``steady`` all
+        later ones; ``whole`` all samples, ``75`` the last 75 % and ``tail`` the last 25 %. Each
+        window has at least one sample; those of an episode of one or two samples overlap.
+    """
+    n = len(t)
+    within = int(np.searchsorted(t - t[0], transient_end * (1 + 1e-9), side="right"))
+    steady = min(max(within, 2), n - 1)
+    return {
+        "whole": slice(0, n),
+        "first": slice(0, 1),
+        "transient": slice(min(1, n - 1), max(steady, 2)),
+        "steady": slice(steady, n),
+        "75": slice(round(0.25 * n), n),
+        "tail": slice(min(round(0.75 * n), n - 1), n),
+    }
+
+
+def state_errors(
+    parts: Mapping[str, slice], x: np.ndarray, xhat: np.ndarray, scored: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """Return the root mean square error of each state over each of the `STATE_WINDOWS`, arrays
+    (batch, nx) in state units: NaN for a state that does not count at any sample, infinite where
+    the estimates are not finite.
+
+    Args:
+        parts: the `windows`.
+        x: true states, shape (batch, num_samples, nx).
+        xhat: estimates, same shape.
+        scored: which errors count, bool, same shape; all if None.
+    """
+    counts = np.ones(x.shape, dtype=bool) if scored is None else scored
+    errors = {}
+    for name in STATE_WINDOWS:
+        part, count = parts[name], counts[:, parts[name]].sum(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.where(counts[:, part], (xhat - x)[:, part] ** 2, 0.0).sum(axis=1)
+            mean = np.divide(square, count, out=np.full(square.shape, np.nan), where=count > 0)
+        errors[name] = np.sqrt(np.where((count > 0) & ~np.isfinite(mean), np.inf, mean))
+    return errors
 
 
 def error_scores(
@@ -103,6 +180,7 @@ def error_scores(
     xhat: np.ndarray,
     scale: Sequence[float],
     *,
+    transient_end: float,
     scored: np.ndarray | None = None,
     alternatives: Sequence[np.ndarray] = (),
 ) -> dict[str, np.ndarray]:
@@ -113,6 +191,7 @@ def error_scores(
         x: true states, shape (batch, num_samples, nx).
         xhat: estimates, same shape; an episode with a value that is not finite counts as diverged.
         scale: scale of the errors, one number per state.
+        transient_end: end of the transient window, in s from the first sample.
         scored: which errors count in NRMSE, bool, shape of x; all if None.
         alternatives: states indistinguishable from x by any output, arrays of x's shape.
 
@@ -121,13 +200,15 @@ def error_scores(
 
         - ``mae``, ``mse``, ``rmse`` in state units and ``smape`` in %: over all states and samples,
           transient included (Farkane et al., PINN-Obs, "Neural Network Training and Testing").
-        - ``nrmse``, ``nrmse_75``, ``nrmse_tail``: root mean square of (x̂ − x)/scale over the whole
-          episode, its last 75 % and its last 25 %.
+        - ``nrmse``, ``nrmse_first``, ``nrmse_transient``, ``nrmse_steady``, ``nrmse_75``,
+          ``nrmse_tail``: root mean square of (x̂ − x)/scale over the whole episode, its first
+          sample, the transient and the steady window, the last 75 % and the last 25 %; see
+          `windows`.
         - ``settling``: the time in s after which the NRMSE of every sample stays below 5 %;
           infinite if that of the last sample is above.
         - ``peak``: the largest NRMSE of a sample.
-        - ``nrmse_modulo``, ``nrmse_tail_modulo``: as above, with each sample's error relative to
-          the nearest of x and its alternatives.
+        - ``nrmse_modulo``, ``nrmse_steady_modulo``, ``nrmse_tail_modulo``: as above, with each
+          sample's error relative to the nearest of x and its alternatives.
         - ``diverged``: bool, whether an estimate is not finite or ``nrmse_tail`` exceeds 0.2.
     """
     if x.shape != xhat.shape or x.ndim != 3 or len(t) != x.shape[1]:
@@ -146,16 +227,16 @@ def error_scores(
         }
         counts = np.ones(x.shape, dtype=bool) if scored is None else scored
         total, number = _sums(error, scale, counts)
-        scores["nrmse"] = window(total, number, 1.0)
-        scores["nrmse_75"] = window(total, number, 0.75)
-        scores["nrmse_tail"] = window(total, number, 0.25)
+        parts = windows(t, transient_end)
+        for name, part in parts.items():
+            scores[_score_name(name)] = window_nrmse(total, number, part)
         by_sample = np.sqrt(total / np.maximum(number, 1))
         scores["settling"] = _settling(t, by_sample)
         scores["peak"] = by_sample.max(axis=1)
         for other in alternatives:
             total = np.minimum(total, _sums(xhat - other, scale, counts)[0])
-        scores["nrmse_modulo"] = window(total, number, 1.0)
-        scores["nrmse_tail_modulo"] = window(total, number, 0.25)
+        for name in ("whole", "steady", "tail"):
+            scores[f"{_score_name(name)}_modulo"] = window_nrmse(total, number, parts[name])
     for values in scores.values():
         values[~finite] = np.inf
     scores["diverged"] = ~(scores["nrmse_tail"] <= DIVERGED)
@@ -189,10 +270,15 @@ def _sums(
     return square.sum(axis=-1), counts.sum(axis=-1)
 
 
-def window(total: np.ndarray, number: np.ndarray, part: float) -> np.ndarray:
-    """Return the NRMSE over the last part of the samples."""
-    first = round((1 - part) * total.shape[1])
-    return np.sqrt(total[:, first:].sum(axis=1) / np.maximum(number[:, first:].sum(axis=1), 1))
+def window_nrmse(total: np.ndarray, number: np.ndarray, part: slice) -> np.ndarray:
+    """Return the NRMSE over a window, shape (batch,), given each sample's sum of squared scaled
+    errors and their number, shape (batch, num_samples)."""
+    return np.sqrt(total[:, part].sum(axis=1) / np.maximum(number[:, part].sum(axis=1), 1))
+
+
+def _score_name(window: str) -> str:
+    """Return the name of the NRMSE of a window."""
+    return "nrmse" if window == "whole" else f"nrmse_{window}"
 
 
 def _settling(t: np.ndarray, by_sample: np.ndarray) -> np.ndarray:

@@ -71,15 +71,16 @@ class Played:
 
     @cached_property
     def scores(self) -> Scores:
-        """The scores of the episodes, including those relative to the reference if there is one."""
-        scores = score(self.system, self.record, self.truth, self.estimates)
+        """The scores of the episodes, with the Cramér-Rao reference if there is one."""
         if self.reference is None:
-            return scores
-        return replace(
-            scores,
-            reference_ratio=scores.nrmse_modulo / self.reference.nrmse,
-            reference_ratio_tail=scores.nrmse_tail_modulo / self.reference.nrmse_tail,
-        )
+            return self.scores_alone
+        return replace(self.scores_alone, reference_steady=self.reference.steady)
+
+    @cached_property
+    def scores_alone(self) -> Scores:
+        """The scores without the reference, which takes longer."""
+        end = self.game.source.setup.transient_end
+        return score(self.system, self.record, self.truth, self.estimates, end)
 
     def figure(self, title: str, row: int = 0) -> Figure:
         """Return a figure of one of the episodes, with a panel per state."""

@@ -6,6 +6,7 @@ import gc
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import FileIO
@@ -17,16 +18,18 @@ from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
-SCHEMA = 4
+SCHEMA = 5
 """Version of the row format."""
 
 Row: TypeAlias = dict[str, Any]
 """One scored episode (``kind`` is ``score``). Its keys:
 
 - ``schema``: version of this format.
-- ``env_id``, ``setup``, ``condition``, ``episode_seed``: the episode.
+- ``env_id``, ``setup``, ``condition``, ``episode``: the episode; ``seed:12`` is that of seed 12.
 - ``game_hash``: hash of the code and settings that make and score the episode.
 - ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
+- ``free_over_known``: factor by which the condition's unknown parameters enlarge the smallest
+  steady error (`pinnobs_gym.scoring.identifiability`); absent where it has none.
 - ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
   and its settings. One that was trained under the condition that is scored has a track of its own.
 - ``estimator_code``: hash of the estimator's code.
@@ -34,6 +37,7 @@ Row: TypeAlias = dict[str, Any]
 - ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,
   ...
 - the scores of `pinnobs_gym.scoring.metrics.score` by name; ``null`` stands for infinity.
+- ``state_rmse``: RMSE of each state in its unit, by window (``transient``, ``steady``) and name.
 - the scores of `pinnobs_gym.scoring.metrics.OPTIONAL_SCORES` that apply, in the same format; the
   others are None here and absent from the file.
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
@@ -44,7 +48,7 @@ Other rows are a job of a leaderboard that failed (``kind`` is ``failure``), or 
 before and then succeeded (``recovery``). Their keys:
 
 - ``schema``, ``env_id``, ``setup``, ``condition``, ``estimator``, ``versions``, ``date``: as above.
-- ``episode_seed``, ``episodes``: the first episode of the job, and the number of episodes.
+- ``episode``, ``episodes``: the first episode of the job, and the number of episodes.
 - ``job``: a hash of the job's full specification.
 - ``error``: the error in one line; for failures only.
 """
@@ -57,14 +61,16 @@ KEY = (
     "estimator",
     "estimator_hash",
     "training_seed",
-    "episode_seed",
+    "episode",
 )
 """The fields that identify a scored row; they are unique in a file."""
-JOB = ("env_id", "setup", "condition", "estimator", "episode_seed", "episodes", "job")
+JOB = ("env_id", "setup", "condition", "estimator", "episode", "episodes", "job")
 """The fields of a job in failures and recoveries."""
 TOLERANCE = 1e-6
 """Largest relative difference between scores of the same episode from different machines."""
 
+_OPTIONAL = (*OPTIONAL_SCORES, "free_over_known")
+"""The numbers that may be absent."""
 _BEGINNING = b'{"schema": '
 """The beginning of every line."""
 
@@ -72,6 +78,16 @@ _BEGINNING = b'{"schema": '
 def game_of(row: Row) -> GameName:
     """Return the game of a row, of a scored episode or of a failed job."""
     return GameName(row["env_id"], row["setup"], row["condition"])
+
+
+def episode_of(seed: int) -> str:
+    """Return the name in rows of the episode of a seed."""
+    return f"seed:{seed}"
+
+
+def seed_of(row: Row) -> int:
+    """Return the seed of a row's episode."""
+    return int(row["episode"].removeprefix("seed:"))
 
 
 class Stored(NamedTuple):
@@ -293,7 +309,7 @@ def _same(row: Row, other: Row) -> bool:
 
 def _line(row: Row) -> bytes:
     first = {"schema": row["schema"]}  # the first key identifies an incomplete line
-    absent = {name for name in OPTIONAL_SCORES if row.get(name) is None}
+    absent = {name for name in _OPTIONAL if row.get(name) is None}
     return json_line({n: v for n, v in (first | row).items() if n not in absent})
 
 
@@ -317,7 +333,7 @@ NEEDED = {
     "score": frozenset(
         (
             *(*KEY, *SCORES, "diverged", "ranked", "nx", "estimator_code", "track", "knows"),
-            *("options", "training", "versions", "us_per_step", "date"),
+            *("options", "training", "versions", "us_per_step", "date", "state_rmse"),
         )
     ),
     "failure": frozenset((*JOB, "error", "date")),
@@ -350,6 +366,10 @@ def _is_object(value: object) -> bool:
     return type(value) is dict
 
 
+def _is_episode(value: object) -> bool:
+    return type(value) is str and re.fullmatch(r"seed:(0|[1-9]\d{0,18})", value) is not None
+
+
 def _are_texts(value: object) -> bool:
     return type(value) is list and all(map(_is_text, value))
 
@@ -361,10 +381,12 @@ _OBJECT = ("an object", _is_object)
 _KINDS = {
     **dict.fromkeys(("env_id", "setup", "condition", "estimator", "track", "date", "error"), _TEXT),
     **dict.fromkeys(("game_hash", "estimator_code", "estimator_hash", "job"), _TEXT),
-    **dict.fromkeys(("episode_seed", "episodes", "nx"), _COUNT),
+    **dict.fromkeys(("episodes", "nx"), _COUNT),
+    "episode": ("seed: and a whole number of at least 0, such as seed:12", _is_episode),
     **dict.fromkeys(("diverged", "ranked"), _FLAG),
     **dict.fromkeys(("options", "training", "versions"), _OBJECT),
     "training_seed": ("a whole number of at least 0, or null", _is_seed),
+    "state_rmse": ("an object of windows, each an object of states", _is_object),
     "knows": ("a list of texts", _are_texts),
 }
 FIELDS = {
@@ -404,9 +426,23 @@ def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
     if kind == "score":
         for name in (*SCORES, "us_per_step"):
             row[name] = _score(path, number, name, row[name])
-        for name in OPTIONAL_SCORES:
+        for name in _OPTIONAL:
             row[name] = _score(path, number, name, row[name]) if name in row else None
+        row["state_rmse"] = {
+            window: _states(path, number, window, states)
+            for window, states in row["state_rmse"].items()
+        }
     return row
+
+
+def _states(path: Path, number: int, window: str, states: object) -> dict[str, float]:
+    """Return the errors of each state over a window."""
+    if type(states) is not dict:
+        raise ValueError(
+            f"{path}, line {number}: state_rmse.{window}={_shown(states)}; expected an object of "
+            "states"
+        )
+    return {n: _score(path, number, f"state_rmse.{window}.{n}", v) for n, v in states.items()}
 
 
 def _score(path: Path, number: int, name: str, value: object) -> float:

@@ -9,10 +9,10 @@ import numpy as np
 
 from pinnobs_gym.files import file_name
 from pinnobs_gym.scoring.playing import Played
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.rows import Row, seed_of
 from pinnobs_gym.training.log import Log
 
-LOGGED = ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak")
+LOGGED = ("nrmse", "nrmse_transient", "nrmse_steady", "rmse", "settling", "peak")
 """The scores that are logged."""
 
 
@@ -22,7 +22,7 @@ def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
     for row in rows:
         for name in LOGGED:
             if np.isfinite(row[name]):
-                log.scalar(f"episode/{name}", row[name], row["episode_seed"])
+                log.scalar(f"episode/{name}", row[name], seed_of(row))
     first = rows[0]
     if played is not None and log.active:
         title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"

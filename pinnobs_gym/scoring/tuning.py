@@ -12,7 +12,6 @@ import numpy as np
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.scoring.metrics import score
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.provenance import estimator_code, game_hash
 from pinnobs_gym.training.settings import SEEDS
@@ -71,7 +70,7 @@ class Search:
         estimator = self.estimator.for_setup(source.system, source.setup, **settings)
         seeds = range(TUNING_SEED, TUNING_SEED + self.episodes)
         played = play(self.game, estimator, seeds)
-        scores = score(played.system, played.record, played.truth, played.estimates)
+        scores = played.scores_alone
         nrmse = np.where(scores.diverged, WORST, np.minimum(scores.nrmse, WORST))
         return float(np.exp(np.mean(np.log(nrmse))))
 

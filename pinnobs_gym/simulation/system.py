@@ -62,6 +62,9 @@ class Setup:
     poor_prior: PoorPrior | None = None
     """The prior that replaces the above under the condition ``poor_prior``; without one the
     condition does not apply."""
+    transient: float | None = None
+    """End of the transient window of the scores, in s from the first sample
+    (`pinnobs_gym.scoring.metrics.windows`); a quarter of the duration if None."""
     truth_step: float | None = None
     """Initial step of the truth solver in s, halved until the error tolerance is met. A hundredth
     of the duration if None."""
@@ -69,8 +72,10 @@ class Setup:
     """Physical parameters that replace the system's defaults."""
 
     def __post_init__(self) -> None:
-        for name in ("dt", "duration"):
+        for name in ("dt", "duration", "transient"):
             value = getattr(self, name)
+            if name == "transient" and value is None:
+                continue
             if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
                 raise ValueError(f"{name}={value} s; expected a positive number of seconds")
         if self.duration < self.dt * (1 - 1e-9):
@@ -101,6 +106,11 @@ class Setup:
     def times(self) -> np.ndarray:
         """Sample times in s, shape (num_steps + 1,), starting at 0."""
         return np.arange(self.num_steps + 1) * self.dt
+
+    @property
+    def transient_end(self) -> float:
+        """End of the transient window in s from the first sample."""
+        return self.duration / 4 if self.transient is None else self.transient
 
     @property
     def fixed_x0(self) -> bool:

@@ -40,6 +40,7 @@ class Academic(System):
             x0_high=(2.0, 1.5),
             xhat0=(0.0, 0.0),
             P0=((1.281, 0.0), (0.0, 0.8165)),
+            transient=0.88,
             poor_prior=PoorPrior((1.0, 2.0), independent(1.5, 2.0)),
             duration=10.0,
             dt=0.02,

@@ -41,6 +41,7 @@ class HarmonicOscillator(System):
             x0_high=(2.0, 2.0, 6.0),
             xhat0=(0.0, 0.0, 3.293),
             P0=((1.420, 0.0, 0.0), (0.0, 1.398, 0.0), (0.0, 0.0, 2.405)),
+            transient=2.56,
             poor_prior=PoorPrior((1.0, 1.0, 2.0), independent(1.5, 1.5, 2.0)),
             duration=20.0,
             dt=0.02,

@@ -98,6 +98,7 @@ class InductionMotor(System):
                 (0.0, 0.0, 0.0, 0.08333, 0.0),
                 (0.0, 0.0, 0.0, 0.0, 3333.0),
             ),
+            transient=0.044,
             poor_prior=PoorPrior((0.0, 0.0, 0.0, 0.0, 0.0), independent(3.0, 3.0, 0.3, 0.3, 120.0)),
             duration=1.0,
             dt=1e-3,

@@ -40,6 +40,7 @@ class ModifiedAcademic(System):
             x0_high=(3.0, 1.5),
             xhat0=(0.0, 0.0),
             P0=((3.0, 0.0), (0.0, 0.8033)),
+            transient=0.8,
             poor_prior=PoorPrior((3.0, 1.0), independent(3.0, 1.5)),
             duration=20.0,
             dt=0.02,

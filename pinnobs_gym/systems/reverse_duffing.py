@@ -38,6 +38,7 @@ class ReverseDuffing(System):
             x0_high=(2.2, 1.8),
             xhat0=(0.0, 0.0),
             P0=((1.682, 0.0), (0.0, 1.002)),
+            transient=0.8,
             poor_prior=PoorPrior((1.0, 1.0), independent(1.5, 1.2)),
             duration=20.0,
             dt=0.02,

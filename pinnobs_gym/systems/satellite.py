@@ -53,6 +53,7 @@ class Satellite(System):
             x0_high=(2.0, 2.0, 3.0),
             xhat0=(0.0, 0.0, 2.158),
             P0=((0.9609, 0.0, 0.0), (0.0, 1.389, 0.0), (0.0, 0.0, 0.2988)),
+            transient=3.08,
             poor_prior=PoorPrior((1.0, 1.0, 2.0), independent(1.5, 1.5, 1.0)),
             duration=20.0,
             dt=0.02,

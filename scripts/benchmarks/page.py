@@ -95,7 +95,12 @@ def _rows(
     return [
         common
         | dict(zip(names, values[i].tolist(), strict=True))
-        | {"diverged": bool(diverged[i]), "episode_seed": i}
+        | {
+            "diverged": bool(diverged[i]),
+            "episode": f"seed:{i}",
+            "state_rmse": {},
+            "free_over_known": None,
+        }
         for i in range(EPISODES)
     ]
 

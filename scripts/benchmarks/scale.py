@@ -81,10 +81,12 @@ def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
         for episode in range(min(EPISODES, count - len(made))):
             score = float(level * rng.lognormal(0, 0.4))
             row = base | dict.fromkeys(SCORES, score) | dict.fromkeys(OPTIONAL_SCORES)
-            row |= {"nrmse_tail": score / 10, "nrmse_tail_modulo": score / 10, "settling": 1.0}
-            row |= {"anees": 1.0, "coverage": 0.9, "reference_ratio": score / 0.03}
+            row |= {"nrmse_steady": score / 10, "nrmse_steady_modulo": score / 10, "settling": 1.0}
+            row |= {"state_rmse": {}, "free_over_known": None}
+            row |= {"anees": 1.0, "coverage": 0.9, "reference_steady": 0.03}
             made.append(
-                row | {"diverged": score > 2, "episode_seed": episode, "us_per_step": float(level)}
+                row
+                | {"diverged": score > 2, "episode": f"seed:{episode}", "us_per_step": float(level)}
             )
         if len(made) == count:
             return made

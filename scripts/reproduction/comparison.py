@@ -156,7 +156,9 @@ def _row(
     scores = {}
     for window, start in WINDOWS.items():
         late = t >= start - 1e-9
-        values = error_scores(t[late], x[None, late], xhat[None, late], (1.0, 1.0))
+        values = error_scores(
+            t[late], x[None, late], xhat[None, late], (1.0, 1.0), transient_end=5.0
+        )
         scores[window] = {metric: float(values[metric][0]) for metric in METRICS}
     key = comparison.key(method, episode)
     seconds = trained.seconds

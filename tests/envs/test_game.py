@@ -73,7 +73,7 @@ def test_initial_states_may_be_given_and_then_there_is_no_reference():
     ekf = EKF.for_setup(game.source.system, game.source.setup)
     assert play(game, ekf, [0, 1]).reference is not None
     assert play(game, ekf, [0, 1], x0).reference is None
-    assert play(Game.of(Linear, noise_std=0.3), ekf, [0, 1]).scores.reference_ratio is None
+    assert play(Game.of(Linear, noise_std=0.3), ekf, [0, 1]).scores.reference_steady is None
 
 
 def test_it_can_be_pickled():

@@ -13,7 +13,6 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
             "nx": 2,
             "options": {},
             "training_seed": None,
-            "nrmse_tail_modulo": value,
             "env_id": "pinnobs/X-v0",
             "setup": "benchmark",
             "condition": "nominal",
@@ -27,7 +26,9 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
             "training": {},
             "us_per_step": 1.0,
             "diverged": bad,
-            "episode_seed": i,
+            "episode": f"seed:{i}",
+            "state_rmse": {},
+            "free_over_known": None,
             **changes,
         }
         for i, (value, bad) in enumerate(zip(nrmse, diverged, strict=True))

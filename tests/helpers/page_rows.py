@@ -13,7 +13,12 @@ def row(seed=0, **changes):
     facts |= {"options": {}, "training": {}, "training_seed": None}
     facts |= {"game_hash": "g", "estimator_code": "c", "estimator_hash": "h"}
     facts |= {"us_per_step": 1.0, "date": "2030-01-02T00:00:00", "versions": {"numpy": "2"}}
-    return base | facts | {"diverged": False, "episode_seed": seed} | changes
+    return (
+        base
+        | facts
+        | {"diverged": False, "episode": f"seed:{seed}", "state_rmse": {}, "free_over_known": None}
+        | changes
+    )
 
 
 def curves(error, t=(0.0, 1.0, 2.0), reference=None, seeds=None, seed=0):

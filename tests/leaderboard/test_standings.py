@@ -82,7 +82,7 @@ def test_what_failed_is_told_in_the_note_of_its_game():
         "setup": "benchmark",
         "condition": "nominal",
         "estimator": "mine",
-        "episode_seed": 3,
+        "episode": "seed:3",
         "episodes": 1,
         "error": "RuntimeError: out of luck.",
     }

@@ -13,7 +13,7 @@ from pinnobs_gym.leaderboard.jobs.job import trained
 from pinnobs_gym.leaderboard.jobs.plan import jobs_of
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.scoring import rows
-from pinnobs_gym.scoring.rows import Stored
+from pinnobs_gym.scoring.rows import Stored, seed_of
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import train_by_name
@@ -148,7 +148,7 @@ def test_variants_have_rows_of_their_own_and_what_is_stored_is_not_run_again(tmp
         for job in plan.left(jobs_of(suite, tmp_path), rows.load(path), False)[0]:
             job.run()
         found = rows.read(path)[before:]
-        return sorted((row["estimator"], row["episode_seed"]) for row in found)
+        return sorted((row["estimator"], seed_of(row)) for row in found)
 
     both = [(name, seed) for name in ("ekf", "robust ekf") for seed in range(3)]
     assert run(suite) == both

@@ -18,8 +18,8 @@ from scipy.linalg import expm
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.scoring.cramer_rao import cramer_rao, exact_bayes, expected_scores, step_error
-from pinnobs_gym.scoring.metrics import error_scores
+from pinnobs_gym.scoring.cramer_rao import cramer_rao, exact_bayes, expected_nrmse, step_error
+from pinnobs_gym.scoring.metrics import error_scores, windows
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.system import Setup
 from pinnobs_gym.systems import SYSTEMS
@@ -99,17 +99,19 @@ def test_on_a_linear_system_the_kalman_filters_covariance_is_the_reference():
     np.testing.assert_allclose(found, P, rtol=1e-10)
 
 
-def test_expected_scores_are_those_of_errors_of_these_covariances():
+def test_expected_errors_are_those_of_errors_of_these_covariances():
     rng = np.random.default_rng(0)
     P = np.stack([np.diag([0.04, 0.09]) * (1 + k) for k in range(20)])
     error = rng.standard_normal((4000, 20, 2)) * np.sqrt(np.einsum("kii->ki", P))
     x, scale = np.zeros_like(error), (2.0, 5.0)
     scored = np.ones(x.shape, dtype=bool)
     scored[:, ::2, 0] = False
-    scores = error_scores(np.arange(20.0), x, error, scale, scored=scored)
-    expected = expected_scores(np.repeat(P[None], 4000, axis=0), scale, scored)
-    for name, values in expected.items():
-        assert np.sqrt(np.mean(scores[name] ** 2)) == pytest.approx(values[0], rel=0.01)
+    t, covariances = np.arange(20.0), np.repeat(P[None], 4000, axis=0)
+    scores = error_scores(t, x, error, scale, transient_end=7.0, scored=scored)
+    for name in ("transient", "steady", "tail"):
+        expected = expected_nrmse(covariances, scale, windows(t, 7.0)[name], scored)
+        rms = np.sqrt(np.mean(scores[f"nrmse_{name}"] ** 2))
+        assert rms == pytest.approx(expected[0], rel=0.01), name
 
 
 @dataclass(frozen=True)

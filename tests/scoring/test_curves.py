@@ -43,7 +43,7 @@ HASHES = {"game_hash": "4567", "estimator_hash": "0123"}
 
 
 def row(seed=3):
-    return {**NOISY._asdict(), "estimator": "a b/c", **HASHES, "episode_seed": seed}
+    return {**NOISY._asdict(), "estimator": "a b/c", **HASHES, "episode": f"seed:{seed}"}
 
 
 def test_what_is_written_is_read_back(tmp_path):

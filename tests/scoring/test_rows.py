@@ -21,7 +21,7 @@ def test_round_trip_keeps_infinity_as_valid_json(tmp_path):
     for line in path.read_text().splitlines():
         json.loads(line, parse_constant=refuse)
     back = rows.read(path)
-    assert [r["episode_seed"] for r in back] == [0, 1, 2]
+    assert [rows.seed_of(r) for r in back] == [0, 1, 2]
     assert back[0]["nrmse"] == float("inf")
     assert back[1]["nrmse"] == 0.5
 
@@ -58,13 +58,13 @@ def test_a_half_line_at_the_end_is_left_out_and_cut_off_by_the_next_rows(tmp_pat
     path.write_bytes(whole[:-cut])
     stored = rows.load(path)
     kept = [0, 1] if cut == 1 else [0]  # only the line's end was missing
-    assert [r["episode_seed"] for r in stored.rows] == kept
+    assert [rows.seed_of(r) for r in stored.rows] == kept
     assert path.read_bytes() == whole[:-cut]
     assert ("line 2, is cut off" in stored.warning) == (cut > 1)
     assert "\n" not in stored.warning
     rows.append(path, [row(2), row(3)])
     stored = rows.load(path)
-    assert [r["episode_seed"] for r in stored.rows] == [*kept, 2, 3]
+    assert [rows.seed_of(r) for r in stored.rows] == [*kept, 2, 3]
     assert stored.warning == ""
 
 
@@ -76,7 +76,7 @@ def test_every_beginning_of_a_line_is_a_half_line(tmp_path):
         path.write_bytes(line[:length])
         assert rows.load(path) == ([], [], rows.load(path).warning)
         rows.append(path, [row(1)])
-        assert [r["episode_seed"] for r in rows.read(path)] == [1]
+        assert [rows.seed_of(r) for r in rows.read(path)] == [1]
 
 
 @pytest.mark.parametrize("content", ["notes of mine", "\0\0\0", "[1, 2]"])
@@ -98,11 +98,11 @@ def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
     with pytest.raises(ValueError, match="line 2, is cut off"):
         rows.read(path)
     path.write_text("\n".join([lines[0], lines[2]]) + "\n")  # as the error advises
-    assert [r["episode_seed"] for r in rows.read(path)] == [0, 2]
+    assert [rows.seed_of(r) for r in rows.read(path)] == [0, 2]
 
 
 def event(kind="failure", day=1, job="a", **changes):
-    names = dict.fromkeys(rows.JOB, "x") | {"episode_seed": 0, "episodes": 1}
+    names = dict.fromkeys(rows.JOB, "x") | {"episode": "seed:0", "episodes": 1}
     names |= {"job": job, "date": f"2026-01-{day:02d}"}
     error = {"error": "out of luck"} if kind == "failure" else {}
     return {"schema": rows.SCHEMA, "kind": kind, **names, **error, **changes}
@@ -112,7 +112,7 @@ def test_failures_are_kept_apart_until_the_job_goes_well(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [event(job="a"), row(0), event(job="b"), event(job="a", error="again")])
     stored = rows.load(path)
-    assert [r["episode_seed"] for r in stored.rows] == [0]
+    assert [rows.seed_of(r) for r in stored.rows] == [0]
     assert {r["job"]: r["error"] for r in stored.failures} == {"a": "again", "b": "out of luck"}
     rows.append(path, [event("recovery", day=2)])
     assert [r["job"] for r in rows.load(path).failures] == ["b"]
@@ -130,14 +130,14 @@ def test_files_are_merged_by_concatenation_in_any_order(tmp_path):
     for parts in ((here, there), (there, here)):
         both.write_bytes(b"".join(part.read_bytes() for part in parts))
         stored = rows.load(both)
-        assert sorted(r["episode_seed"] for r in stored.rows) == [0, 1]
+        assert sorted(rows.seed_of(r) for r in stored.rows) == [0, 1]
         assert stored.failures == []
 
 
 def test_another_schema_and_missing_fields_are_refused(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(schema=99)])
-    with pytest.raises(ValueError, match="schema 99; expected 4: move the file"):
+    with pytest.raises(ValueError, match="schema 99; expected 5: move the file"):
         rows.read(path)
     path.unlink()
     incomplete = row()
@@ -192,7 +192,7 @@ def test_processes_may_share_a_file(tmp_path):
         worker.start()
     for worker in workers:
         worker.join()
-    seeds = sorted(r["episode_seed"] for r in rows.read(path))
+    seeds = sorted(rows.seed_of(r) for r in rows.read(path))
     assert seeds == sorted(100 * i + j for i in range(3) for j in range(50))
 
 
@@ -201,7 +201,7 @@ WRONG = {
     "us_per_step": ("-1", '"a"'),
     "anees": ("-0.5", "[]"),
     "innovation_correlation": ("-1.5", '"a"'),
-    "episode_seed": ("-1", "1.5", "true", "null", '"1"'),
+    "episode": ("-1", "1", "true", "null", '"1"', '"seed:-1"', '"seed:01"', '"seed:1.5"'),
     "nx": ("-1", '"2"'),
     "training_seed": ("-1", "1.5", '"a"'),
     "diverged": ("1", "null", '"no"'),
@@ -214,6 +214,8 @@ WRONG = {
     "options": ("[]", "null"),
     "training": ("[]",),
     "versions": ("1",),
+    "free_over_known": ("-1", '"a"'),
+    "state_rmse": ("1", "[]", "null"),
 }
 
 

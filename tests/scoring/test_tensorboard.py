@@ -83,8 +83,8 @@ def test_the_runs_are_the_estimators_on_the_systems(played):
 def test_scalars_are_the_scores_of_the_rows(played):
     runs, shown = played
     for run, group in runs.items():
-        for name in ("nrmse", "nrmse_75", "nrmse_tail", "rmse", "settling", "peak"):
-            expected = {r["episode_seed"]: r[name] for r in group if np.isfinite(r[name])}
+        for name in ("nrmse", "nrmse_transient", "nrmse_steady", "rmse", "settling", "peak"):
+            expected = {rows.seed_of(r): r[name] for r in group if np.isfinite(r[name])}
             if expected:
                 assert shown.scalars(run, f"episode/{name}") == pytest.approx(expected, rel=1e-6)
     assert shown.scalars(run, "episode/nrmse").keys() == {0, 1, 2}
@@ -135,9 +135,9 @@ def test_other_settings_of_one_estimator_are_other_lines(tmp_path):
     assert shown.settings(first)["process_noise"] == 0.01
     assert shown.settings(second)["process_noise"] == 0.1
     stored = rows.read(tmp_path / "rows.jsonl")
-    assert [row["episode_seed"] for row in stored] == [4, 6, 7]
+    assert [rows.seed_of(row) for row in stored] == [4, 6, 7]
     assert shown.scalars(first, "episode/nrmse") == {4: pytest.approx(stored[0]["nrmse"])}
-    both = {row["episode_seed"]: pytest.approx(row["nrmse"]) for row in stored[1:]}
+    both = {rows.seed_of(row): pytest.approx(row["nrmse"]) for row in stored[1:]}
     assert shown.scalars(second, "episode/nrmse") == both
     # In any order: files of the same second are read in that of their names.
     assert {image.step for image in shown.runs[second].Images("states")} == {6, 7}

@@ -21,7 +21,6 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from pinnobs_gym.estimation.learned.trained import content_of, from_content
 from pinnobs_gym.estimation.learned.trained_file import with_tensors
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent, setup_of
-from pinnobs_gym.scoring.metrics import score
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.training.trainer import Trainer
 from trainers.rl.agent import first_seed, learning_rate, make_agent, make_env, policy_layers
@@ -90,7 +89,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
         )
         first = self.episode + HELD_OUT
         played = play(self.game, estimator, range(first, first + self.config.held_out))
-        scores = score(played.system, played.record, played.truth, played.estimates)
+        scores = played.scores_alone
         parts = ("nrmse_modulo", "nrmse_tail_modulo")
         medians = {part: float(np.median(getattr(scores, part))) for part in parts}
         self.latest = math.sqrt(math.prod(medians.values()))

@@ -103,7 +103,7 @@ class Job:
             "kind": kind,
             **self.game.name._asdict(),
             "estimator": self.label or ESTIMATORS.name_of(ESTIMATORS.resolve(self.estimator)),
-            "episode_seed": self.seed,
+            "episode": rows_module.episode_of(self.seed),
             "episodes": self.episodes,
             "job": self.digest,
             "versions": versions(),

@@ -16,7 +16,7 @@ from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
-from pinnobs_gym.scoring.rows import Stored, game_of
+from pinnobs_gym.scoring.rows import Stored, episode_of, game_of
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
 
@@ -115,8 +115,8 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
         if job.label is not None or cls.label is BaseEstimator.label:
             name = job.label or ESTIMATORS.name_of(cls)
             keys = known_rows[job.game.name, name]
-            seeds = range(job.seed, job.seed + job.episodes)
-            known = frozenset(entry for entry in keys if entry[-1] in seeds)
+            wanted = set(map(episode_of, range(job.seed, job.seed + job.episodes)))
+            known = frozenset(entry for entry in keys if entry[-1] in wanted)
         to_run.append(replace(job, known=known, failed=again))
     return to_run, left_out
 

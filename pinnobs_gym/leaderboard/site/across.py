@@ -7,27 +7,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.leaderboard import ranks
 from pinnobs_gym.leaderboard.contenders import Contender, among
-from pinnobs_gym.leaderboard.ranks import Line
+from pinnobs_gym.leaderboard.places import Place, Places
+from pinnobs_gym.leaderboard.ranks import Line, by_condition, worst_ranks
 from pinnobs_gym.leaderboard.runs import rows_of
 from pinnobs_gym.leaderboard.site.columns import Columns, extend, number
 
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors of online estimators to the peer under several conditions."""
+    """Factors of online estimators to the peer in the steady window under several conditions."""
 
     of: str
     """A system, or "all systems"."""
     estimators: tuple[str, ...]
     """Estimators, those played under more conditions first, then those with the better worst
     rank."""
-    worst: tuple[int, ...]
-    """Worst rank of each estimator."""
-    values: Mapping[str, Mapping[str, float]]
-    """`ranks.log_ratios`, by condition and estimator; absent where the estimator lacks a game of
-    the peer."""
+    worst: tuple[int | None, ...]
+    """Worst rank of each estimator; None if it has none."""
+    values: Mapping[str, Mapping[str, Place]]
+    """Places by condition and estimator, of those with a rank; empty under a condition under which
+    no states are identifiable or too few episodes were played."""
 
 
 def factors(contenders: Sequence[Contender]) -> list[Factors]:
@@ -38,17 +38,21 @@ def factors(contenders: Sequence[Contender]) -> list[Factors]:
     groups = {"all systems": online}
     for system in systems if len(systems) > 1 else ():
         groups[system] = among(online, lambda run, wanted=system: run.game.system == wanted)
-    ratios = {of: ranks.log_ratios(group) for of, group in groups.items()}
-    return [_factors(of, values) for of, values in ratios.items() if len(values) > 1]
+    found = {of: by_condition(group) for of, group in groups.items()}
+    return [_factors(of, placed) for of, placed in found.items() if len(placed) > 1]
 
 
-def _factors(of: str, values: Mapping[str, Mapping[str, float]]) -> Factors:
-    placed: dict[str, list[int]] = {}
-    for by_estimator in ranks.ranks(values).values():
-        for estimator, rank in by_estimator.items():
-            placed.setdefault(estimator, []).append(rank)
-    names = sorted(placed, key=lambda n: (-len(placed[n]), max(placed[n]), sum(placed[n])))
-    return Factors(of, tuple(names), tuple(max(placed[name]) for name in names), values)
+def _factors(of: str, found: Mapping[str, Places]) -> Factors:
+    values = {
+        condition: {
+            name: place
+            for name, place in placed.windows.get("steady", {}).items()
+            if place.rank is not None
+        }
+        for condition, placed in found.items()
+    }
+    ranks = worst_ranks(found)
+    return Factors(of, tuple(ranks), tuple(ranks.values()), values)
 
 
 def training_seconds(contender: Contender) -> float | None:
@@ -59,25 +63,27 @@ def training_seconds(contender: Contender) -> float | None:
 
 
 def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns:
-    """Return a row per line of the overview: its factor to the peer with the interval, its µs per
-    step, and the CPU seconds of its training, with a gap for estimators that are not trained.
+    """Return a row per line of the overview: its factor to the peer in the steady window with the
+    interval, its µs per step, and the CPU seconds of its training, with a gap for estimators that
+    are not trained.
 
     ``front`` is true for the Pareto front: lines that no other of their track beats in both
-    accuracy and speed. Lines without a finite factor are left out.
+    accuracy and speed. Lines without a factor are left out.
     """
     table: Columns = {name: [] for name in ("estimator", "track", "ratio", "low", "high", "us")}
     table |= {"seconds": [], "front": []}
     for line in lines:
-        if line.ratio is None or not np.isfinite(line.ratio.value):
+        if "steady" not in line.places:
             continue
+        factor = line.places["steady"].factor
         spent = seconds.get(line.estimator)
         extend(
             table,
             estimator=[line.estimator],
             track=[line.track],
-            ratio=[number(line.ratio.value)],
-            low=[number(line.ratio.low)],
-            high=[number(line.ratio.high)],
+            ratio=[number(factor.value)],
+            low=[number(factor.low)],
+            high=[number(factor.high)],
             us=[number(line.us_per_step)],
             seconds=[None if spent is None else number(spent)],
             front=[not any(_beats(other, line) for other in lines)],
@@ -87,7 +93,7 @@ def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns
 
 def _beats(other: Line, line: Line) -> bool:
     """Return whether the other line is both faster and more accurate."""
-    if other.ratio is None or line.ratio is None or other.track != line.track:
+    if "steady" not in other.places or other.track != line.track:
         return False
     faster = other.us_per_step < line.us_per_step
-    return faster and other.ratio.value < line.ratio.value
+    return faster and other.places["steady"].factor.value < line.places["steady"].factor.value

@@ -23,9 +23,11 @@ HUGE = 1e9
 
 
 class Styled:
-    """Encodings that draw each estimator in its style."""
+    """Encodings that draw each estimator in its style, and the name of the peer that factors are
+    to."""
 
-    def __init__(self, styles: Mapping[str, Style]) -> None:
+    def __init__(self, styles: Mapping[str, Style], peer: str) -> None:
+        self.peer = peer
         names = list(styles)
         dashes = [list(style.dash) for style in styles.values()]
         shapes = [style.shape for style in styles.values()]

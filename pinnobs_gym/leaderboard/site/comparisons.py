@@ -1,4 +1,4 @@
-"""Charts that compare estimators with the EKF, with the reference, and by cost."""
+"""Charts that compare estimators with the peer, with the reference, and by cost."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
     """Chart the factor to the peer with its interval, a line per estimator, on an axis from low to
     high."""
     scale = log_scale(low, high)
-    tips = ["estimator:N", "track:N", exact("ratio", "/ ekf"), exact("low"), exact("high")]
-    title = "NRMSE / EKF's, over all systems"
+    tips = ["estimator:N", "track:N", exact("ratio", f"/ {styled.peer}"), exact("low"), exact("high")]
+    title = f"steady NRMSE / {styled.peer}'s, over all systems"
     x = alt.X("ratio:Q", scale=scale, title=title, axis=log_axis(low, high))
     base = (
         named("standings")
@@ -61,13 +61,13 @@ def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spe
     """Chart quantiles of the error over the Cramér-Rao reference, a line per estimator, on an axis
     from low to high."""
     scale, axis = log_scale(low, high), log_axis(low, high)
-    title = "NRMSE / reference, same episode"
+    title = "steady NRMSE / reference"
     base = (
         named("ratios")
         .transform_calculate(upper90=finite("q90"), upper75=finite("q75"))
         .encode(
             y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
-            tooltip=["estimator:N", *map(exact, ("q10", "q25", "median", "q75", "q90"))],
+            tooltip=["estimator:N", *map(exact, ("q10", "q25", "rms", "q75", "q90"))],
         )
     )
     coloured = base.encode(color=styled.colour)
@@ -79,9 +79,9 @@ def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spe
         coloured.mark_bar(size=9, opacity=0.6).encode(
             x=alt.X("q25:Q", scale=scale, axis=axis, title=title), x2="upper75:Q"
         ),
-        base.transform_filter("isValid(datum.median)")
+        base.transform_filter("isValid(datum.rms)")
         .mark_tick(style="middle")
-        .encode(x=alt.X("median:Q", scale=scale, axis=axis, title=title)),
+        .encode(x=alt.X("rms:Q", scale=scale, axis=axis, title=title)),
         height=STEP * len(order),
     )
 
@@ -97,8 +97,8 @@ def cost(
     ``named_<field>`` are labelled."""
     scale = log_scale(*up)
     x = alt.X(f"{field}:Q", scale=log_scale(*across), title=title, axis=log_axis(*across))
-    y = alt.Y("ratio:Q", scale=scale, title="NRMSE / EKF's", axis=log_axis(*up))
-    tips = ["estimator:N", "track:N", exact(field, title), exact("ratio", "/ ekf")]
+    y = alt.Y("ratio:Q", scale=scale, title=f"steady NRMSE / {styled.peer}'s", axis=log_axis(*up))
+    tips = ["estimator:N", "track:N", exact(field, title), exact("ratio", f"/ {styled.peer}")]
     base = (
         named("standings")
         .transform_filter(f"isValid(datum.{field})")

@@ -33,7 +33,7 @@ class Charts:
 def charts_of(page: Page, styles: Mapping[str, Style]) -> Charts:
     """Return all charts of a page: those across systems, and those of each game, whose names
     contain its number."""
-    styled = Styled(styles)
+    styled = Styled(styles, page.main.places.peer)
     parts = [_across(styled, page.costs)] if page.costs["estimator"] else []
     parts += [_game(styled, game) for section in page.sections for game in section.games]
     charts = {name: chart for part in parts for name, chart in part.charts.items()}

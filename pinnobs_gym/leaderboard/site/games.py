@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.contenders import Contender
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
 from pinnobs_gym.leaderboard.site.columns import Columns
@@ -17,6 +16,7 @@ from pinnobs_gym.leaderboard.site.over_samples import States, errors, reference,
 from pinnobs_gym.leaderboard.standings_table import Table
 from pinnobs_gym.scoring import curves
 from pinnobs_gym.scoring.curves import Curves
+from pinnobs_gym.scoring.rows import seed_of
 
 Players = Mapping[str, Sequence[ScoredRun]]
 """Runs of one game by the contender's name."""
@@ -42,12 +42,15 @@ class GameResults:
     """The example episode; None without curves."""
 
 
-def games_of(contenders: Iterable[Contender], folders: Sequence[Path]) -> list[GameResults]:
+def games_of(
+    contenders: Iterable[Contender], tables: Iterable[Table], folders: Sequence[Path]
+) -> list[GameResults]:
     """Return the results of the games in a system's ranked condition, and of nominal games after
     them.
 
     Args:
         contenders: in the order of the charts.
+        tables: of all games.
         folders: folders with their curves.
 
     Raises:
@@ -59,19 +62,23 @@ def games_of(contenders: Iterable[Contender], folders: Sequence[Path]) -> list[G
             if runs[0].ranked or game.condition == "nominal":
                 played[game][contender.name] = runs
     ranked = {game: next(iter(players.values()))[0].ranked for game, players in played.items()}
+    known = {table.game: table for table in tables}
     order = sorted(
         played, key=lambda game: (game.env_id, game.setup, not ranked[game], game.condition)
     )
-    return [_results(number, game, played[game], folders) for number, game in enumerate(order)]
+    return [
+        _results(number, known[game], played[game], folders) for number, game in enumerate(order)
+    ]
 
 
-def _results(number: int, game: GameName, players: Players, folders: Sequence[Path]) -> GameResults:
+def _results(number: int, table: Table, players: Players, folders: Sequence[Path]) -> GameResults:
+    game = table.game
     own = _curves(game, players, folders)
     rows = {name: rows_of(runs) for name, runs in players.items()}
     return GameResults(
         number=number,
         game=game,
-        table=standings_table.table(game, (run for runs in players.values() for run in runs)),
+        table=table,
         settling=settling(rows),
         ratios=ratios(rows),
         errors=errors(own),
@@ -90,7 +97,7 @@ def _curves(game: GameName, players: Players, folders: Sequence[Path]) -> dict[s
     for name, runs in players.items():
         names = sorted(run.hashes for run in runs)
         own = [part for each in names for part in parts.get(each, [])]
-        merged = curves.merged(own, {row["episode_seed"] for row in rows_of(runs)})
+        merged = curves.merged(own, {seed_of(row) for row in rows_of(runs)})
         if merged is not None:
             by_contender[name] = merged
     return by_contender

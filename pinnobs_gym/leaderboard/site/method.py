@@ -10,7 +10,7 @@ from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import Contender
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.standings import training_of
-from pinnobs_gym.scoring.rows import Row, Stored, game_of
+from pinnobs_gym.scoring.rows import Row, Stored, game_of, seed_of
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ def _command(runs: Sequence[ScoredRun], conditions: Sequence[str] = ()) -> str:
     setup = runs[0].game.setup
     words += ["--setup", setup] if setup != "benchmark" else []
     words += ["--condition", *conditions] if conditions else []
-    alone = {row["episode_seed"] for row in rows if row["training"].get("per_record")}
-    seeds = {row["episode_seed"] for row in rows}
+    alone = {seed_of(row) for row in rows if row["training"].get("per_record")}
+    seeds = {seed_of(row) for row in rows}
     words += ["--episodes", str(max(seeds) - min(seeds) + 1)]
     words += ["--trained-episodes", str(max(alone) - min(alone) + 1)] if alone else []
     budgets = {row["training"].get("config", {}).get("budget") for row in rows} - {None}

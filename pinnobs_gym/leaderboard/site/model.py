@@ -6,11 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.leaderboard import ranks
-from pinnobs_gym.leaderboard.contenders import PEER, Contender, contenders
-from pinnobs_gym.leaderboard.distinct import distinct
+from pinnobs_gym.leaderboard.board import Part, board
+from pinnobs_gym.leaderboard.contenders import Contender
 from pinnobs_gym.leaderboard.ranks import Line
-from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.site.across import Factors, costs, factors, training_seconds
 from pinnobs_gym.leaderboard.site.columns import Columns
 from pinnobs_gym.leaderboard.site.games import GameResults, games_of
@@ -40,8 +38,10 @@ class Page:
     """Track of each estimator, in display order."""
     chosen: tuple[str, ...]
     """The estimators selected initially in charts over time."""
-    lines: tuple[Line, ...]
-    """The overview across systems."""
+    main: Part
+    """Estimators that are made before any scored record is seen."""
+    on_record: Part | None
+    """Estimators that are trained on each record; None if there are none."""
     costs: Columns
     """The overview's factors and the estimators' costs; see `across.costs`."""
     sections: tuple[Section, ...]
@@ -60,20 +60,23 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
     Raises:
         ValueError: in one line, if a file of curves is damaged.
     """
-    kept, notes = distinct(stored.rows)
-    runs = runs_of(kept)
-    compared = contenders(runs)
-    lines = ranks.lines(compared)
-    listed = _listed(compared, lines)
+    results = board(stored)
+    main, on_record = results.main, results.on_record
+    listed = _listed(main.contenders, main.lines)
+    others = [] if on_record is None else _listed(on_record.contenders, on_record.lines)
+    others = [each for each in others if each.name not in {c.name for c in listed}]
     seconds = {contender.name: training_seconds(contender) for contender in listed}
+    drawn = [*listed, *others]
+    tables = {table.game: table for part in results.parts[::-1] for table in part.tables}
     return Page(
-        tracks={contender.name: contender.track for contender in listed},
-        chosen=_chosen(lines),
-        lines=tuple(lines),
-        costs=costs(lines, seconds),
-        sections=tuple(_sections(games_of(listed, folders))),
-        factors=tuple(factors(compared)),
-        method=method_of(stored, listed, notes),
+        tracks={contender.name: contender.track for contender in drawn},
+        chosen=_chosen(main.lines, main.places.peer),
+        main=main,
+        on_record=on_record,
+        costs=costs(main.lines, seconds),
+        sections=tuple(_sections(games_of(drawn, tables.values(), folders))),
+        factors=tuple(factors(main.contenders)),
+        method=method_of(stored, drawn, results.notes),
     )
 
 
@@ -84,10 +87,10 @@ def _listed(found: Iterable[Contender], lines: Iterable[Line]) -> list[Contender
     return [by_name[name] for name in order]
 
 
-def _chosen(lines: Iterable[Line]) -> tuple[str, ...]:
+def _chosen(lines: Iterable[Line], peer: str) -> tuple[str, ...]:
     """Return the best online estimators and the peer."""
     online = [line.estimator for line in lines if line.track == "online"]
-    return tuple(dict.fromkeys([*online[:SHOWN], *(name for name in online if name == PEER)]))
+    return tuple(dict.fromkeys([*online[:SHOWN], *(name for name in online if name == peer)]))
 
 
 def _sections(games: Iterable[GameResults]) -> list[Section]:

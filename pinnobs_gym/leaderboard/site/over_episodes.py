@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pinnobs_gym.leaderboard.site.columns import QUANTILES, Columns, extend, number, quantiles
+from pinnobs_gym.leaderboard.standings import over_reference
 from pinnobs_gym.scoring.rows import Row
 
 STEPS = 100
@@ -21,7 +22,7 @@ class _Ratios(NamedTuple):
     """One contender's errors over the reference."""
 
     estimator: str
-    median: float
+    rms: float
     quantiles: np.ndarray
 
 
@@ -62,17 +63,19 @@ def _steps(settled: np.ndarray, episodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ratios(players: Players) -> Columns:
-    """Return the median and quantiles ``q10`` to ``q90`` of each estimator's NRMSE over the
-    Cramér-Rao reference of the same episode, the smallest median first."""
+    """Return the ``rms`` of each estimator's NRMSE over the steady window, over that of the
+    Cramér-Rao reference of the same episodes, and quantiles ``q10`` to ``q90`` of the ratios of
+    single episodes; the smallest first."""
     spreads = []
     for name, rows in players.items():
-        values = [row["reference_ratio"] for row in rows if row["reference_ratio"] is not None]
-        if values:
+        known = [row for row in rows if row["reference_steady"] is not None]
+        if known:
+            values = [row["nrmse_steady_modulo"] / row["reference_steady"] for row in known]
             spread = quantiles(np.array(values)[:, None])[:, 0]
-            spreads.append(_Ratios(name, float(np.median(values)), spread))
-    spreads.sort(key=lambda each: each.median)
+            spreads.append(_Ratios(name, over_reference(known), spread))
+    spreads.sort(key=lambda each: each.rms)
     table: Columns = {"estimator": [each.estimator for each in spreads]}
-    table["median"] = [number(each.median) for each in spreads]
+    table["rms"] = [number(each.rms) for each in spreads]
     for i, q in enumerate(QUANTILES):
         table[f"q{100 * q:.0f}"] = [number(each.quantiles[i]) for each in spreads]
     return table

@@ -47,7 +47,7 @@ def draw(page: Page) -> str:
 
 @dataclass(frozen=True)
 class HeatCell:
-    """The factor of one estimator to the peer."""
+    """The factor of one estimator to the peer, and its rank."""
 
     text: str
     side: str
@@ -84,20 +84,19 @@ def _heat(factors: Factors) -> Heat:
 
 
 def _line(factors: Factors, condition: str) -> HeatLine:
-    values: Mapping[str, float] = factors.values[condition]
+    values: Mapping[str, Place] = factors.values[condition]
     parts = [CONDITIONS[part].summary for part in condition.split("+") if part in CONDITIONS]
     cells = (_cell(values.get(name)) for name in factors.estimators)
     return HeatLine(condition, "; ".join(parts), tuple(cells))
 
 
-def _cell(value: float | None) -> HeatCell:
-    """Return the cell of a factor's logarithm; factors of four and more have full colour."""
-    if value is None:
+def _cell(place: Place | None) -> HeatCell:
+    """Return the cell of a place; factors of four and more have full colour."""
+    if place is None:
         return HeatCell("", "none", 0.0)
-    with np.errstate(over="ignore"):
-        text = standings_table.number(float(np.exp(value)), 2)
-    depth = min(abs(value) / np.log(4), 1.0)
-    return HeatCell(text, "better" if value < 0 else "worse", round(depth, 2))
+    factor = place.factor.value
+    depth = min(abs(np.log(factor)) / np.log(4), 1.0)
+    return HeatCell(number(factor, 2), "better" if factor < 1 else "worse", round(depth, 2))
 
 
 def _marked(text: str) -> Markup:

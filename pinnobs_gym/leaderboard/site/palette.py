@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.leaderboard.contenders import PEER
+from pinnobs_gym.leaderboard.places import PEER
 
 LIGHT = ("#0072b2", "#d55e00", "#009e73", "#b8559a", "#c78500", "#3d9bd6", "#7a5230")
 DARK = ("#4aa8e0", "#ff8a3d", "#2fc79b", "#e08ec4", "#f2b733", "#9ad4ff", "#c9a27e")

@@ -16,7 +16,7 @@ from pinnobs_gym.scoring.rows import Stored
 COMMON = {"date": "2030-01-02T00:00:00", "versions": {"numpy": "2"}}
 MOTOR = {"env_id": "pinnobs/Motor-v0", **COMMON}
 FAILURE = {"env_id": "pinnobs/Motor-v0", "setup": "benchmark", "condition": "nominal"}
-FAILURE |= {"estimator": "broken", "episode_seed": 0, "episodes": 4, "error": "no luck"}
+FAILURE |= {"estimator": "broken", "episode": "seed:0", "episodes": 4, "error": "no luck"}
 
 
 def scored():

@@ -34,7 +34,7 @@ def scored(tmp_path_factory):
     for condition in ("nominal", "load_step"):
         evaluate("ekf", MOTOR, episodes=2, results=path, condition=condition)
     failed = {"schema": rows.SCHEMA, "kind": "failure", "env_id": DUFFING, "setup": "benchmark"}
-    failed |= {"condition": "nominal", "estimator": "broken", "episode_seed": 0, "episodes": 4}
+    failed |= {"condition": "nominal", "estimator": "broken", "episode": "seed:0", "episodes": 4}
     failed |= {"job": "x", "error": "ZeroDivisionError: <by zero>", "date": "2030-01-01"}
     rows.append(path, [failed])
     return path
