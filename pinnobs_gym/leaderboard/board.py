@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pinnobs_gym.leaderboard import ranks, ranks_table, standings_table
 from pinnobs_gym.leaderboard.contenders import contenders
 from pinnobs_gym.leaderboard.distinct import distinct
+from pinnobs_gym.leaderboard.escapes import markdown_text
 from pinnobs_gym.leaderboard.ranks import Line
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.standings_table import Table
@@ -44,5 +45,5 @@ def board(stored: Stored) -> Board:
 def markdown(board: Board) -> str:
     """Return the overview, the ranks and the table of every game in Markdown."""
     across = ranks_table.markdown(board.lines, board.ranks)
-    notes = "".join(f"\n{standings_table.markdown_text(note)}\n" for note in board.notes)
+    notes = "".join(f"\n{markdown_text(note)}\n" for note in board.notes)
     return across + notes + "\n" + standings_table.markdown(board.tables)

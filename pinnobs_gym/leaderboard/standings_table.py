@@ -1,15 +1,16 @@
-"""The table of each game, as cells and as Markdown."""
+"""The table of each game, as text and as Markdown."""
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
 from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.runs import ScoredRun
 from pinnobs_gym.leaderboard.standings import Standing
@@ -70,36 +71,53 @@ def _uneven(runs: Sequence[ScoredRun]) -> str:
     return ""
 
 
-HEADER = (
-    "",
-    "estimator",
-    "track",
-    "episodes",
-    "diverged %",
-    "settled s",
-    "NRMSE",
-    "tail NRMSE",
-    "90th pct.",
-    "/ CRR",
-    "tail / CRR",
-    "ANEES",
-    "covers %",
-    "NIS",
-    "corr.",
-    "µs/step",
-    "knows",
-    "training",
+Show: TypeAlias = Callable[[Interval], str]
+"""How a number is shown: with or without its interval."""
+
+COLUMNS: tuple[tuple[Column, Callable[[Standing, Show], str]], ...] = (
+    (Column("track", 3, numeric=False), lambda s, _: s.track),
+    (Column("episodes", 1), lambda s, _: str(s.episodes)),
+    (Column("diverged %"), lambda s, show: show(s.diverged.percent)),
+    (Column("settled s", 1), lambda s, _: number(s.settling.value)),
+    (Column("NRMSE"), lambda s, show: show(s.nrmse)),
+    (Column("tail NRMSE"), lambda s, show: _tail(s, show)),
+    (Column("90th pct.", 3), lambda s, _: number(s.tail_90)),
+    (Column("/ CRR", 3), lambda s, _: _optional(s.reference_ratio)),
+    (Column("tail / CRR", 3), lambda s, _: _optional(s.reference_ratio_tail)),
+    (Column("ANEES", 2), lambda s, _: _banded(s.anees)),
+    (Column("covers %", 2), lambda s, _: _optional(_percent(s.coverage), 2)),
+    (Column("NIS", 3), lambda s, _: _optional(s.nis)),
+    (Column("corr.", 3), lambda s, _: _optional(s.innovation_correlation, 2)),
+    (Column("µs/step", 3), lambda s, _: number(s.us_per_step)),
+    (Column("knows", 4, numeric=False), lambda s, _: s.knows),
+    (Column("training", 5, numeric=False), lambda s, _: s.training),
 )
-"""The column headings of a table."""
+"""The columns of a table behind rank and name, and the text of each for a standing."""
 
 
-def cells(table: Table, intervals: bool = True) -> list[list[str]]:
-    """Return the table's rows as text, a cell per column of `HEADER`, with or without intervals."""
-    lines, ranks = [], defaultdict(int)
+def grid(table: Table, intervals: bool = True) -> Grid:
+    """Return the table as text, with or without intervals, and a rule between the tracks."""
+    show: Show = _interval if intervals else lambda interval: number(interval.value)
+    ranks: dict[str, int] = defaultdict(int)
+    lines = []
     for standing, name in zip(table.standings, names(table.standings), strict=True):
         ranks[standing.track] += 1
-        lines.append([str(ranks[standing.track]), name, *_cells(standing, intervals)])
-    return lines
+        shown = (cell(standing, show) for _, cell in COLUMNS)
+        lines.append((str(ranks[standing.track]), name, *shown))
+    columns = (Column("rank"), Column("estimator", numeric=False), *(c for c, _ in COLUMNS))
+    blocks = track_blocks([standing.track for standing in table.standings])
+    return Grid(table.title, columns, tuple(lines), blocks, table.note)
+
+
+def layouts(table: Table) -> Layouts:
+    """Return the table as text with intervals, and without them for where they do not fit."""
+    return ((grid(table),), (grid(table, intervals=False),))
+
+
+def track_blocks(tracks: Sequence[str]) -> tuple[int, ...]:
+    """Return the indices of lines of these tracks, online first, before which a rule is drawn."""
+    online = [track == "online" for track in tracks]
+    return (online.index(False),) if not all(online) else ()
 
 
 def names(standings: Iterable[Standing]) -> list[str]:
@@ -115,61 +133,9 @@ def names(standings: Iterable[Standing]) -> list[str]:
     ]
 
 
-def _cells(s: Standing, intervals: bool) -> list[str]:
-    """Return the cells of a standing, except its rank and name."""
-    shown = _interval if intervals else lambda interval: number(interval.value)
-    tail = shown(s.tail)
-    if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
-        tail += f" [{number(s.tail_modulo)}]"
-    return [
-        s.track,
-        str(s.episodes),
-        shown(s.diverged.percent),
-        number(s.settling.value),
-        shown(s.nrmse),
-        tail,
-        number(s.tail_90),
-        _optional(s.reference_ratio),
-        _optional(s.reference_ratio_tail),
-        _banded(s.anees),
-        _optional(None if s.coverage is None else 100 * s.coverage, 2),
-        _optional(s.nis),
-        _optional(s.innovation_correlation, 2),
-        number(s.us_per_step),
-        s.knows,
-        s.training,
-    ]
-
-
 def markdown(tables: Iterable[Table]) -> str:
     """Return the tables in Markdown."""
-    parts = ["# Each game\n", NOTE + "\n"]
-    for table in tables:
-        parts.append(f"\n## {markdown_text(table.title)}\n")
-        parts.append(text_table(HEADER, cells(table)))
-        parts += [f"\n{markdown_text(table.note)}"] if table.note else []
-    return "\n".join(parts) + "\n"
-
-
-def markdown_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return one table in Markdown, of cells in Markdown."""
-    rules = ["---"] * len(header)
-    return "\n".join("| " + " | ".join(line) + " |" for line in (header, rules, *lines))
-
-
-def text_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return one table in Markdown, of cells that are text, whatever characters are in them."""
-    return markdown_table(
-        [markdown_text(cell) for cell in header],
-        ([markdown_text(cell) for cell in line] for line in lines),
-    )
-
-
-def markdown_text(text: str) -> str:
-    """Return text with the characters escaped that Markdown, HTML or a table would take for
-    markup; brackets only where they could be a link."""
-    text = re.sub(r"[\\`*<>|]", r"\\\g<0>", " ".join(text.split()))
-    return re.sub(r"\](?=[(\[:])", r"\\]", text)
+    return "\n\n".join(["# Each game", NOTE, *(grid(table).markdown() for table in tables)]) + "\n"
 
 
 NOTE = (
@@ -199,6 +165,19 @@ def number(value: float, digits: int = 3) -> str:
 
 def _optional(value: float | None, digits: int = 3) -> str:
     return "" if value is None else number(value, digits)
+
+
+def _percent(part: float | None) -> float | None:
+    return None if part is None else 100 * part
+
+
+def _tail(s: Standing, show: Show) -> str:
+    """Format the NRMSE over the last quarter, in brackets that modulo indistinguishable states if
+    it differs."""
+    tail = show(s.tail)
+    if s.tail_modulo is not None and number(s.tail_modulo) != number(s.tail.value):
+        tail += f" [{number(s.tail_modulo)}]"
+    return tail
 
 
 def _banded(value: Interval | None) -> str:

@@ -64,7 +64,8 @@ class Evaluate:
         check_writable(self.out)
         scored = self._score(game, estimator, episodes)
         for table in standings_table.tables(runs_of(scored)):
-            print_table(table)
+            hint = f"pinnobs tables {self._rows} -o FILE writes all"
+            print_table(standings_table.layouts(table), hint)
         console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pinnobs_gym.cli.console import RunView, console, print_grid, print_table
+from pinnobs_gym.cli.console import RunView, console, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.leaderboard import ranks_table, standings_table, suites
@@ -135,18 +135,19 @@ class Leaderboard:
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
         """Print and write the results."""
         results = board(stored)
+        path = self.out / "leaderboard.md"
+        hint = f"{path} has all"
         shown = [table for table in results.tables if table.game.condition in conditions]
         for table in shown if len(conditions) <= 2 else ():
-            print_table(table)
+            print_table(standings_table.layouts(table), hint)
         console.print(standings_table.NOTE if len(conditions) <= 2 else "")
-        print_grid("Across systems", *ranks_table.cells(results.lines))
+        print_table(ranks_table.layouts(results.lines), hint)
         console.print(ranks_table.NOTE)
         for note in results.notes:
             console.print(note, style="yellow", soft_wrap=True)
         if len(results.ranks) > 1:
-            print_grid("Ranks", *ranks_table.rank_cells(results.ranks))
+            print_table(ranks_table.rank_layouts(results.ranks), hint)
             console.print(ranks_table.RANK_NOTE)
-        path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
             temporary.write_text(markdown(results), encoding="utf-8")
         for what, where in (

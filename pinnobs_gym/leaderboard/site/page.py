@@ -31,10 +31,9 @@ def draw(page: Page) -> str:
     environment.filters |= {"marked": _marked, "anchor": _anchor}
     return environment.from_string(_text("page.html")).render(
         page=page,
-        overview=ranks_table.cells(page.lines),
+        overview=ranks_table.grid(page.lines),
         note=ranks_table.NOTE,
-        header=standings_table.HEADER,
-        cells=standings_table.cells,
+        grid=standings_table.grid,
         heat=[_heat(each) for each in page.factors],
         styles=drawn,
         charts=charts.charts,
