@@ -21,7 +21,7 @@ from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import consistency, metrics, rows
 from pinnobs_gym.scoring.playing import play

@@ -11,7 +11,7 @@ from typing import Any
 
 from machine import processor
 
-from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.leaderboard.grid import markdown_table
 
 HEADER = ("figure", "measured", "asked")
 

@@ -30,8 +30,8 @@ from pinnobs_gym.files import replacing
 from pinnobs_gym.leaderboard import ranks, ranks_table
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.grid import text_table
 from pinnobs_gym.leaderboard.runs import runs_of
-from pinnobs_gym.leaderboard.standings_table import text_table
 from pinnobs_gym.scoring import rows
 
 ROOT = Path(__file__).parents[1]
@@ -72,9 +72,11 @@ def summary(scored: list[rows.Row]) -> str:
         "`runs/leaderboard/leaderboard.md`."
     )
     standings = board(rows.Stored(scored, []))
-    parts = [intro, ranks_table.NOTE, text_table(*ranks_table.cells(standings.lines))]
+    overview = ranks_table.grid(standings.lines)
+    parts = [intro, ranks_table.NOTE, text_table(overview.header, overview.lines)]
     if len(standings.ranks) > 2:
-        parts += [ranks_table.RANK_NOTE, text_table(*ranks_table.rank_cells(standings.ranks))]
+        placed = ranks_table.rank_grid(standings.ranks)
+        parts += [ranks_table.RANK_NOTE, text_table(placed.header, placed.lines)]
     return "\n\n".join(parts)
 
 
@@ -86,7 +88,8 @@ def under_conditions(scored: list[rows.Row]) -> str:
         f"--condition all --episodes {episodes}`."
     )
     ratios = ranks.log_ratios(contenders(runs_of(scored)))
-    table = text_table(*ranks_table.rank_cells(ranks.ranks(ratios)))
+    placed = ranks_table.rank_grid(ranks.ranks(ratios))
+    table = text_table(placed.header, placed.lines)
     return "\n\n".join([intro, ranks_table.RANK_NOTE, table])
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from rich import box
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import (
@@ -18,48 +18,31 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table as RichTable
 from rich.text import Text
 
-from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.grid import PROSE, Layouts, fitting
 
-WIDE = 190
-"""Width of a leaderboard's table with its intervals, in characters."""
 _PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
-console = Console(**_PLAIN) if Console().is_terminal else Console(width=WIDE, **_PLAIN)
-"""The console for all output; wide enough for the tables if it is not a terminal. Names are data:
-brackets and colons in them are printed as they are."""
+console = Console(**_PLAIN) if Console().is_terminal else Console(width=PROSE, **_PLAIN)
+"""The console for all output. Names are data: brackets and colons in them are printed as they
+are."""
 
 
-def print_table(table: standings_table.Table) -> None:
-    """Print a leaderboard's table, without intervals on a narrow terminal."""
-    wide = console.width >= WIDE
-    shown = RichTable(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE)
-    hidden = {"knows", "training", "NIS", "corr.", "tail / CRR"}
-    hidden |= {"track"} if wide else {"90th pct.", "µs/step", "/ CRR", "ANEES", "covers %"}
-    columns = [i for i, name in enumerate(standings_table.HEADER) if name not in hidden]
-    for i in columns:
-        name = standings_table.HEADER[i]
-        text = name in ("estimator", "track")
-        shown.add_column(name, justify="left" if text else "right", no_wrap=True)
-    for line in standings_table.cells(table, intervals=wide):
-        shown.add_row(*(line[i] for i in columns))
-    console.print(shown)
-    for standing, name in zip(table.standings, standings_table.names(table.standings), strict=True):
-        trained = f"; trained: {standing.training}" if standing.training else ""
-        console.print(f"  {name} knows: {standing.knows}{trained}")
-    if table.note:
-        console.print(f"  {table.note}", style="yellow")
+def table_width() -> int | None:
+    """Return the width of tables: that of the terminal; elsewhere the environment variable COLUMNS
+    or, without it, None: a pipe or a file gets all columns, as ``less -S`` can show them."""
+    if console.is_terminal:
+        return console.width
+    given = os.environ.get("COLUMNS", "")
+    return int(given) if given.isdecimal() and int(given) else None
 
 
-def print_grid(title: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
-    """Print a table of text with names in its first column."""
-    shown = RichTable(title=title, title_justify="left", title_style="bold", box=box.SIMPLE)
-    for i, name in enumerate(header):
-        shown.add_column(name, justify="right" if i else "left", overflow="fold")
-    for line in lines:
-        shown.add_row(*line)
-    console.print(shown)
+def print_table(layouts: Layouts, hint: str = "") -> None:
+    """Print a table in the first of its layouts that fits. ``hint`` says where the columns are
+    found that do not."""
+    width = table_width()
+    for grid in fitting(layouts, width):
+        console.print(grid.text(width, hint) + "\n", soft_wrap=True, highlight=False)
 
 
 def progress() -> Progress:

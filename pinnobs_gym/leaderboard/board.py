@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.leaderboard import ranks, standings_table
+from pinnobs_gym.leaderboard import ranks
 from pinnobs_gym.leaderboard.contenders import Contender, contenders
 from pinnobs_gym.leaderboard.distinct import distinct
 from pinnobs_gym.leaderboard.places import Places
 from pinnobs_gym.leaderboard.ranks import Line
 from pinnobs_gym.leaderboard.runs import ScoredRun, apart, runs_of
-from pinnobs_gym.leaderboard.standings_table import Table
+from pinnobs_gym.leaderboard.tables import Table, tables
 from pinnobs_gym.scoring.rows import Row, Stored
 
 
@@ -28,6 +28,14 @@ class Part:
     """The places of the overview."""
     conditions: Mapping[str, Places]
     """Places of online estimators under each condition, over all systems."""
+
+    @property
+    def knows(self) -> dict[str, tuple[str, ...]]:
+        """What each estimator knows, the most in any game."""
+        return {
+            each.name: max((tuple(run.rows[0]["knows"]) for run in each.runs), key=len)
+            for each in self.contenders
+        }
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,7 @@ def _part(runs: Sequence[ScoredRun], failures: Sequence[Row]) -> Part:
     lines, places = ranks.lines(compared)
     return Part(
         contenders=tuple(compared),
-        tables=tuple(standings_table.tables(compared, failures)),
+        tables=tuple(tables(compared, failures)),
         lines=tuple(lines),
         places=places,
         conditions=ranks.by_condition(compared),

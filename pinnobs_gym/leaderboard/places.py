@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.comparison import Results, score
+from pinnobs_gym.leaderboard.comparison import Estimate, Results, score
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender
-from pinnobs_gym.leaderboard.intervals import Interval
+from pinnobs_gym.leaderboard.intervals import CONFIDENCE, Interval
 from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 
 PEER = "ukf"
@@ -37,6 +39,10 @@ class Places:
     """Name of the estimator that all are compared with; empty if there is none."""
     windows: Mapping[str, Mapping[str, Place]] = field(default_factory=dict)
     """By window and name."""
+    left_out: tuple[GameName, ...] = ()
+    """Games that are not compared, since states are not identifiable."""
+    too_few: bool = False
+    """Whether nothing is ranked because some game has fewer than `FEWEST` episodes."""
 
     def place(self, window: str, name: str) -> Place | None:
         """Return the place of an estimator in a window; None if it has none."""
@@ -50,10 +56,14 @@ class Places:
     def order(self, name: str) -> tuple[float, float, float]:
         """Return the sort key of an estimator: by its steady rank, then by its steady factor, then
         by the transient one; those without come last."""
-        found = [self.place(window, name) for window in WINDOWS]
-        factors = [float("inf") if place is None else place.factor.value for place in found]
         rank = self.rank("steady", name)
-        return (float("inf") if rank is None else rank, *factors)
+        steady, transient = (self._factor(window, name) for window in WINDOWS)
+        return np.inf if rank is None else rank, steady, transient
+
+    def _factor(self, window: str, name: str) -> float:
+        """Return the factor of an estimator in a window; infinite without a place."""
+        place = self.place(window, name)
+        return np.inf if place is None else place.factor.value
 
 
 def places(contenders: Iterable[Contender]) -> Places:
@@ -63,10 +73,14 @@ def places(contenders: Iterable[Contender]) -> Places:
     the peer played, in every training; under conditions other than nominal there must be `FEWEST`
     episodes.
     """
-    found = [c for c in contenders if _comparable(c)]
+    players = list(contenders)
+    games = dict.fromkeys(game for player in players for game in player.games)
+    found = [player for player in players if _comparable(player)]
+    compared = {game for player in found for game in _comparable(player)}
+    left_out = tuple(game for game in games if game not in compared)
     peer = peer_of(found)
     if peer is None:
-        return Places()
+        return Places(left_out=left_out)
     windows = {}
     for window in WINDOWS:
         results = {contender.name: _results(contender, peer, window) for contender in found}
@@ -75,11 +89,11 @@ def places(contenders: Iterable[Contender]) -> Places:
             whole = [c.name for c in found if c.track == track and _complete(c, peer)]
             ranks |= ranks_of(tie_groups({name: results[name] for name in whole}))
         windows[window] = {
-            name: Place(score(own).interval.exp, ranks.get(name))
+            name: Place(_interval(score(own)).exp, ranks.get(name))
             for name, own in results.items()
             if own
         }
-    return Places(peer.name, windows)
+    return Places(peer.name, windows, left_out, _too_few(peer))
 
 
 def peer_of(contenders: Sequence[Contender]) -> Contender | None:
@@ -112,10 +126,28 @@ def _results(contender: Contender, peer: Contender, window: str) -> dict[str, Re
 
 def _complete(contender: Contender, peer: Contender) -> bool:
     """Return whether a contender played all that the peer did, and enough of it to be ranked."""
-    for game in _comparable(peer):
-        wanted = peer.errors[game].episodes
-        if game not in contender.games or not set(wanted) <= set(contender.errors[game].episodes):
-            return False
-        if game.condition != "nominal" and len(wanted) < FEWEST:
-            return False
-    return True
+    return not _too_few(peer) and all(
+        game in contender.games
+        and set(peer.errors[game].episodes) <= set(contender.errors[game].episodes)
+        for game in _comparable(peer)
+    )
+
+
+def _too_few(peer: Contender) -> bool:
+    """Return whether a game under a condition other than nominal has too few episodes."""
+    return any(
+        game.condition != "nominal" and len(peer.errors[game].episodes) < FEWEST
+        for game in _comparable(peer)
+    )
+
+
+def _interval(estimate: Estimate) -> Interval:
+    """Return an estimate with its 95 % interval."""
+    if estimate.standard_error == 0:
+        return Interval(estimate.value, estimate.value, estimate.value)
+    if not np.isfinite(estimate.standard_error):
+        return Interval(estimate.value, -np.inf, np.inf)
+    from scipy.special import stdtrit  # scipy.stats takes long to import
+
+    half = float(stdtrit(estimate.degrees, (1 + CONFIDENCE) / 2)) * estimate.standard_error
+    return Interval(estimate.value, estimate.value - half, estimate.value + half)

@@ -28,9 +28,9 @@ class Line:
     """Median over games."""
 
     @property
-    def knows(self) -> str:
+    def knows(self) -> tuple[str, ...]:
         """The information given to it, the most in any of its games."""
-        return max((standing.knows for standing in self.games.values()), key=len, default="")
+        return max((standing.knows for standing in self.games.values()), key=len, default=())
 
 
 def lines(contenders: Iterable[Contender]) -> tuple[list[Line], Places]:

@@ -1,90 +1,179 @@
-"""The tables across systems and conditions, as cells and as Markdown."""
+"""The tables across systems and conditions, as text."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-import numpy as np
-
+from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import label
-from pinnobs_gym.leaderboard.intervals import Interval
-from pinnobs_gym.leaderboard.ranks import Line
+from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
+from pinnobs_gym.leaderboard.numerals import number
+from pinnobs_gym.leaderboard.places import FEWEST, Place, Places
+from pinnobs_gym.leaderboard.ranks import Line, worst_ranks
 from pinnobs_gym.leaderboard.standings import Standing
-from pinnobs_gym.leaderboard.standings_table import number, text_table
+from pinnobs_gym.leaderboard.standings_table import track_blocks, with_letters
 
 NOTE = (
-    "Median NRMSE over the whole episode, under the condition that a system is ranked under; `div` "
-    "is the part of the episodes that diverged, which score infinity. Lines stand in the order of "
-    "`/ ekf`: the interquartile mean over all systems and episodes of log(NRMSE / the EKF's on the "
-    "same episode), as a factor, with its 95 % bootstrap interval. Infinite scores count: they are "
-    "trimmed only as part of the highest quarter. `better` is the part of the episodes with a "
-    "smaller NRMSE than the EKF's. Offline estimators see the whole record first."
+    "Under the condition that each system is ranked under. The factor is the error over the "
+    "peer's: per system the interquartile mean over trainings and episodes of log(NRMSE / the "
+    "peer's on the same episode), then the geometric mean over systems, with its 95 % interval "
+    "from trainings and episodes. Lines stand in the order of the rank in the steady window. "
+    "Estimators of one rank cannot be told apart: none is significantly worse than the best of "
+    "them (5 % for each group). Diverging significantly more often outranks a smaller error; in "
+    "the factors a diverged episode counts as an error of the whole scale or more. Columns of "
+    "systems have the median steady NRMSE and, as `div`, how many episodes diverged. Without a "
+    "rank are those that did not play every episode that the peer played."
 )
 """Explanation of the overview."""
-
-
-def cells(found: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
-    """Return the overview's header and rows as text."""
-    games = sorted({game for line in found for game in line.games}, key=label)
-    header = ["estimator", "track", "/ ekf", "better", *map(label, games), "µs/step", "knows"]
-    rows = []
-    for line in found:
-        shown = [_cell(line.games.get(game)) for game in games]
-        ratio = "" if line.ratio is None else _factor(line.ratio)
-        better = "" if line.better is None else f"{100 * line.better.value:.0f} %"
-        rows.append(
-            [
-                *(line.estimator, line.track, ratio, better, *shown),
-                *(number(line.us_per_step, 2), line.knows),
-            ]
-        )
-    return header, rows
-
-
-def rank_cells(found: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[list[str]]]:
-    """Return the header and rows of the table of ranks as text: a column per estimator, sorted by
-    worst rank, a row per condition, and a last row with the worst rank."""
-    worst: dict[str, int] = {}
-    total: dict[str, int] = defaultdict(int)
-    for placed in found.values():
-        for name, rank in placed.items():
-            worst[name] = max(worst.get(name, 0), rank)
-            total[name] += rank
-    names = sorted(worst, key=lambda name: (worst[name], total[name]))
-    rows = [
-        [condition, *(str(placed.get(name, "")) for name in names)]
-        for condition, placed in found.items()
-    ]
-    return ["condition", *names], [*rows, ["worst", *(str(worst[name]) for name in names)]]
-
-
 RANK_NOTE = (
-    "Rank of each online estimator under every condition, by the same interquartile mean; of those "
-    "alone that played every system that the EKF did. Estimators stand in the order of their worst "
-    "rank."
+    "Rank of each online estimator in the steady window under every condition, over all systems; "
+    "of those alone that played all that the peer did. Estimators stand in the order of their "
+    "worst rank."
 )
 """Explanation of the table of ranks."""
+TITLE = "Across systems"
+AT_ONCE = 5
+"""Conditions in one table of ranks where not all fit."""
+OF_GAME: tuple[tuple[Column, Callable[[Standing], str]], ...] = (
+    (Column("steady"), lambda s: number(s.steady.value)),
+    (Column("transient"), lambda s: number(s.transient.value)),
+    (Column("diverged %"), lambda s: number(s.diverged.percent.value)),
+    (Column("µs/step", 1), lambda s: number(s.us_per_step, 2)),
+)
+"""The columns of one game in an overview that has a table per game."""
 
 
-def markdown(found: Sequence[Line], placed: Mapping[str, Mapping[str, int]]) -> str:
-    """Return the overview of `lines` in Markdown, followed by the table of `ranks` if it has
-    several conditions."""
-    parts = ["# Leaderboard\n", NOTE, "", text_table(*cells(found)), ""]
-    if len(placed) > 1:
-        parts += ["# Conditions\n", RANK_NOTE, "", text_table(*rank_cells(placed)), ""]
-    return "\n".join(parts) + "\n"
+def grid(found: Sequence[Line], peer: str) -> Grid:
+    """Return the overview as text, with a column per game that is never dropped."""
+    return _overview(found, peer, _games(found))
 
 
-def _cell(s: Standing | None) -> str:
+def layouts(found: Sequence[Line], peer: str) -> Layouts:
+    """Return the overview with a column per game and, where that does not fit, as a table across
+    games followed by one of each game."""
+    across = with_letters(_overview(found, peer, ()), [line.knows for line in found])
+    narrow = (across, *(_game(game, found) for game in _games(found)))
+    return ((grid(found, peer),), narrow)
+
+
+def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Grid:
+    """Return the overview with columns of these games."""
+    columns: list[tuple[Column, Callable[[Line], str]]] = [
+        (Column("rank"), lambda line: _rank(line.places.get("steady"))),
+        (Column("estimator", numeric=False), lambda line: line.estimator),
+        (Column(f"steady / {peer}"), lambda line: _factor(line.places.get("steady"))),
+        (Column("rank, transient", 1), lambda line: _rank(line.places.get("transient"))),
+        (Column(f"transient / {peer}"), lambda line: _factor(line.places.get("transient"))),
+        *(
+            (Column(label(game)), lambda line, game=game: _of_game(line.games.get(game)))
+            for game in games
+        ),
+        (Column("track", 3, numeric=False), lambda line: line.track),
+        (Column("µs/step", 2), lambda line: number(line.us_per_step, 2)),
+        (Column("knows", numeric=False), lambda line: ", ".join(line.knows)),
+    ]
+    return Grid(
+        TITLE,
+        tuple(column for column, _ in columns),
+        tuple(tuple(cell(line) for _, cell in columns) for line in found),
+        track_blocks([line.track for line in found]),
+    )
+
+
+def _games(found: Sequence[Line]) -> list[GameName]:
+    return sorted({game for line in found for game in line.games}, key=label)
+
+
+def _game(game: GameName, found: Sequence[Line]) -> Grid:
+    """Return the overview's lines of one game, of the estimators that played it."""
+    played = [line for line in found if game in line.games]
+    return Grid(
+        label(game),
+        (Column("estimator", numeric=False), *(column for column, _ in OF_GAME)),
+        tuple((x.estimator, *(cell(x.games[game]) for _, cell in OF_GAME)) for x in played),
+        track_blocks([line.track for line in played]),
+    )
+
+
+def rank_grid(found: Mapping[str, Places], knows: Mapping[str, Sequence[str]]) -> Grid:
+    """Return the table of ranks as text: a line per estimator, sorted by worst rank, and a column
+    per condition under which there are ranks.
+
+    Args:
+        found: places by condition.
+        knows: what each estimator knows, by name.
+    """
+    ranked, notes = _ranked(found)
+    return _ranks(found, ranked, knows, notes)
+
+
+def rank_layouts(found: Mapping[str, Places], knows: Mapping[str, Sequence[str]]) -> Layouts:
+    """Return the table of ranks with all conditions and, where that does not fit, in parts."""
+    ranked, notes = _ranked(found)
+    known = [knows[name] for name in worst_ranks(found)]
+    parts = [
+        with_letters(_ranks(found, ranked[first : first + AT_ONCE], knows, ""), known)
+        for first in range(0, len(ranked), AT_ONCE)
+    ]
+    last = [Grid("", (), (), note=notes)] if notes else []
+    return ((rank_grid(found, knows),), (*parts, *last))
+
+
+def _ranks(
+    found: Mapping[str, Places],
+    conditions: Sequence[str],
+    knows: Mapping[str, Sequence[str]],
+    note: str,
+) -> Grid:
+    """Return the ranks under these conditions."""
+    columns = (
+        Column("estimator", numeric=False),
+        *map(Column, conditions),
+        Column("worst"),
+        Column("knows", numeric=False),
+    )
+    lines = tuple(
+        (
+            name,
+            *(_rank(found[condition].place("steady", name)) for condition in conditions),
+            "" if worst is None else str(worst),
+            ", ".join(knows[name]),
+        )
+        for name, worst in worst_ranks(found).items()
+    )
+    return Grid("Ranks", columns, lines, note=note)
+
+
+def _ranked(found: Mapping[str, Places]) -> tuple[list[str], str]:
+    """Return the conditions under which there are ranks, and remarks on what is left out."""
+    ranked, notes = [], []
+    for condition, places in found.items():
+        if places.too_few:
+            notes.append(f"{condition}: fewer than {FEWEST} episodes, which are not ranked.")
+        elif not places.windows:
+            notes.append(f"{condition}: not identifiable on any system, so that nothing is ranked.")
+        else:
+            ranked.append(condition)
+            if places.left_out:
+                games = ", ".join(game.system for game in places.left_out)
+                notes.append(f"{condition}: without {games}, where states are not identifiable.")
+    return ranked, " ".join(notes)
+
+
+def _of_game(s: Standing | None) -> str:
     if s is None:
         return ""
     lost = f"div {s.diverged.percent.value:.0f} %" if s.diverged.value else ""
-    median = number(s.nrmse.value) if np.isfinite(s.nrmse.value) else ""
+    median = number(s.steady.value)
     return ", ".join(filter(None, [median, lost]))
 
 
-def _factor(ratio: Interval) -> str:
-    if np.isnan(ratio.value):
-        return "?"
-    return f"{number(ratio.value, 2)} ({number(ratio.low, 2)}-{number(ratio.high, 2)})"
+def _rank(place: Place | None) -> str:
+    return "" if place is None or place.rank is None else str(place.rank)
+
+
+def _factor(place: Place | None) -> str:
+    if place is None:
+        return ""
+    factor = place.factor
+    return f"{number(factor.value, 2)} ({number(factor.low, 2)}-{number(factor.high, 2)})"

@@ -62,7 +62,7 @@ class Standing:
     innovation_correlation: float | None
     """Mean over episodes."""
     us_per_step: float
-    knows: str
+    knows: tuple[str, ...]
     budget: float | None
     """CPU seconds allotted to training; None without such a limit."""
     training: str
@@ -99,7 +99,7 @@ def standing(rows: Sequence[Row]) -> Standing:
         nis=_statistic(np.mean, rows, "nis"),
         innovation_correlation=_statistic(np.mean, rows, "innovation_correlation"),
         us_per_step=float(np.median([row["us_per_step"] for row in rows])),
-        knows=", ".join(first["knows"]),
+        knows=tuple(first["knows"]),
         budget=first["training"].get("config", {}).get("budget"),
         training=training_of(rows),
     )

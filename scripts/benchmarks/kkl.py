@@ -15,7 +15,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
-from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS

@@ -18,7 +18,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.envs.sb3_env import Sb3VecEnv
 from pinnobs_gym.estimators.sb3 import Sb3, TrainedAgent
-from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import train_by_name

@@ -18,7 +18,8 @@ import numpy as np
 
 from benchmarks import Figure, at_least, at_most
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.leaderboard.board import board, markdown
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.chapters import markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.suites import Entry, Suite

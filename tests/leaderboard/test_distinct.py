@@ -5,7 +5,7 @@ from made_rows import rows_of
 
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.distinct import distinct
-from pinnobs_gym.leaderboard.standings_table import cells
+from pinnobs_gym.leaderboard.standings_table import grid
 from pinnobs_gym.scoring.rows import Stored
 
 OLD, NEW = {"date": "2030-01-02"}, {"date": "2030-01-03"}
@@ -87,6 +87,6 @@ def test_no_two_lines_of_a_table_look_alike():
         facts = {"training": {"config": config}, "training_seed": seed}
         rows += rows_of("gain", [1.0], estimator_hash=f"g{seed}", **facts)
     (table,) = board(Stored(rows, [])).tables
-    shown = [line[1] for line in cells(table)]
+    shown = [line[1] for line in grid(table).lines]
     assert len(shown) == 6
     assert len(set(shown)) == 6

@@ -52,12 +52,13 @@ def test_lines_by_hand():
 
 
 def test_cells_by_hand():
-    header, shown = ranks_table.cells(lines(played()))
+    grid = ranks_table.grid(lines(played()))
+    shown = grid.lines
     columns = ["estimator", "track", "/ ekf", "better", "Motor-v0 (load_step)", "X-v0", "µs/step"]
-    assert header == [*columns, "knows"]
-    assert shown[0][4:6] == ["0.05, div 25 %", "0.5"]
-    assert shown[2][4:6] == ["0.1", "div 100 %"]
-    assert shown[3][4:6] == ["", "0.25"]
+    assert grid.header == (*columns, "knows")
+    assert shown[0][4:6] == ("0.05, div 25 %", "0.5")
+    assert shown[2][4:6] == ("0.1", "div 100 %")
+    assert shown[3][4:6] == ("", "0.25")
     assert shown[0][3] == "88 %"
     text = markdown(board(Stored(played(), [])))
     assert "| half | online | 0.5 (0.5-∞) | 88 % | 0.05, div 25 % | 0.5 | 1 | model |" in text
@@ -109,9 +110,9 @@ def test_ranks_by_hand():
     assert found["load_step"] == {"ekf": 2, "half": 1, "lost": 2}
     # that both never diverged, where the EKF always did, makes them equal
     assert found["outliers"] == {"ekf": 3, "half": 1, "lost": 1}
-    header, shown = ranks_table.rank_cells(found)
-    assert header == ["condition", "half", "lost", "ekf"]
-    assert shown[-1] == ["worst", "1", "3", "3"]
+    grid = ranks_table.rank_grid(found)
+    assert grid.header == ("condition", "half", "lost", "ekf")
+    assert grid.lines[-1] == ("worst", "1", "3", "3")
 
 
 def test_estimators_that_played_less_have_no_rank():

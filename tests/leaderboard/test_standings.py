@@ -28,7 +28,7 @@ def test_markdown_has_a_table_per_game_with_all_columns():
     lines = text.splitlines()
     header = next(line for line in lines if line.startswith("| "))
     body = lines[lines.index(header) + 2]
-    assert header.count("|") == body.count("|") == len(standings_table.HEADER) + 1
+    assert header.count("|") == body.count("|") == len(standings_table.COLUMNS) + 3
     assert "## pinnobs/X-v0, benchmark, nominal" in lines
     assert "ekf" in body
     assert "0.2" in body
@@ -61,10 +61,8 @@ def test_numbers(value, text):
 def test_optional_scores_are_shown_where_they_are(tmp_path):
     facts = {"reference_ratio": 1.25, "anees": 1.5, "coverage": 0.876, "nis": 1.04}
     (table,) = tables([*rows_of("ekf", [0.1] * 50, **facts), *rows_of("bare", [0.2])])
-    ekf, bare = (
-        dict(zip(standings_table.HEADER, line, strict=True))
-        for line in standings_table.cells(table)
-    )
+    grid = standings_table.grid(table)
+    ekf, bare = (dict(zip(grid.header, line, strict=True)) for line in grid.lines)
     # the band of 50 episodes and 2 states is 0.742 to 1.296
     assert (ekf["/ CRR"], ekf["ANEES"], ekf["covers %"], ekf["NIS"]) == (
         *("1.25", "1.5 ▲", "88", "1.04"),
@@ -73,7 +71,7 @@ def test_optional_scores_are_shown_where_they_are(tmp_path):
     assert {bare[name] for name in ("/ CRR", "ANEES", "covers %", "NIS", "corr.")} == {""}
     for anees, shown in ((1.29, "1.29"), (0.7, "0.7 ▼"), (np.inf, "∞ ▲")):
         (table,) = tables(rows_of("ekf", [0.1] * 50, anees=anees))
-        assert shown in standings_table.cells(table)[0]
+        assert shown in standings_table.grid(table).lines[0]
 
 
 def test_what_failed_is_told_in_the_note_of_its_game():

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
-from rich.table import Table
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.leaderboard.grid import Column, Grid
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,20 @@ class Estimators:
         if self.name is not None:
             console.print(inspect.getdoc(ESTIMATORS.resolve(self.name)), markup=False)
             return 0
-        table = Table("name", "track", "knows", "what it is")
-        for name, cls in ESTIMATORS.classes().items():
-            first = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
-            table.add_row(name, cls.track, ", ".join(cls.knows), first)
-        console.print(table)
+        print_table([[listing()]])
         return 0
+
+
+def listing() -> Grid:
+    """Return the table of estimators. In a terminal it is a record of each: what an estimator is
+    takes a line."""
+    names = ("name", "track", "knows", "what it is")
+    columns = tuple(Column(name, numeric=False) for name in names)
+    lines = []
+    for name, cls in ESTIMATORS.classes().items():
+        first = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
+        lines.append((name, cls.track, ", ".join(cls.knows), first))
+    return Grid("", columns, tuple(lines))
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -14,7 +14,10 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.contenders import contenders
 from pinnobs_gym.leaderboard.runs import runs_of
+from pinnobs_gym.leaderboard.states_table import by_state
+from pinnobs_gym.leaderboard.tables import tables
 from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes, seeds_of
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
@@ -63,8 +66,10 @@ class Evaluate:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         check_writable(self.out)
         scored = self._score(game, estimator, episodes)
-        for table in standings_table.tables(runs_of(scored)):
-            print_table(table)
+        for table in tables(contenders(runs_of(scored))):
+            hint = f"pinnobs tables {self._rows} -o FILE writes all"
+            print_table(standings_table.layouts(table), hint)
+        print_table([[by_state(game.source.system, scored)]])
         console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pinnobs_gym.cli.console import RunView, console, print_grid, print_table
+from pinnobs_gym.cli.console import RunView, console, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
-from pinnobs_gym.leaderboard import ranks_table, standings_table, suites
-from pinnobs_gym.leaderboard.board import board, markdown
+from pinnobs_gym.leaderboard import suites
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.chapters import chapters, markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.job import Job
@@ -135,18 +136,22 @@ class Leaderboard:
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
         """Print and write the results."""
         results = board(stored)
-        shown = [table for table in results.tables if table.game.condition in conditions]
-        for table in shown if len(conditions) <= 2 else ():
-            print_table(table)
-        console.print(standings_table.NOTE if len(conditions) <= 2 else "")
-        print_grid("Across systems", *ranks_table.cells(results.lines))
-        console.print(ranks_table.NOTE)
+        path = self.out / "leaderboard.md"
+        hint = f"{path} has all"
+        found = chapters(results)
+        for chapter in found[::-1]:  # the overview last, where it is seen
+            wanted = [
+                layouts
+                for i, layouts in enumerate(chapter.tables)
+                if not chapter.games or chapter.games[i].game.condition in conditions
+            ]
+            if not wanted or (chapter.games and len(conditions) > 2):
+                continue
+            for layouts in wanted:
+                print_table(layouts, hint)
+            console.print(chapter.note + "\n", highlight=False)
         for note in results.notes:
             console.print(note, style="yellow", soft_wrap=True)
-        if len(results.ranks) > 1:
-            print_grid("Ranks", *ranks_table.rank_cells(results.ranks))
-            console.print(ranks_table.RANK_NOTE)
-        path = self.out / "leaderboard.md"
         with replacing(path) as temporary:
             temporary.write_text(markdown(results), encoding="utf-8")
         for what, where in (

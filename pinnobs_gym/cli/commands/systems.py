@@ -8,12 +8,12 @@ from typing import Annotated
 
 import tyro
 from rich.markdown import Markdown
-from rich.table import Table
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.systems import SYSTEMS
 
 
@@ -34,14 +34,20 @@ class Systems:
             else:
                 print(text)
             return 0
-        table = Table("env id", "states", "measured", "inputs", "setups")
-        for cls in SYSTEMS.classes().values():
-            system = cls()
-            states, outputs = ", ".join(cls.state_names), ", ".join(system.output_names)
-            inputs = ", ".join(cls.input_names)
-            table.add_row(env_id(cls), states, outputs, inputs, ", ".join(cls.setups))
-        console.print(table)
+        print_table([[listing()]], "pinnobs systems NAME says more")
         return 0
+
+
+def listing() -> Grid:
+    """Return the table of systems."""
+    names = {"env id": 0, "measured": 1, "states": 2, "inputs": 3, "setups": 4}
+    columns = tuple(Column(name, priority, numeric=False) for name, priority in names.items())
+    lines = []
+    for cls in SYSTEMS.classes().values():
+        measured = cls().output_names
+        parts = (measured, cls.state_names, cls.input_names, cls.setups)
+        lines.append((env_id(cls), *map(", ".join, parts)))
+    return Grid("", columns, tuple(lines))
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -37,7 +37,13 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
     """Chart the factor to the peer with its interval, a line per estimator, on an axis from low to
     high."""
     scale = log_scale(low, high)
-    tips = ["estimator:N", "track:N", exact("ratio", f"/ {styled.peer}"), exact("low"), exact("high")]
+    tips = [
+        "estimator:N",
+        "track:N",
+        exact("ratio", f"/ {styled.peer}"),
+        exact("low"),
+        exact("high"),
+    ]
     title = f"steady NRMSE / {styled.peer}'s, over all systems"
     x = alt.X("ratio:Q", scale=scale, title=title, axis=log_axis(low, high))
     base = (

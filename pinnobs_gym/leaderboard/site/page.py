@@ -14,6 +14,9 @@ import vl_convert
 from markupsafe import Markup, escape
 
 from pinnobs_gym.leaderboard import ranks_table, standings_table
+from pinnobs_gym.leaderboard.chapters import ON_RECORD
+from pinnobs_gym.leaderboard.numerals import number
+from pinnobs_gym.leaderboard.places import Place
 from pinnobs_gym.leaderboard.site.across import Factors
 from pinnobs_gym.leaderboard.site.drawings import charts_of, embedded
 from pinnobs_gym.leaderboard.site.model import Page
@@ -31,10 +34,10 @@ def draw(page: Page) -> str:
     environment.filters |= {"marked": _marked, "anchor": _anchor}
     return environment.from_string(_text("page.html")).render(
         page=page,
-        overview=ranks_table.cells(page.lines),
+        overview=lambda part: ranks_table.grid(part.lines, part.places.peer),
         note=ranks_table.NOTE,
-        header=standings_table.HEADER,
-        cells=standings_table.cells,
+        on_record=ON_RECORD,
+        grid=standings_table.grid,
         heat=[_heat(each) for each in page.factors],
         styles=drawn,
         charts=charts.charts,
@@ -74,7 +77,7 @@ class Heat:
     names: Sequence[str]
     """Names of the estimators."""
     lines: tuple[HeatLine, ...]
-    worst: Sequence[int]
+    worst: Sequence[int | None]
     """Worst rank of each estimator."""
 
 

@@ -1,0 +1,72 @@
+"""The tables of a leaderboard in the order in which they are shown, with their explanations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pinnobs_gym.leaderboard import ranks_table, standings_table
+from pinnobs_gym.leaderboard.board import Board, Part
+from pinnobs_gym.leaderboard.escapes import markdown_text
+from pinnobs_gym.leaderboard.grid import Layouts
+from pinnobs_gym.leaderboard.tables import Table
+
+ON_RECORD = (
+    "Estimators that are trained on each record by itself, and all others on the same episodes. A "
+    "training serves one record only, so that these are not ranked with the others above."
+)
+"""Explanation of the second part."""
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """Tables with a common explanation."""
+
+    key: str
+    """``overview``, ``ranks`` or ``games``; of the second part with ``on-record `` before it."""
+    title: str
+    note: str
+    tables: tuple[Layouts, ...]
+    games: tuple[Table, ...] = ()
+    """The games of the tables, if each is of one game."""
+
+
+def chapters(board: Board) -> list[Chapter]:
+    """Return the chapters of a leaderboard: overview, ranks by condition and games, first of the
+    estimators that are made before any record is seen, then on the records of the others."""
+    found = _chapters(board.main, "", "", "")
+    if board.on_record is not None:
+        found += _chapters(board.on_record, "on-record ", ", trained on each record", ON_RECORD)
+    return found
+
+
+def markdown(board: Board) -> str:
+    """Return all tables of a leaderboard in Markdown."""
+    parts = []
+    for chapter in chapters(board):
+        parts += [f"# {chapter.title}", markdown_text(chapter.note)]
+        parts += [layouts[0][0].markdown() for layouts in chapter.tables]
+    return "\n\n".join([*parts, *map(markdown_text, board.notes)]) + "\n"
+
+
+def _chapters(part: Part, key: str, title: str, note: str) -> list[Chapter]:
+    """Return the chapters of one part, with these additions to their keys, titles and notes."""
+
+    def noted(own: str) -> str:
+        return " ".join(filter(None, (note, own)))
+
+    found = []
+    if part.lines:
+        overview = ranks_table.layouts(part.lines, part.places.peer)
+        found.append(
+            Chapter(f"{key}overview", f"Leaderboard{title}", noted(ranks_table.NOTE), (overview,))
+        )
+    if len(part.conditions) > 1:
+        ranks = ranks_table.rank_layouts(part.conditions, part.knows)
+        found.append(
+            Chapter(f"{key}ranks", f"Conditions{title}", noted(ranks_table.RANK_NOTE), (ranks,))
+        )
+    tables = tuple(map(standings_table.layouts, part.tables))
+    games = Chapter(
+        f"{key}games", f"Each game{title}", noted(standings_table.NOTE), tables, part.tables
+    )
+    return [*found, games]

@@ -1,0 +1,23 @@
+"""Numbers as the tables show them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pinnobs_gym.leaderboard.intervals import Interval
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Format a score with this number of significant digits."""
+    if not np.isfinite(value):
+        return "∞"
+    if abs(value) >= 10**digits:
+        return f"{value:.0f}" if abs(value) < 1e5 else f"{value:.1e}"
+    return f"{value:.{digits}g}"
+
+
+def interval_text(interval: Interval) -> str:
+    """Format a number with its interval."""
+    if interval.low == interval.high:
+        return number(interval.value)
+    return f"{number(interval.value)} ({number(interval.low, 2)}-{number(interval.high, 2)})"
