@@ -74,7 +74,7 @@ def table(game: GameName, contenders: Iterable[Contender], notes: Sequence[str] 
 def _failed(row: Row) -> str:
     """Return a sentence about a failed job."""
     many = row["episodes"] > 1
-    which = f"{row['episodes']} episodes" if many else f"episode {row['episode']}"
+    which = f"{row['episodes']} episodes" if many else row["episode"]
     return f"Failed: {row['estimator']}, {which}: {row['error'].rstrip('.')}."
 
 

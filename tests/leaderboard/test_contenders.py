@@ -18,7 +18,7 @@ def test_runs_are_in_the_order_of_their_first_rows():
         ("b", 1, 1),
     ]
     assert [run.game for run in runs] == [X, X._replace(condition="delay")]
-    assert runs[0].standing.nrmse.value == np.median([0.1, 0.2])
+    assert runs[0].standing.steady.value == np.median([0.1, 0.2])
     assert runs[0].standing is runs[0].standing
 
 
@@ -28,21 +28,25 @@ def test_labels_leave_out_what_is_usual():
     assert label(X._replace(condition="delay", setup="paper")) == "X-v0 (delay), paper"
 
 
-def test_ratios_are_of_the_episodes_that_the_peer_and_all_trainings_played():
+def test_errors_are_of_the_episodes_that_all_trainings_played():
     made = {"training": {"seconds": 1.0}}
     rows = [
-        *rows_of("ekf", [1.0, 1.0, 2.0]),
         *rows_of("gain", [0.5, 4.0], training_seed=0, estimator_hash="g0", **made),
         *rows_of("gain", [0.25, 1.0, 1.0], training_seed=1, estimator_hash="g1", **made),
         *rows_of("gain", [9.0], condition="delay", training_seed=0, estimator_hash="g0", **made),
+        *rows_of("ukf", [20.0, 0.1, 0.1], diverged=[False, True, False]),
     ]
-    gain, ekf = contenders(runs_of(rows))
-    assert (gain.name, ekf.name) == ("gain", "ekf")  # the most rows first
+    gain, ukf = contenders(runs_of(rows))
+    assert (gain.name, ukf.name) == ("gain", "ukf")  # the most rows first
     assert list(gain.games) == [X._replace(condition="delay"), X][::-1]
-    assert list(gain.ratios) == [X]  # the peer did not play the other
-    np.testing.assert_allclose(gain.ratios[X], np.log([[0.5, 4.0], [0.25, 1.0]]))
-    assert gain.standing(X).episodes == 5
-    assert ekf.ratios[X].tolist() == [[0.0, 0.0, 0.0]]
+    assert gain.errors[X].episodes == ("seed:0", "seed:1")
+    np.testing.assert_allclose(np.exp(gain.errors[X].logs["steady"]), [[0.5, 4.0], [0.25, 1.0]])
+    assert gain.standing(X).episodes == 3
+    # errors are at most ten times the scale, and those of diverged episodes at least the scale
+    np.testing.assert_allclose(np.exp(ukf.errors[X].logs["steady"]), [[10.0, 1.0, 0.1]])
+    some = ukf.errors[X].of(["seed:2", "seed:1"])
+    np.testing.assert_allclose(np.exp(some.logs["steady"]), [[0.1, 1.0]])
+    assert some.diverged.tolist() == [[False, True]]
 
 
 def test_among_wanted_games_the_order_is_of_their_rows_alone():

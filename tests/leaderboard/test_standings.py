@@ -2,25 +2,32 @@ import numpy as np
 import pytest
 from made_rows import rows_of
 
-from pinnobs_gym.leaderboard import standings, standings_table
+from pinnobs_gym.leaderboard import chapters, standings, standings_table, tables
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.numerals import number
 from pinnobs_gym.leaderboard.runs import runs_of
+from pinnobs_gym.scoring.rows import Stored
 
 
-def tables(rows, failures=()):
-    return standings_table.tables(runs_of(rows), failures)
+def tables_of(rows, failures=()):
+    return tables.tables(contenders(runs_of(rows)), failures)
 
 
-def test_estimators_are_ranked_by_median_within_their_track():
+def test_estimators_are_ranked_within_their_track():
     rows = [
-        *rows_of("worse", [0.3, 0.1, 0.2]),
-        *rows_of("better", [0.1, 0.1, 0.4]),
-        *rows_of("offline", [0.01, 0.01, 0.01], track="offline"),
-        *rows_of("worst", [0.1, 0.1, 0.1], diverged=[True, True, False]),
+        *rows_of("worse", [0.3, 0.1, 0.2] * 20),
+        *rows_of("better", [0.1, 0.05, 0.1] * 20),
+        *rows_of("offline", [0.01, 0.01, 0.01] * 20, track="offline"),
+        *rows_of("worst", [0.01, 0.01, 0.01] * 20, diverged=[True, True, False] * 20),
+        *rows_of("told", [0.01] * 60, track="online, condition known"),
     ]
-    (table,) = tables(rows)
-    assert [s.estimator for s in table.standings] == ["better", "worse", "worst", "offline"]
-    assert np.isinf(table.standings[2].nrmse.value)
-    assert table.standings[2].diverged.value == pytest.approx(2 / 3)
+    (table,) = tables_of(rows)
+    found = [(entry.name, entry.ranks["steady"]) for entry in table.entries]
+    online = [("better", 1), ("worse", 2), ("worst", 3)]
+    assert found == [*online, ("offline", 1), ("told", 1)]
+    assert np.isinf(table.entries[2].standing.steady.value)
+    assert table.entries[2].standing.diverged.value == pytest.approx(2 / 3)
 
 
 def test_markdown_has_a_table_per_game_with_all_columns():
@@ -35,13 +42,12 @@ def test_markdown_has_a_table_per_game_with_all_columns():
 
 
 def test_unequal_episodes_are_pointed_out():
-    same = tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1, 0.2])])
+    same = tables_of([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1, 0.2])])
     assert same[0].note == ""
-    uneven = tables([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1])])
+    uneven = tables_of([*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1])])
     assert "Not all online estimators" in uneven[0].note
-    assert uneven[0].note in standings_table.markdown(uneven)
     apart = [*rows_of("a", [0.1, 0.2]), *rows_of("b", [0.1], track="offline")]
-    assert tables(apart)[0].note == ""
+    assert tables_of(apart)[0].note == ""
 
 
 def test_training_is_told_in_the_row():
@@ -55,22 +61,21 @@ def test_training_is_told_in_the_row():
     [(0.00123456, "0.00123"), (np.inf, "∞"), (1234.5, "1234"), (12.345, "12.3"), (0, "0")],
 )
 def test_numbers(value, text):
-    assert standings_table.number(value) == text
+    assert number(value) == text
 
 
 def test_optional_scores_are_shown_where_they_are(tmp_path):
-    facts = {"reference_ratio": 1.25, "anees": 1.5, "coverage": 0.876, "nis": 1.04}
-    (table,) = tables([*rows_of("ekf", [0.1] * 50, **facts), *rows_of("bare", [0.2])])
+    facts = {"reference_steady": 0.08, "anees": 1.5, "coverage": 0.876, "nis": 1.04}
+    (table,) = tables_of([*rows_of("ekf", [0.1] * 50, **facts), *rows_of("bare", [0.2])])
     grid = standings_table.grid(table)
     ekf, bare = (dict(zip(grid.header, line, strict=True)) for line in grid.lines)
     # the band of 50 episodes and 2 states is 0.742 to 1.296
     assert (ekf["/ CRR"], ekf["ANEES"], ekf["covers %"], ekf["NIS"]) == (
         *("1.25", "1.5 ▲", "88", "1.04"),
     )
-    assert ekf["tail / CRR"] == ""
     assert {bare[name] for name in ("/ CRR", "ANEES", "covers %", "NIS", "corr.")} == {""}
     for anees, shown in ((1.29, "1.29"), (0.7, "0.7 ▼"), (np.inf, "∞ ▲")):
-        (table,) = tables(rows_of("ekf", [0.1] * 50, anees=anees))
+        (table,) = tables_of(rows_of("ekf", [0.1] * 50, anees=anees))
         assert shown in standings_table.grid(table).lines[0]
 
 
@@ -85,9 +90,18 @@ def test_what_failed_is_told_in_the_note_of_its_game():
         "error": "RuntimeError: out of luck.",
     }
     other = failure | {"condition": "noise5", "episodes": 20}
-    second, first = tables(rows_of("ekf", [0.1, 0.2]), [failure, other])
-    assert first.note == "Failed: mine, episode 3: RuntimeError: out of luck."
-    assert [s.estimator for s in first.standings] == ["ekf"]
-    assert (second.game.condition, second.standings) == ("noise5", ())  # nothing else was played
+    second, first = tables_of(rows_of("ekf", [0.1, 0.2]), [failure, other])
+    assert first.note == "Failed: mine, seed:3: RuntimeError: out of luck."
+    assert [entry.name for entry in first.entries] == ["ekf"]
+    assert (second.game.condition, second.entries) == ("noise5", ())  # nothing else was played
     assert second.note == "Failed: mine, 20 episodes: RuntimeError: out of luck."
-    assert second.note in standings_table.markdown([first, second])
+    text = chapters.markdown(board(Stored(rows_of("ekf", [0.1, 0.2]), [failure, other])))
+    assert second.note in text
+
+
+def test_the_ratio_to_the_reference_is_of_root_mean_squares():
+    rows = rows_of("ekf", [3.0, 4.0, 99.0])
+    for row, reference in zip(rows, (1.0, 2.0, None), strict=True):
+        row["reference_steady"] = reference
+    found = standings.standing(rows)
+    assert found.over_reference == pytest.approx(5 / 5**0.5)
