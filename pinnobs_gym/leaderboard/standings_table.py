@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -110,8 +110,11 @@ def grid(table: Table, intervals: bool = True) -> Grid:
 
 
 def layouts(table: Table) -> Layouts:
-    """Return the table as text with intervals, and without them for where they do not fit."""
-    return ((grid(table),), (grid(table, intervals=False),))
+    """Return the table as text with intervals; where they do not fit, without them; and where that
+    does not fit either, and lines become records, with intervals again."""
+    whole, short = grid(table), grid(table, intervals=False)
+    note = " ".join(filter(None, [short.note, "95 % intervals are not shown at this width."]))
+    return ((whole,), (replace(short, note=note),), (whole,))
 
 
 def track_blocks(tracks: Sequence[str]) -> tuple[int, ...]:

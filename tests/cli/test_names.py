@@ -9,9 +9,9 @@ from made_rows import rows_of
 from pinnobs_gym.cli import main
 from pinnobs_gym.files import file_name
 from pinnobs_gym.leaderboard.board import board, markdown
+from pinnobs_gym.leaderboard.escapes import markdown_text
 from pinnobs_gym.leaderboard.site.model import page_model
 from pinnobs_gym.leaderboard.site.page import draw
-from pinnobs_gym.leaderboard.escapes import markdown_text
 from pinnobs_gym.scoring.rows import SCHEMA, Stored
 
 NAMES = [
