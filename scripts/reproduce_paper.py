@@ -26,12 +26,12 @@ from reproduction import comparison, report
 from reproduction.comparison import METHODS, Comparison
 from reproduction.running import PaperJob, run
 from reproduction.tables import TABLES, Table, recipe
-from rich import box
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table as RichTable
 
+from pinnobs_gym.cli.console import print_table
 from pinnobs_gym.files import append_lines, check_writable, replacing
+from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.scoring.rows import Row
 
 COMPARISON = "comparison"
@@ -152,12 +152,11 @@ def work(jobs: Sequence[PaperJob], processes: int, results: Path) -> int:
 
 def show(table: Table, rows: Sequence[Row], path: Path) -> None:
     """Print a table and write it as Markdown."""
-    shown = RichTable(title=table.title, title_justify="left", box=box.SIMPLE)
-    for i, name in enumerate(report.HEADER):
-        shown.add_column(name, justify="left" if i < 2 else "right")
-    for line in report.lines(table, rows):
-        shown.add_row(*line)
-    console.print(shown)
+    columns = (
+        Column(name, priority=max(i - 5, 0), numeric=i >= 2) for i, name in enumerate(report.HEADER)
+    )
+    grid = Grid(table.title, tuple(columns), tuple(map(tuple, report.lines(table, rows))))
+    print_table([[grid]], f"{path} has all")
     notes = [*table.notes, report.starts(table), *report.PROTOCOL]
     for note in notes:
         console.print(note, style="dim", markup=False, highlight=False)
@@ -199,12 +198,9 @@ def compare(options: Options) -> int:
         print("stopped; the same command continues it", file=sys.stderr)
         status = 130
     rows = comparison.read(results)
-    shown = RichTable(title="Comparison", title_justify="left", box=box.SIMPLE)
-    for i, name in enumerate(comparison.HEADER):
-        shown.add_column(name, justify="left" if i < 4 else "right")
-    for line in comparison.lines(chosen, rows):
-        shown.add_row(*line)
-    console.print(shown)
+    columns = (Column(name, numeric=i >= 4) for i, name in enumerate(comparison.HEADER))
+    lines = map(tuple, comparison.lines(chosen, rows))
+    print_table([[Grid("Comparison", tuple(columns), tuple(lines))]])
     for note in chosen.protocol():
         console.print(note, style="dim", markup=False, highlight=False)
     path = options.out / f"{COMPARISON}.md"

@@ -42,7 +42,7 @@ def print_table(layouts: Layouts, hint: str = "") -> None:
     found that do not."""
     width = table_width()
     for grid in fitting(layouts, width):
-        console.print(grid.text(width, hint) + "\n", soft_wrap=True, highlight=False)
+        console.out(grid.text(width, hint) + "\n", highlight=False)
 
 
 def progress() -> Progress:

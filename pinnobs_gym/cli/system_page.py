@@ -9,6 +9,7 @@ from types import ModuleType
 from docstring_parser import parse_from_object
 
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
+from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.system import System, vector
@@ -116,8 +117,8 @@ def _parameters(cls: type[System]) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    return "\n".join(lines + ["| " + " | ".join(map(str, row)) + " |" for row in rows])
+    """Return a table in Markdown, of cells in Markdown."""
+    return markdown_table(header, ([str(cell) for cell in row] for row in rows))
 
 
 def field_docs(cls: type) -> dict[str, str]:

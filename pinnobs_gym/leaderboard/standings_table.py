@@ -56,10 +56,15 @@ def grid(table: Table, intervals: bool = True) -> Grid:
 
 
 def layouts(table: Table) -> Layouts:
-    """Return the table as text and, for where that does not fit, without intervals and with letters
-    for what estimators know."""
-    known = [entry.standing.knows for entry in table.entries]
-    return ((grid(table),), (with_letters(grid(table, intervals=False), known),))
+    """Return the table as text with intervals; where they do not fit, without them and with letters
+    for what estimators know; and where that does not fit either, and lines become records, with
+    intervals again."""
+    whole = grid(table)
+    short = with_letters(
+        grid(table, intervals=False), [entry.standing.knows for entry in table.entries]
+    )
+    note = " ".join(filter(None, [short.note, "95 % intervals are not shown at this width."]))
+    return ((whole,), (replace(short, note=note),), (whole,))
 
 
 def with_letters(grid: Grid, known: Sequence[Sequence[str]]) -> Grid:

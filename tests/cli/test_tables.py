@@ -1,0 +1,174 @@
+"""The command `tables`, and the width of tables in a terminal, a pipe and a file."""
+
+import csv
+import io
+import json
+
+import pytest
+from made_rows import rows_of
+from rich.console import Console
+
+from pinnobs_gym.cli import console, main
+from pinnobs_gym.leaderboard.grid import Column, Grid
+from pinnobs_gym.scoring.rows import SCHEMA
+
+MOTOR = {"env_id": "pinnobs/Motor-v0"}
+LOADED = {**MOTOR, "condition": "load_step", "ranked": False}
+MIXED = {**MOTOR, "condition": "dropout10+noise5", "ranked": False}
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A file of two estimators, one of an evil name, on two systems and three conditions."""
+    facts = {"schema": SCHEMA, "kind": "score", "versions": {}, "knows": ["model", "noise"]}
+    rows = []
+    for game in ({}, MOTOR, LOADED, MIXED):
+        rows += rows_of("ekf", [0.2, 0.2], **game, **facts)
+        rows += rows_of("=a_b|\x1b[1m", [0.1, 0.1], **game, **facts)
+    path = tmp_path / "rows.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path
+
+
+@pytest.fixture
+def printed(path, capsys):
+    """Run the command with arguments and return what it prints."""
+
+    def run(*arguments):
+        assert main(["tables", str(path), *map(str, arguments)]) == 0
+        return capsys.readouterr().out
+
+    return run
+
+
+def titles(text):
+    names = ("Across", "Ranks", "pinnobs/")
+    return [line for line in text.splitlines() if line.startswith(names)]
+
+
+ALL = [
+    "Across systems",
+    "Ranks",
+    "pinnobs/Motor-v0, benchmark, dropout10+noise5",
+    "pinnobs/Motor-v0, benchmark, load_step",
+    "pinnobs/Motor-v0, benchmark, nominal",
+    "pinnobs/X-v0, benchmark, nominal",
+]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ([], ALL),
+        (["overview"], ALL[:1]),
+        (["ranks", "X"], [ALL[1], ALL[5]]),
+        (["Motor"], ALL[2:5]),
+        (["Motor-v0,load_step"], ALL[3:4]),
+        (["pinnobs/Motor-v0, noise5+dropout10"], ALL[2:3]),
+    ],
+)
+def test_tables_are_chosen_by_name(printed, names, expected):
+    assert titles(printed(*(["--table", *names] if names else []))) == expected
+
+
+def test_markdown_latex_and_csv(printed):
+    markdown = printed("--table", "X", "--format", "markdown")
+    assert markdown.startswith(
+        "## pinnobs/X-v0, benchmark, nominal\n\n| rank | estimator | track |"
+    )
+    assert "| 1 | =a_b\\|�" in markdown
+    latex = printed("--table", "X", "--format", "latex", "--columns", "estimator", "NRMSE")
+    assert r"\begin{tabular}{lr}" in latex
+    assert r"=a\_b\textbar{}? & 0.1 \\" in latex
+    header, first, second = csv.reader(io.StringIO(printed("--table", "X", "--format", "csv")))
+    assert header[:2] == ["rank", "estimator"]
+    assert first[:2] == ["1", "'=a_b|\x1b[1m"]
+    assert second[:2] == ["2", "ekf"]
+    assert len(header) == len(first) == len(second)
+
+
+def test_a_file_has_all_columns_at_any_width(printed, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    told = printed("--table", "X", "-o", tmp_path / "new" / "x.txt")
+    assert told == f"tables: {tmp_path / 'new' / 'x.txt'}\n"
+    text = (tmp_path / "new" / "x.txt").read_text(encoding="utf-8")
+    assert "  knows " in text
+    assert "not shown" not in text
+    narrow = printed("--table", "X")
+    assert "knows, training (-o FILE writes all)" in " ".join(narrow.split())
+    assert max(map(len, narrow.splitlines())) <= 80
+    monkeypatch.delenv("COLUMNS")
+    assert printed("--table", "X") == text
+
+
+def test_no_name_steers_the_terminal(printed, path):
+    assert "\x1b" not in printed()
+    assert "=a_b|�" in printed()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--table", "Y"], "unknown table 'Y'; known are overview, ranks, Motor-v0, X-v0"),
+        (["--table", "X,noise5"], "no table 'X,noise5'; X was played under nominal"),
+        (["--format", "csv"], "csv holds one table, not 6 (Across systems; Ranks; pinnobs/Mot"),
+        (["--format", "html"], "invalid choice 'html' for argument '--format'"),
+        (["--table", "X", "--columns", "RMSE"], "unknown column 'RMSE' of 'pinnobs/X-v0, benchma"),
+        (["-o", "rows.jsonl/x"], "cannot write rows.jsonl/x"),
+        (["none.jsonl"], "there is no rows file none.jsonl"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_two(path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(path.parent)
+    assert main(["tables", "rows.jsonl", *arguments]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert printed.err.startswith("pinnobs: error: ")
+    assert (len(printed.err.splitlines()), printed.out) == (1, "")
+
+
+def test_no_rows_are_mistakes_too(tmp_path, capsys):
+    (tmp_path / "rows.jsonl").touch()
+    assert main(["tables"]) == 2
+    assert "no rows file is given" in capsys.readouterr().err
+    assert main(["tables", str(tmp_path / "rows.jsonl")]) == 2
+    assert "no scored episodes in" in capsys.readouterr().err
+
+
+def test_what_is_left_out_is_told_beside_the_tables(path, capsys):
+    facts = {"schema": SCHEMA, "kind": "score", "versions": {}}
+    old = rows_of("ekf", [0.3], game_hash="older", date="2029-01-01", **facts)
+    path.write_text(path.read_text() + "".join(json.dumps(row) + "\n" for row in old))
+    assert main(["tables", str(path), "--table", "X"]) == 0
+    printed = capsys.readouterr()
+    assert "1 episodes of pinnobs/X-v0, benchmark, nominal are left out" in printed.err
+    assert "left out" not in printed.out
+
+
+@pytest.mark.parametrize(
+    ("columns", "width"),
+    [(None, None), ("80", 80), ("0", None), ("wide", None), ("", None)],
+)
+def test_a_pipe_has_no_width_unless_it_is_given(monkeypatch, columns, width):
+    monkeypatch.setattr(console, "console", Console(file=io.StringIO(), width=100))
+    if columns is None:
+        monkeypatch.delenv("COLUMNS", raising=False)
+    else:
+        monkeypatch.setenv("COLUMNS", columns)
+    assert console.table_width() == width
+
+
+def test_a_terminal_has_its_own_width_and_no_line_is_wrapped(monkeypatch):
+    written = io.StringIO()
+    terminal = Console(file=written, force_terminal=True, width=30, color_system=None)
+    monkeypatch.setattr(console, "console", terminal)
+    assert console.table_width() == 30
+    name = "[bold]a name of forty characters, :smile:"
+    columns = (Column("name", numeric=False), Column("n"))
+    console.print_table([[Grid("", columns, ((name, "1"),))]])
+    assert written.getvalue() == f"name: {name}\nn:    1\n\n"
+    written.truncate(written.seek(0))
+    columns = (Column("name", numeric=False), Column("number"), Column("x" * 30, 1))
+    console.print_table([[Grid("", columns, (("a", "1", "2"),))]], "x")
+    told = f"not shown at this width:\n{'x' * 30}\n(x)\n\n"
+    assert written.getvalue() == f"name  number\n----  ------\na          1\n{told}"
