@@ -3,16 +3,16 @@ posterior."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.estimation.kalman import joseph_update, predict
+from pinnobs_gym.estimation.kalman import joseph_update
 from pinnobs_gym.scoring.metrics import by_sample, window_nrmse, windows
-from pinnobs_gym.simulation.matrices import moments
-from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.matrices import moments, sandwich
+from pinnobs_gym.simulation.model import model_step, model_step_jacobian
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import Setup, System, vector
 
@@ -51,25 +51,57 @@ def cramer_rao(
         Covariances, shape (batch, num_samples, nx, nx).
     """
     batch, num_samples, nx = x.shape
-    P = np.repeat(P0[..., None], batch, axis=-1)
     noise = np.zeros((nx, nx)) if Q is None else Q
     bound = np.empty((num_samples, nx, nx, batch))
-    u = system.input(t)
-    for k in range(num_samples):
+    steps = _linearised(system, t, x, missing)
+    for k, P in enumerate(covariances(steps, P0, R, noise)):
+        bound[k] = P
+    return bound.transpose(3, 0, 1, 2)
+
+
+def covariances(
+    steps: Iterable[tuple[np.ndarray | None, np.ndarray]],
+    P0: np.ndarray,
+    R: np.ndarray,
+    Q: np.ndarray,
+) -> Iterator[np.ndarray]:
+    """Yield the covariances P (n, n, batch) after each sample: P⁻ = FPFᵀ + Q, then P = P⁻ −
+    P⁻Hᵀ(HP⁻Hᵀ + R)⁻¹HP⁻, in Joseph's form.
+
+    Args:
+        steps: for each sample, the Jacobian F (n, n, batch) of the step to it, which is None at the
+            first, and that of the outputs, H (ny, n, batch).
+        P0: covariance of the prior, shape (n, n).
+        R: covariance of the output noise, shape (ny, ny).
+        Q: covariance of the process noise per sample, shape (n, n).
+    """
+    P = P0[..., None]
+    for F, H in steps:
+        if F is not None:
+            P = sandwich(F, P) + Q[..., None]
+        ny, n, batch = H.shape
+        P = np.broadcast_to(P, (n, n, batch))
+        # The covariance does not depend on the estimate and the innovation.
+        _, P, _ = joseph_update(np.zeros((batch, n)), P, np.zeros((batch, ny)), H, R[..., None])
+        yield P
+
+
+def _linearised(
+    system: System, t: np.ndarray, x: np.ndarray, missing: np.ndarray | None
+) -> Iterator[tuple[np.ndarray | None, np.ndarray]]:
+    """Yield the steps of `covariances`, linearised at the true states; the arguments are those of
+    `cramer_rao`."""
+    u, F = system.input(t), None
+    for k in range(len(t)):
         now = x[:, k]
         if k:
-            # Time update, linearised at the true state.
             times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
-            _, P, _ = predict(system, times, x[:, k - 1], P, noise[..., None], inputs)
+            F = model_step_jacobian(system, *times, x[:, k - 1], *inputs)[1].transpose(1, 2, 0)
         H = system.h_jacobian(t[k], now, u[k]).transpose(1, 2, 0)
         if missing is not None:
             # A zero row of H carries no information.
             H = np.where(missing[:, k].T[:, None], 0.0, H)
-        # Measurement update; the covariance does not depend on the innovation.
-        innovation = np.zeros((batch, system.ny))
-        _, P, _ = joseph_update(now, P, innovation, H, R[..., None])
-        bound[k] = P
-    return bound.transpose(3, 0, 1, 2)
+        yield F, H
 
 
 def expected_nrmse(

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pinnobs_gym.simulation.conditions.base import Condition, Outputs
+from pinnobs_gym.simulation.conditions.base import Condition, Outputs, Unknowns
 from pinnobs_gym.simulation.conditions.measurement import (
     Delay,
     Dropouts,
@@ -57,6 +57,9 @@ class Combined(Condition):
         for part in self.parts:
             system = part.plant(system, rngs)
         return system
+
+    def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
+        return tuple(each for part in self.parts for each in part.unknowns(system, setup))
 
     def process_noise(self, system: System) -> np.ndarray | None:
         stds = [part.process_noise(system) for part in self.parts]

@@ -32,6 +32,36 @@ class Outputs:
 
 
 @dataclass(frozen=True)
+class Unknowns:
+    """Numbers that a condition changes and estimators are not told, as deviations from what the
+    model says. Without deviations, the plant and its outputs are the model's.
+
+    The base class has numbers without any effect; a subclass overrides what they act on.
+    """
+
+    std: tuple[float, ...]
+    """Root mean square of each deviation under the condition's law, above 0."""
+
+    def plant(self, system: System, deviations: np.ndarray) -> System:
+        """Return the system with these deviations, shape (batch, num_unknowns)."""
+        return system
+
+    def output_slopes(
+        self, system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray
+    ) -> np.ndarray:
+        """Return the derivative of received outputs with respect to each deviation, where there is
+        none, beyond what follows from `plant`: shape (batch, ny, num_unknowns).
+
+        Args:
+            system: the model.
+            t: times in s, shape (batch,).
+            x: states at these times, shape (batch, nx).
+            u: inputs at these times, shape (batch, nu).
+        """
+        return np.zeros((len(x), system.ny, len(self.std)))
+
+
+@dataclass(frozen=True)
 class Condition:
     """A change of an episode. The base class changes nothing.
 
@@ -63,6 +93,19 @@ class Condition:
         """Return the true plant, with parameters that are numbers or arrays (batch,). Estimators
         keep the model."""
         return system
+
+    def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
+        """Return the numbers that estimators are not told, in the order in which they act on the
+        plant; none if the condition changes only what is random anyway or what estimators know.
+
+        `pinnobs_gym.scoring.identifiability` tells from them whether the outputs determine the
+        state.
+
+        Args:
+            system: the model.
+            setup: the setup that is played.
+        """
+        return ()
 
     def process_noise(self, system: System) -> np.ndarray | None:
         """Return the standard deviations (nx,) of white noise added to the state at every sample

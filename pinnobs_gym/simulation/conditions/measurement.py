@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.conditions.base import Condition, Outputs, Unknowns, noise_scale
 from pinnobs_gym.simulation.system import Setup, System
 
 
@@ -91,6 +91,26 @@ class Delay(Condition):
         late = np.full_like(sent.y, np.nan)
         late[self.samples :] = sent.y[: -self.samples]
         return late
+
+    def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
+        """The delay in s. It is the same in all episodes, and zero in the model."""
+        return (_Lateness((self.samples * setup.dt,)),)
+
+
+@dataclass(frozen=True)
+class _Lateness(Unknowns):
+    """A time τ in s by which outputs are late: y(t) = h(t − τ, x(t − τ), u(t − τ))."""
+
+    def output_slopes(
+        self, system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray
+    ) -> np.ndarray:
+        """Return −dh/dt along the trajectory: the central difference along its tangent, whose error
+        is of second order in a step of a thousandth of the delay."""
+        step, rate = 1e-3 * self.std[0], system.f(t, x, u)
+        earlier, later = (
+            system.h(t + s, x + s * rate, np.asarray(system.input(t + s))) for s in (-step, step)
+        )
+        return ((earlier - later) / (2 * step))[..., None]
 
 
 @dataclass(frozen=True)

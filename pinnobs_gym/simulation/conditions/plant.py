@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from pinnobs_gym.simulation.conditions.base import Condition
-from pinnobs_gym.simulation.system import Array, System, vector
+from pinnobs_gym.simulation.conditions.base import Condition, Unknowns
+from pinnobs_gym.simulation.system import Array, Setup, System, vector
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,34 @@ class Mismatch(Condition):
         return f"parameters of the plant off by ±{100 * self.part:g} %, the model's nominal"
 
     def plant(self, system: System, rngs: Sequence[np.random.Generator]) -> System:
-        parameters = system.parameters
+        off = self._off(system)
+        count = len(off.std)
+        signs = np.array([2.0 * rng.integers(0, 2, count) - 1 for rng in rngs]).reshape(-1, count)
+        return off.plant(system, self.part * signs)
+
+    def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
+        """The relative deviation of each parameter, or of each rate of change."""
+        return (self._off(system),)
+
+    def _off(self, system: System) -> _RelativeDeviations:
         names = system.uncertain
         if names is None:
-            names = [n for n, v in parameters.items() if not isinstance(v, bool | np.bool_)]
-        count = len(names) or system.nx
-        signs = np.array([2.0 * rng.integers(0, 2, count) - 1 for rng in rngs]).reshape(-1, count)
-        factors = 1 + self.part * signs
-        if not names:
+            own = system.parameters.items()
+            names = tuple(n for n, v in own if not isinstance(v, bool | np.bool_))
+        return _RelativeDeviations((self.part,) * (len(names) or system.nx), tuple(names))
+
+
+@dataclass(frozen=True)
+class _RelativeDeviations(Unknowns):
+    """Relative deviations of parameters or, if none is named, of the rates of change."""
+
+    names: tuple[str, ...]
+
+    def plant(self, system: System, deviations: np.ndarray) -> System:
+        factors = 1 + deviations
+        if not self.names:
             return OtherRates(system, factors)
-        changed = {n: parameters[n] * f for n, f in zip(names, factors.T, strict=True)}
+        changed = {n: getattr(system, n) * f for n, f in zip(self.names, factors.T, strict=True)}
         return replace(system, **changed)
 
 
@@ -59,6 +77,11 @@ class OtherRates(System):
     def scale(self) -> tuple[float, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Scale of the original plant's states."""
         return self.plant.scale
+
+    @property
+    def model_step(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Longest Runge-Kutta step of the original plant in s."""
+        return self.plant.model_step or self.plant.setups["benchmark"].dt
 
     def f(self, t: Array, x: Array, u: Array) -> Array:
         return self.factors * self.plant.f(t, x, u)
@@ -86,13 +109,36 @@ class LoadStep(Condition):
         return f"the motor's load torque steps at {self.time:g} s to 0 to {self.highest:g} N·m"
 
     def plant(self, system: System, rngs: Sequence[np.random.Generator]) -> System:
-        if "load_step_torque" not in {f.name for f in fields(system)}:
+        if not {"T_L", "load_step_torque"} <= {f.name for f in fields(system)}:
             raise ValueError(
                 f"condition 'load_step' needs a plant with a load torque; "
                 f"{type(system).__name__} has none"
             )
         torque = np.array([rng.uniform(0.0, self.highest) for rng in rngs])
         changes = {"load_step_time": self.time, "load_step_torque": torque}
+        return replace(system, **changes)
+
+    def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
+        """The torque after the step, relative to the model's torque T_L, which has none."""
+        torque: float = getattr(system, "T_L")  # noqa: B009 (not a parameter of every system)
+        spread, offset = self.highest / np.sqrt(12), self.highest / 2 - torque
+        return (_OtherTorque((float(np.hypot(spread, offset)),), self.time, torque),)
+
+
+@dataclass(frozen=True)
+class _OtherTorque(Unknowns):
+    """The deviation of a motor's load torque (N·m) from that of the model, from a time on."""
+
+    time: float
+    """Time of the step (s)."""
+    torque: float
+    """The model's torque (N·m)."""
+
+    def plant(self, system: System, deviations: np.ndarray) -> System:
+        changes = {
+            "load_step_time": self.time,
+            "load_step_torque": self.torque + deviations[:, 0],
+        }
         return replace(system, **changes)
 
 
