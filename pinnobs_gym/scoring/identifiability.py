@@ -49,7 +49,7 @@ def free_over_known(game: Game) -> float | None:
 
     Returns:
         The ratio, at least 1; None if the condition has no unknowns, without output noise, from a
-        fixed initial state, or where the error with known numbers is zero or not finite.
+        fixed initial state, without a steady sample, or where an error is zero or not finite.
     """
     key = (type(game.source.system), game.name, pickle.dumps(dict(game.changes)))
     if key not in _ratios:
@@ -67,12 +67,15 @@ def _ratio(game: Game) -> float | None:
     system, setup = source.system, source.setup
     unknowns = source.condition.unknowns(system, setup)
     noise_std = vector(setup.noise_std, system.ny, "noise_std")
-    if not unknowns or source.fixed_x0 or not (noise_std > 0).all():
+    t = source.times[:-1]
+    steady = t > steady_from(setup)
+    applies = bool(unknowns) and not source.fixed_x0 and (noise_std > 0).all() and steady.any()
+    if not applies:
         return None
     # Trajectories of the nominal plant, and which of their outputs are missing.
     nominal = _without_unknowns(game)
     episodes = nominal.episodes(_SEEDS)
-    t, x = source.times[:-1], episodes.x[:-1]
+    x = episodes.x[:-1]
     flow = linearised(system, t, x, unknowns)
     H = np.where(np.isnan(episodes.y[:-1]).swapaxes(1, 2)[:, :, None], 0.0, flow.H)
     # The prior of the states is the game's, that of the unknowns is their law.
@@ -83,7 +86,7 @@ def _ratio(game: Game) -> float | None:
     if source.process_noise is not None:
         Q[:nx, :nx] = np.diag(source.process_noise**2)
     # The same recursion with and without the unknowns; only steady variances of states are used.
-    R, steady = np.diag(noise_std**2), t > steady_from(setup)
+    R = np.diag(noise_std**2)
     counts = np.asarray(system.observable(x))[steady]
     rms = []
     for n in (size, nx):
@@ -140,7 +143,9 @@ def linearised(
     rows, times = x.reshape(-1, nx), np.repeat(t, batch)
     u = np.asarray(system.input(times))
     ends = (times[:-batch], times[batch:], rows[:-batch], u[:-batch], u[batch:])
-    by_unknown = _derivatives(lambda plant: model_step(plant, *ends), system, unknowns, len(ends[0]))
+    by_unknown = _derivatives(
+        lambda plant: model_step(plant, *ends), system, unknowns, len(ends[0])
+    )
     count = by_unknown.shape[-1]
     F = np.zeros((len(ends[0]), nx + count, nx + count))
     F[:, :nx, :nx] = model_step_jacobian(system, *ends)[1]
