@@ -44,8 +44,8 @@ def free_over_known(game: Game) -> float | None:
     of the nominal plant of seeds 0 to 9. The result depends neither on the estimators nor on the
     episodes that are scored. It is kept for the life of the process.
 
-    A large value says that outputs determine only combinations of states and numbers, so that
-    estimators differ by chance and not by merit.
+    Where outputs determine only combinations of states and numbers, the first error has a lower
+    limit that less noise does not change, so that the ratio grows as the noise decreases.
 
     Returns:
         The ratio, at least 1; None if the condition has no unknowns, without output noise, from a
