@@ -10,7 +10,7 @@ import numpy as np
 
 from pinnobs_gym.leaderboard.intervals import Interval, median, rate
 from pinnobs_gym.scoring.consistency import band
-from pinnobs_gym.scoring.identifiability import LIMIT
+from pinnobs_gym.scoring.identifiability import Identifiability
 from pinnobs_gym.scoring.metrics import DIVERGED
 from pinnobs_gym.scoring.rows import Row
 
@@ -107,7 +107,8 @@ def standing(rows: Sequence[Row]) -> Standing:
 
 def is_identifiable(row: Row) -> bool:
     """Return whether the states can be told from the outputs in a row's game."""
-    return row["free_over_known"] is None or row["free_over_known"] <= LIMIT
+    found = row["free_over_known"], row["nominal_over_free"]
+    return None in found or Identifiability(*found).holds
 
 
 def _modulo(rows: Sequence[Row]) -> float | None:

@@ -96,7 +96,8 @@ def _unidentifiable(players: Sequence[Contender]) -> str:
     if first is None or is_identifiable(first):
         return ""
     return (
-        "Not identifiable, so that nothing is ranked: the outputs do not tell the states from the "
-        "parameters that the condition changes, which enlarges the smallest error that can be "
-        f"reached {number(first['free_over_known'], 2)} times."
+        "Not identifiable, so that nothing is ranked: the outputs do not tell the states from what "
+        "the condition changes. This enlarges the smallest error that can be reached "
+        f"{number(first['free_over_known'], 2)} times, and a filter that ignores it is within "
+        f"{number(first['nominal_over_free'], 2)} times of that."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -15,7 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
-from pinnobs_gym.scoring.identifiability import free_over_known
+from pinnobs_gym.scoring.identifiability import Identifiability, identifiability
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.provenance import (
     canonical,
@@ -233,6 +233,13 @@ def _check_model(model: System, system: System) -> None:
         raise ValueError(f"the estimator's model is {found}; the env plays {expected}")
 
 
+def _identifiability(game: Game) -> Row:
+    """Return how a condition enlarges errors, as fields of rows; None where it does not."""
+    names = [f.name for f in fields(Identifiability)]
+    found = identifiability(game)
+    return dict.fromkeys(names) if found is None else asdict(found)
+
+
 def _common(estimator: BaseEstimator, game: Game) -> Row:
     """Return the fields common to all rows of an evaluation."""
     system, condition = game.source.system, game.name.condition
@@ -245,7 +252,7 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "game_hash": game_hash(game.source),
         "ranked": game.name.condition == canonical_name(system.ranked_condition),
         "nx": system.nx,
-        "free_over_known": free_over_known(game),
+        **_identifiability(game),
         "estimator": estimator.label,
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
         "knows": [*estimator.knows, *(["condition"] if informed else [])],

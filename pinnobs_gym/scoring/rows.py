@@ -28,8 +28,9 @@ Row: TypeAlias = dict[str, Any]
 - ``env_id``, ``setup``, ``condition``, ``episode``: the episode; ``seed:12`` is that of seed 12.
 - ``game_hash``: hash of the code and settings that make and score the episode.
 - ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
-- ``free_over_known``: factor by which the condition's unknown parameters enlarge the smallest
-  steady error (`pinnobs_gym.scoring.identifiability`); absent where it has none.
+- ``free_over_known``, ``nominal_over_free``: how what the condition changes without estimators
+  being told enlarges steady errors (`pinnobs_gym.scoring.identifiability.Identifiability`); absent
+  where there is nothing of this kind.
 - ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
   and its settings. One that was trained under the condition that is scored has a track of its own.
 - ``estimator_code``: hash of the estimator's code.
@@ -69,7 +70,7 @@ JOB = ("env_id", "setup", "condition", "estimator", "episode", "episodes", "job"
 TOLERANCE = 1e-6
 """Largest relative difference between scores of the same episode from different machines."""
 
-_OPTIONAL = (*OPTIONAL_SCORES, "free_over_known")
+_OPTIONAL = (*OPTIONAL_SCORES, "free_over_known", "nominal_over_free")
 """The numbers that may be absent."""
 _BEGINNING = b'{"schema": '
 """The beginning of every line."""

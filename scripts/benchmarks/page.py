@@ -100,6 +100,7 @@ def _rows(
             "episode": f"seed:{i}",
             "state_rmse": {},
             "free_over_known": None,
+            "nominal_over_free": None,
         }
         for i in range(EPISODES)
     ]

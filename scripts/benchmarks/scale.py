@@ -83,7 +83,7 @@ def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
             score = float(level * rng.lognormal(0, 0.4))
             row = base | dict.fromkeys(SCORES, score) | dict.fromkeys(OPTIONAL_SCORES)
             row |= {"nrmse_steady": score / 10, "nrmse_steady_modulo": score / 10, "settling": 1.0}
-            row |= {"state_rmse": {}, "free_over_known": None}
+            row |= {"state_rmse": {}, "free_over_known": None, "nominal_over_free": None}
             row |= {"anees": 1.0, "coverage": 0.9, "reference_steady": 0.03}
             made.append(
                 row

@@ -29,6 +29,7 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
             "episode": f"seed:{i}",
             "state_rmse": {},
             "free_over_known": None,
+            "nominal_over_free": None,
             **changes,
         }
         for i, (value, bad) in enumerate(zip(nrmse, diverged, strict=True))

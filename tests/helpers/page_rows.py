@@ -16,7 +16,13 @@ def row(seed=0, **changes):
     return (
         base
         | facts
-        | {"diverged": False, "episode": f"seed:{seed}", "state_rmse": {}, "free_over_known": None}
+        | {
+            "diverged": False,
+            "episode": f"seed:{seed}",
+            "state_rmse": {},
+            "free_over_known": None,
+            "nominal_over_free": None,
+        }
         | changes
     )
 

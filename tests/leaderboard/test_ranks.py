@@ -110,7 +110,12 @@ def test_those_that_played_other_episodes_have_a_factor_but_no_rank():
 def test_ranks_under_conditions():
     outliers = {"condition": "outliers", "ranked": False}
     few = {"condition": "gap", "ranked": False}
-    delayed = {"condition": "delay1", "ranked": False, "free_over_known": 12.0}
+    delayed = {
+        "condition": "delay1",
+        "ranked": False,
+        "free_over_known": 12.0,
+        "nominal_over_free": 1.1,
+    }
     rows = [*played()]
     for facts in (outliers, delayed):
         rows += [*rows_of("ukf", NOISY[0], **facts), *rows_of("half", NOISY[0] * 2, **facts)]
@@ -132,7 +137,7 @@ def test_ranks_under_conditions():
 
 def test_a_system_whose_states_are_not_identifiable_is_left_out_of_a_condition():
     facts = {"condition": "delay1", "ranked": False}
-    other = {"env_id": "pinnobs/Y-v0", "free_over_known": 6.0, **facts}
+    other = {"env_id": "pinnobs/Y-v0", "free_over_known": 6.0, "nominal_over_free": 1.2, **facts}
     rows = [*rows_of("ukf", NOISY[0], **facts), *rows_of("half", NOISY[0] / 2, **facts)]
     rows += [*rows_of("ukf", NOISY[0], **other), *rows_of("half", NOISY[0] * 90, **other)]
     rows += [*rows_of("ukf", NOISY[0]), *rows_of("half", NOISY[0])]

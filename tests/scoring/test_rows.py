@@ -214,6 +214,7 @@ WRONG = {
     "options": ("[]", "null"),
     "training": ("[]",),
     "versions": ("1",),
+    "nominal_over_free": ("-1",),
     "free_over_known": ("-1", '"a"'),
     "state_rmse": ("1", "[]", "null"),
 }

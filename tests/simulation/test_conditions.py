@@ -334,3 +334,66 @@ def test_a_system_that_is_uncertain_of_what_it_has_not_is_refused():
 
     with pytest.raises(TypeError, match="Wrong: uncertain names no parameter 'a4'"):
         Wrong.validate()
+
+
+@pytest.mark.parametrize(
+    ("name", "condition", "count"),
+    [
+        ("ReverseDuffing", "mismatch10", 2),
+        ("Satellite", "mismatch30", 3),
+        ("InductionMotor", "mismatch10+load_step", 5),
+        ("Academic", "delay4", 1),
+        ("Satellite", "noise5+mismatch10+delay1+gap", 4),
+        ("Satellite", "nominal", 0),
+        ("Satellite", "dt2+xhat0_far+x0_outside+process_noise1e-2+outliers+dropout10+gap", 0),
+        ("Satellite", "noise0.1+poor_prior", 0),
+    ],
+)
+def test_what_estimators_are_not_told(name, condition, count):
+    source = EpisodeSource(name, condition=condition)
+    unknowns = source.condition.unknowns(source.system, source.setup)
+    assert sum(len(each.std) for each in unknowns) == count
+
+
+@pytest.mark.parametrize("name", ["ReverseDuffing", "Satellite", "InductionMotor"])
+def test_plants_are_off_by_their_unknowns(name):
+    """Under mismatch30: without deviations they are the model, with ±std those that are played."""
+    source = EpisodeSource(name, condition="mismatch30")
+    system, (x0,) = source.system, source.draw(source.streams([0])).x0
+    (unknown,) = source.condition.unknowns(system, source.setup)
+    count = len(unknown.std)
+    assert unknown.std == (0.3,) * count
+    plant = unknown.plant(system, np.zeros((1, count)))
+    np.testing.assert_array_equal(rate(plant, x0[None]), rate(system, x0[None]))
+    all_signs = 0.3 * signs(count)
+    possible = rate(unknown.plant(system, all_signs), np.repeat(x0[None], len(all_signs), axis=0))
+    rngs = [np.random.default_rng(seed) for seed in range(8)]
+    for played in rate(source.condition.plant(system, rngs), np.repeat(x0[None], 8, axis=0)):
+        assert (possible == played).all(axis=-1).any()
+
+
+def rate(plant, x, seconds=0.3):
+    t = np.full(len(x), seconds)
+    return plant.f(t, x, np.asarray(plant.input(t)))
+
+
+def test_a_delay_is_of_the_samples_that_are_played():
+    source = EpisodeSource("Academic", condition="dt5+delay2")
+    (unknown,) = source.condition.unknowns(source.system, source.setup)
+    np.testing.assert_allclose(unknown.std, 2 * 5 * 0.02)
+
+
+def test_the_torque_after_the_step_is_off_by_what_is_drawn():
+    """Root mean square of 20,000 draws relative to the model's 10 N·m; ω' = ... − T/J."""
+    source = EpisodeSource("InductionMotor", condition="mismatch10+load_step")
+    off, torque = source.condition.unknowns(source.system, source.setup)
+    drawn = np.random.default_rng(0).uniform(0, 40, 20000) - 10
+    np.testing.assert_allclose(torque.std, np.sqrt(np.mean(drawn**2)), rtol=0.02)
+    # T_L, off by 10 %, acts before the step alone, and the other torque after it.
+    deviations = np.zeros((2, 4))
+    deviations[:, off.names.index("T_L")] = 0.1
+    plant = torque.plant(off.plant(source.system, deviations), np.array([[6.0], [6.0]]))
+    x, J = np.ones((2, 5)), source.system.J
+    for seconds, other in ((0.5, 1.0), (0.7, 6.0)):
+        changed = rate(plant, x, seconds) - rate(source.system, x, seconds)
+        np.testing.assert_allclose(changed, [[0, 0, 0, 0, -other / J]] * 2, atol=1e-9)
