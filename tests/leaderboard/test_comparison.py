@@ -102,11 +102,13 @@ def test_the_variance_over_seeds_and_episodes_by_hand():
     # Two seeds, four episodes. Means of seeds .75 and .25 (variance 1/8), of episodes 1, .5, .5, 0
     # (variance 1/6). The rest is ±.25 in the second episode and ∓.25 elsewhere:
     # x - seed - episode + mean = [[-.25, .25, .25, -.25], [.25, -.25, -.25, .25]], whose sum of
-    # squares .5 over 3 degrees is 1/6. Variance (1/8)/2 + (1/6)/4 - (1/6)/8 = 1/12.
+    # squares .5 over 3 degrees is 1/6. Variance (1/8)/2 + (1/6)/4 - (1/6)/8 = 1/12. Degrees with
+    # the seeds' 1/16 counted twice: (1/12 + 1/16)²/((2/16)²/1 + (1/24)²/3 + (1/48)²/3).
     crossed = np.array([[True, True, True, False], [True, False, False, False]])
     own = divergence_difference({"A": results(np.zeros((2, 4)), crossed)}, never(4))
     assert own.value == 0.5
     assert own.standard_error == pytest.approx(np.sqrt(1 / 12))
+    assert own.degrees == pytest.approx(7**2 / (6**2 + 2**2 / 3 + 1 / 3))
 
 
 def test_seeds_that_agree_give_the_result_of_one_and_others_a_larger_error():

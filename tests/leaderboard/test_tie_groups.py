@@ -110,7 +110,7 @@ def worse_by(p, best, seed):
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 6])
 def test_the_level_is_divided_by_the_number_of_pairs(copies):
-    # Half of the level is that of the score; 1, 2, 3, 6 copies and one other make 1, 3, 6, 21 pairs.
+    # The score has half of the level. 1, 2, 3, 6 copies and one other make 1, 3, 6, 21 pairs.
     best = {"A": results(noise(0))}
     pairs = {1: 1, 2: 3, 3: 6, 6: 21}[copies]
     field = {f"a{i}": best for i in range(copies)}
