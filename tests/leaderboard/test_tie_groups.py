@@ -77,6 +77,17 @@ def test_divergence_outranks_a_better_nrmse_only_if_it_is_significant(diverged, 
     assert tie_groups(field) == ((first,), (second,))
 
 
+@pytest.mark.parametrize(("diverged", "first"), [(7, "safe"), (6, "fast")])
+def test_divergence_has_half_of_the_level(diverged, first):
+    # The exact p-values 2·0.5⁶ = 0.031 and 2·0.5⁷ = 0.016 are on either side of 0.025; those of the
+    # t test, 0.014 and 0.008, are smaller.
+    field = {
+        "fast": {"A": results(noise(0) - 1, diverged)},
+        "safe": {"A": results(noise(1))},
+    }
+    assert tie_groups(field)[0] == (first,)
+
+
 def test_an_estimator_that_diverges_is_compared_again_in_the_next_group():
     field = {
         "safe": {"A": results(noise(0))},
