@@ -105,10 +105,8 @@ def _tied(
 ) -> list[_Player]:
     """Return the players, in their order, that are not significantly worse than the best of them
     in a statistic, by the procedure of `tie_groups`."""
-    p_values = []
-    for player in players:
-        compared = estimate(statistic(player), statistic(best))
-        p_values.append(p_value(compared) if compared.value > 0 else 1.0)
+    others = [statistic(player) for player in players]
+    p_values = [p_value(estimate(other, statistic(best))) for other in others]
     left = set(range(len(players)))
     for index in sorted(left, key=lambda index: p_values[index]):
         pairs = len(left) * (len(left) - 1) / 2

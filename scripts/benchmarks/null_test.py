@@ -166,7 +166,7 @@ _DRAWS = {
 
 
 def _filter_pool() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return log ratios and divergence (filters, episodes) of filters of seeds 0, 1, ... by system."""
+    """Return log ratios and divergence (filters, episodes) by system, of seeds 0, 1, ..."""
     results = {}
     for system in SYSTEMS:
         game = Game.of(system)
