@@ -19,7 +19,7 @@ result then holds for this one trained estimator, not for its training.
 The 95 % interval of `score` was simulated for normal, Student t₃ and exponential effects, 1, 3 and
 5 seeds, 20 to 100 episodes and 1 to 6 systems: it covers the truth in 93 to 99.8 % of repetitions,
 most often where differences between seeds are by far the largest. With 2 seeds of one system it is
-92 %. `coverage` of `scripts/benchmarks/null_test.py` repeats the check.
+92 %. `coverage` of `scripts/null_test.py` repeats the check.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def tie_groups(field: Field, level: float = 0.05) -> tuple[tuple[str, ...], ...]
     made-up scores without divergence, with a level of 5 % for the second test: Holm over k - 1
     comparisons 94, 92, 88 and 82 %; over pairs 94, 95, 95 and 95 %. If up to 30 % of episodes
     diverged, two estimators were tied in 88 to 97 % with the whole level for each test, and in 94
-    to 99 % with half of it. `made_up` of `scripts/benchmarks/null_test.py` repeats the check.
+    to 99 % with half of it. `made_up` of `scripts/null_test.py` repeats the check.
 
     Args:
         field: results by estimator and system.

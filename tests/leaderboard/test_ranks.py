@@ -38,7 +38,7 @@ def played():
 
 def test_the_factor_is_the_geometric_mean_over_systems():
     found = lines(played())
-    assert [*found][0] == "half"
+    assert next(iter(found)) == "half"
     assert {*found} == {"half", "ukf", "same", "smooth"}
     half = found["half"].places["steady"]
     assert half.factor.value == pytest.approx(4) ** -1

@@ -9,10 +9,11 @@ import numpy as np
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.enkf import EnKF
 from pinnobs_gym.leaderboard.comparison import Field, Results, p_value, score
-from pinnobs_gym.leaderboard.intervals import CONFIDENCE, log_ratio
+from pinnobs_gym.leaderboard.contenders import LARGEST
+from pinnobs_gym.leaderboard.intervals import CONFIDENCE
 from pinnobs_gym.leaderboard.tie_groups import tie_groups
-from pinnobs_gym.scoring import metrics
 from pinnobs_gym.scoring.evaluation import make_estimator
+from pinnobs_gym.scoring.playing import play
 
 SIZES = (2, 5, 12, 25)
 """Numbers of equal estimators in `made_up`."""
@@ -22,8 +23,6 @@ POOL = 40
 """Number of filters that are run in `filter_rates`."""
 EPISODES = 50
 """Number of episodes of each system in `filter_rates`."""
-CAP = 1.0
-"""The largest NRMSE that enters a log ratio in `filter_rates`."""
 
 
 def made_up(repetitions: int = 500, seed: int = 0) -> dict[str, float]:
@@ -113,7 +112,7 @@ def filter_rates(repetitions: int = 500) -> dict[str, float]:
     their random numbers are all in one tie group.
 
     A pool of filters is run once on the benchmark episodes of `SYSTEMS`, relative to the first of
-    them. The repetitions draw from the pool filters of three kinds:
+    them, in the steady window. The repetitions draw from the pool filters of three kinds:
 
     - ``five seeds``: five of the pool, as an estimator with five training seeds.
     - ``seed per episode``: in every episode another one of the pool.
@@ -170,13 +169,10 @@ def _filter_pool() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     results = {}
     for system in SYSTEMS:
         game = Game.of(system)
-        played = game.episodes(range(EPISODES))
-        record = game.source.record(played)
-        truth = np.ascontiguousarray(played.x[: record.num_samples].swapaxes(0, 1))
-        scores = []
-        for seed in range(POOL):
-            estimates = make_estimator(EnKF, game, {"seed": seed}).run(record)
-            scores.append(metrics.score(game.source.system, record, truth, estimates))
-        nrmse = np.minimum([each.nrmse for each in scores], CAP)
-        results[system] = log_ratio(nrmse, nrmse[0]), np.array([each.diverged for each in scores])
+        scores = [
+            play(game, make_estimator(EnKF, game, {"seed": seed}), range(EPISODES)).scores_alone
+            for seed in range(POOL)
+        ]
+        log_error = np.log(np.minimum([each.nrmse_steady for each in scores], LARGEST))
+        results[system] = log_error - log_error[0], np.array([each.diverged for each in scores])
     return results
