@@ -94,6 +94,9 @@ class BaseEstimator(ABC):
     """Search ranges of the settings that ``pinnobs tune`` searches."""
     recipe: ClassVar[Mapping[str, Any]] = {}
     """Default choices for this estimator in the Config of its trainer, see `trainer_config`."""
+    variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
+    """Choices in the Config of its trainer, each of which a suite without a list of estimators
+    plays separately."""
     exempt_from: ClassVar[Mapping[str, str]] = {}
     """Checks of `pinnobs_gym.estimation.checks.check_estimator` that do not apply to the estimator,
     by name, with the reason in one line."""
@@ -139,12 +142,15 @@ class BaseEstimator(ABC):
 
     @property
     def label(self) -> str:
-        """Name in tables: the class attribute ``name`` or, without it, the name of the class."""
-        return getattr(type(self), "name", type(self).__name__)
+        """Name in tables: the class attribute ``name`` or, without it, the name of the class, and
+        the recipe of its training if its trainer has several."""
+        name = getattr(type(self), "name", type(self).__name__)
+        return labelled(name, self.training.get("recipe", ""))
 
     @property
     def training(self) -> dict[str, Any]:
-        """Description of the training in plain numbers and strings; empty without training."""
+        """Description of the training in plain numbers and strings; empty without training. Its
+        ``recipe`` is part of the `label`, and what its ``knows`` lists adds to `knows`."""
         return {}
 
     @property
@@ -224,6 +230,12 @@ class OfflineEstimator(BaseEstimator):
         "diverging_row": "it may refuse a record that is not finite",
         "model_alone": "it may need outputs",
     }
+
+
+def labelled(name: str, recipe: str) -> str:
+    """Return the name in tables of an estimator trained by a recipe; see
+    `pinnobs_gym.training.settings.TrainingConfig.recipe`."""
+    return f"{name} ({recipe})" if recipe else name
 
 
 def _empty_columns(state: State, num_samples: int) -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -53,6 +53,14 @@ class TrainedNetwork(Trained):
     """Outputs of the training record, shape (num_samples, ny)."""
     covariance: Covariance | None = None
     """Covariances of the estimates, if the recipe computes them."""
+    recipe: str
+    """The recipe in a few words; see `pinnobs_gym.training.settings.TrainingConfig.recipe`."""
+    knows: tuple[str, ...]
+    """The information that the training used; see the same class."""
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        return {"recipe": self.recipe, "knows": self.knows}
 
     def xhat(self, t: np.ndarray) -> np.ndarray:
         """Return the network's estimates (..., nx), in state units, at times t (...) in s."""
@@ -120,6 +128,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     knows = ("model", "prior")
     needs_training = "pinn_obs"
     recipe = MappingProxyType({"preset": "transfer"})
+    variants = (MappingProxyType({}), MappingProxyType({"preset": "plain"}))
 
     def reset(self, prior: Prior) -> State:
         return State(prior.mean)
@@ -269,11 +278,13 @@ class PinnObs(OfflineEstimator):
         if name != "irregular_times"
     }
     trains_on_record = "pinn_obs"
+    variants = (MappingProxyType({}), MappingProxyType({"preset": "plain"}))
 
     @property
     def training(self) -> dict[str, Any]:
-        facts = {"trainer": "pinn_obs", "seed": self.config.seed, "per_record": True}
-        return {**facts, "config": asdict(self.config)}
+        config = self.config
+        facts = {"trainer": "pinn_obs", "seed": config.seed, "per_record": True}
+        return {**facts, "recipe": config.recipe, "knows": config.knows, "config": asdict(config)}
 
     def fit(self, record: Record) -> list[TrainedNetwork]:
         """Train one network per row; see `trainers.pinn_obs.PinnObsTrainer.train_rows`."""

@@ -245,6 +245,8 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
     system, condition = game.source.system, game.name.condition
     # An estimator trained under the very condition that is scored is no match for the others.
     informed = condition != "nominal" and estimator.training.get("condition") == condition
+    knows = [*estimator.knows, *estimator.training.get("knows", ())]
+    knows += ["condition"] if informed else []
     return {
         "schema": SCHEMA,
         "kind": "score",
@@ -255,7 +257,7 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         **_identifiability(game),
         "estimator": estimator.label,
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
-        "knows": [*estimator.knows, *(["condition"] if informed else [])],
+        "knows": list(dict.fromkeys(knows)),
         "options": canonical(estimator.options),
         "estimator_code": estimator_code(type(estimator)),
         "estimator_hash": estimator_hash(estimator),

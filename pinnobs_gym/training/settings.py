@@ -35,6 +35,17 @@ class TrainingConfig:
     """Iterations between points of the logged curves."""
 
     @property
+    def recipe(self) -> str:
+        """The recipe in a few words, which names of estimators in tables show; empty if the trainer
+        has one recipe only."""
+        return ""
+
+    @property
+    def knows(self) -> tuple[str, ...]:
+        """The information that the training uses in addition to that of its estimators."""
+        return ()
+
+    @property
     def records(self) -> int:
         """Number of recorded episodes to train on; 0 if the trainer plays episodes itself."""
         return 1

@@ -1,88 +1,28 @@
-"""PINN-Obs: the fast and the paper's recipe, gains replayed, on all six systems."""
+"""PINN-Obs by three recipes on all six systems: the paper's, a fast one with the paper's loss, and
+the fast one guided by a Kalman smoother of the same record."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
+from paper_case import Case
 from plain_network import Network
+from three_recipes import GUIDED, SEEDS, paper_setup
+from three_recipes import readme_table as readme_table
 
 from benchmarks import Figure, at_most, cpu_seconds
-from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.learned.mlp import Architecture
-from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, TrainedNetwork
-from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import System
-from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
-from pinnobs_gym.training.loop import train
-from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer, paper, transfer
+from trainers.pinn_obs import PinnObsTrainer, guided, paper, transfer
 
-SEEDS = range(5)
 PAPER_ITERATIONS = 101_431
 """Iterations of the paper's best training (its table of depths and widths, 9×20)."""
 LOSS, RMSE = 9.56e-4, 0.0562
 """Loss and RMSE of that training."""
-EKF_RMSE = {
-    "ReverseDuffing": 0.0216,
-    "HarmonicOscillator": 0.168,
-    "Academic": 0.0212,
-    "ModifiedAcademic": 0.0154,
-    "Satellite": 0.0372,
-    "InductionMotor": 0.0102,
-}
-"""RMSE of an independent EKF over the whole episode of the paper setup, without noise."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """An episode of the paper setup with its truth."""
-
-    system: System
-    record: Record
-    x: np.ndarray
-    """True states at the samples, shape (num_samples, nx)."""
-
-    @staticmethod
-    def of(name: str) -> Case:
-        """Return the episode shown in the paper."""
-        source = EpisodeSource(name, "paper")
-        played = source.play(source.draw(source.streams([0])))
-        record = source.record(played)
-        return Case(source.system, record, played.x[: record.num_samples, 0])
-
-    def elsewhere(self, x0: list[float], xhat0: list[float]) -> Case:
-        """Return an episode of the same plant from another initial state and estimate."""
-        record = self.record
-        x = truth(self.system, np.array([x0]), record.t, None)[:, 0]
-        prior = Prior(np.array([xhat0]), record.prior.cov)
-        y = self.system.h(record.t, x, record.u[0])
-        return Case(self.system, replace(record, y=y[None], prior=prior), x)
-
-    def noisy(self, std: float, seed: int) -> Case:
-        """Return the same episode with noise on its outputs."""
-        noise = std * np.random.default_rng(seed).standard_normal(self.record.y.shape)
-        return replace(self, record=replace(self.record, y=self.record.y + noise))
-
-    def trained(self, config: PinnObsConfig, noise_std: float = 0.0) -> TrainedNetwork:
-        """Train on this record."""
-        return train(PinnObsTrainer(self.system, config, record=self.record, noise_std=noise_std))
-
-    def rmse(self, xhat: np.ndarray) -> float:
-        """Return the root mean square error over all states and samples, as in the paper."""
-        return float(np.sqrt(np.mean((xhat - self.x) ** 2)))
-
-    def direct(self, trained: TrainedNetwork) -> float:
-        """Return the RMSE of the network's own estimates."""
-        return self.rmse(trained.xhat(self.record.t))
-
-    def replayed(self, trained: TrainedNetwork) -> float:
-        """Return the RMSE of the observer with the learned gain; not finite if it diverges."""
-        with np.errstate(all="ignore"):
-            return self.rmse(PinnObsReplay(self.system, trained=trained).run(self.record).xhat[0])
 
 
 def figures(repeats: int) -> Iterator[Figure]:
@@ -95,7 +35,7 @@ def figures(repeats: int) -> Iterator[Figure]:
     yield Figure("R, the paper's iterations in plain autograd", whole, "CPU-s", "", None)
     for depth, part in ((3, 1000), (9, 250)):
         times = [seconds_to_paper(duffing, depth, seed, whole / 100) for seed in SEEDS]
-        what = f"ReverseDuffing, {depth}x20, to the paper's loss and RMSE"
+        what = f"ReverseDuffing, {GUIDED}, {depth}x20, to the paper's loss and RMSE"
         yield Figure(f"{what}, median of seeds", float(np.median(times)), "CPU-s", "", None)
         yield at_most(
             f"{what}, slowest of {len(SEEDS)} seeds, over R", max(times) / whole, "", 1 / part
@@ -153,12 +93,12 @@ def plain_iteration(case: Case) -> Callable[[], None]:
 
 
 def seconds_to_paper(case: Case, depth: int, seed: int, limit: float) -> float:
-    """Measure the CPU seconds of the fast recipe until loss and RMSE reach the paper's.
+    """Measure the CPU seconds of the guided recipe until loss and RMSE reach the paper's.
 
     They are checked every ten iterations. The result is infinite if the limit is exceeded.
     """
     spent, start = 0.0, time.process_time()
-    config = PinnObsConfig(depth=depth, seed=seed)
+    config = replace(guided(), depth=depth, seed=seed)
     run = PinnObsTrainer(case.system, config, record=case.record, noise_std=0.0)
     while not run.finished():
         for _ in range(10):
@@ -179,9 +119,9 @@ def replays(case: Case, budget: float) -> Iterator[Figure]:
         values = []
         for seed in SEEDS:
             one = case.noisy(std, seed) if std else case
-            config = PinnObsConfig(seed=seed, budget=budget)
+            config = replace(guided(), seed=seed, budget=budget)
             values.append(one.replayed(one.trained(config, std)))
-        what = f"ReverseDuffing, replay on the own record, noise {std:g}, RMSE"
+        what = f"ReverseDuffing, {GUIDED}, replay on the own record, noise {std:g}, RMSE"
         yield at_most(f"{what}, median of {len(SEEDS)} seeds", float(np.median(values)), "", asked)
         yield at_most(f"{what}, worst", max(values), "", asked)
 
@@ -194,24 +134,6 @@ def transfers(case: Case) -> Iterator[Figure]:
         trained = case.trained(replace(transfer(), seed=seed))
         own.append(case.replayed(trained))
         elsewhere.append(other.replayed(trained))
-    what = "ReverseDuffing, gain meant to transfer, RMSE, worst of seeds"
+    what = f"ReverseDuffing, {GUIDED}, gain meant to transfer, RMSE, worst of seeds"
     yield at_most(f"{what}, from x0=[1, 1.5], xhat0=[0, 0]", max(elsewhere), "", 0.08)
     yield at_most(f"{what}, own record", max(own), "", 0.26)
-
-
-def paper_setup(name: str) -> Iterator[Figure]:
-    """Score the network's estimates and the replay of its gain on a system's paper setup."""
-    case = Case.of(name)
-    results = []
-    for seed in SEEDS:
-        trained = case.trained(PinnObsConfig(seed=seed))
-        results.append((case.direct(trained), case.replayed(trained), trained.seconds))
-    direct, replay, seconds = np.median(results, axis=0)
-    line = EKF_RMSE[name]
-    yield Figure(f"{name}, paper setup, training", float(seconds), "CPU-s", "", None)
-    yield at_most(f"{name}, paper setup, direct RMSE", float(direct), "", round(1.1 * line, 5))
-    worst = max(result[0] for result in results)
-    yield Figure(f"{name}, paper setup, direct RMSE, worst of seeds", worst, "", "", None)
-    yield at_most(f"{name}, paper setup, replay RMSE", float(replay), "", round(1.5 * line, 5))
-    worst = max(result[1] for result in results)
-    yield Figure(f"{name}, paper setup, replay RMSE, worst of seeds", worst, "", "", None)

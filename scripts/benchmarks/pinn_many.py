@@ -11,7 +11,7 @@ from benchmarks import Figure, at_least, cpu_seconds, median_ratio
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.training.loop import train
-from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer, plain
 from trainers.pinn_obs.objective import Objective
 
 MANY = 64
@@ -32,7 +32,7 @@ def figures(repeats: int) -> Iterator[Figure]:
 def at_once(source: EpisodeSource, record: Record, repeats: int) -> Figure:
     """Compare the records per CPU-second of `train_rows` with those of `train`.
 
-    Only the first iterations of the fast preset are run; all iterations cost the same.
+    Only the first iterations of the guided preset are run; all iterations cost the same.
     """
     system, noise = source.system, source.setup.noise_std
     config = PinnObsConfig(iterations=ITERATIONS)
@@ -64,7 +64,7 @@ def stacked_evaluations(source: EpisodeSource, record: Record, repeats: int) -> 
     """
     noise = source.setup.noise_std
     rows = [record.rows(slice(i, i + 1)) for i in range(MANY)]
-    config = PinnObsConfig(guide=0.0)  # the guide is no part of an evaluation
+    config = plain()  # the guide is no part of an evaluation
     runs = [PinnObsTrainer(source.system, config, record=r, noise_std=noise) for r in rows]
     objectives = [run.recipe.objective for run in runs]
     thetas = [run.theta for run in runs]

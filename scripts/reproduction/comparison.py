@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.estimator import labelled
 from pinnobs_gym.estimators.kkl import KKL
 from pinnobs_gym.estimators.pinn_obs import PinnObsReplay
 from pinnobs_gym.files import append_lines
@@ -55,7 +56,7 @@ class Comparison:
     """Settings of the comparison."""
 
     preset: str
-    """Recipe of PINN-Obs: fast or paper."""
+    """Recipe of PINN-Obs: guided, plain or paper."""
     budget: float | None
     """CPU seconds of each training."""
     seed: int
@@ -67,7 +68,7 @@ class Comparison:
         """Return the config of a method."""
         common: dict[str, Any] = {"seed": self.seed, "budget": self.budget}
         if method.startswith("pinn_obs"):
-            transfer = method == "pinn_obs_replay" and self.preset == "fast"
+            transfer = method == "pinn_obs_replay" and self.preset == "guided"
             common |= {"preset": "transfer" if transfer else self.preset}
         else:
             common |= {"start": "zero", "transient": False, "noise": False}
@@ -90,11 +91,12 @@ class Comparison:
             "a state passes zero.",
             "PINN-Obs is trained on each record by itself, from x̂₀ = [1, 1], and scored offline by "
             "the network's own x̂(t). pinn_obs_replay is the observer with the learned L(t) on the "
-            "same record, online; its gain is trained to transfer, where the recipe can. The KKL "
-            "observers are each trained once, on simulated episodes of the benchmark's set with "
-            "their true states, without noise, and run online on every record from z₀ = 0; time "
-            "is not an input of T*. Training is CPU seconds of one thread, for PINN-Obs those of "
-            "one record (the median).",
+            "same record, online; its gain is trained to transfer, where the recipe can. The guide "
+            "is a Kalman smoother of the same record, and is not part of the paper's method. "
+            "The KKL observers are each trained once, on simulated episodes of the benchmark's set "
+            "with their true states, without noise, and run online on every record from z₀ = 0; "
+            "time is not an input of T*. Training is CPU seconds of one thread, for PINN-Obs those "
+            "of one record (the median).",
             "The paper's: one bar for each method and metric. It does not state its initial "
             "states, z₀, window or noise, and whether they are of one record; its figures of "
             "PINN-Obs cannot include the sample at t₀ (see the table of examples).",
@@ -193,6 +195,7 @@ def lines(comparison: Comparison, rows: Mapping[str, Row]) -> list[tuple[str, ..
         if method in PRINTED:
             printed = ["" if value is None else f"{value:.3g}" for value in PRINTED[method]]
             table.append((method, "the paper", "not stated", "not stated", *printed, ""))
+        name = labelled(method, comparison.config(method).recipe)
         own = [rows.get(comparison.key(method, i)) for i in range(comparison.records)]
         present = [row for row in own if row is not None]
         seconds = f"{np.median([row['seconds'] for row in present]):.0f}" if present else ""
@@ -200,7 +203,7 @@ def lines(comparison: Comparison, rows: Mapping[str, Row]) -> list[tuple[str, ..
             for statistic, of in (("mean", np.mean), ("median", np.median)):
                 values = [of(_values(present, window, metric)) for metric in METRICS]
                 shown = [f"{value:.3g}" for value in values]
-                table.append((method, "ours", window, statistic, *shown, seconds))
+                table.append((name, "ours", window, statistic, *shown, seconds))
     return table
 
 

@@ -14,7 +14,7 @@ from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.systems import SYSTEMS
 from reproduction.running import REPEATS, SETUP, PaperJob
-from reproduction.tables import Case, Printed, Table, recipe
+from reproduction.tables import RECIPES, Case, Printed, Table, recipe
 
 HEADER = (
     "case",
@@ -166,7 +166,7 @@ def _recipe(row: Row) -> str:
     config = row["config"]
     seed = f", seed {config['seed']}" if config["seed"] else ""
     end = f"stopped at {_budget(row):g} s" if _is_cut(row) else "to the end"
-    return f"{row['preset']}{seed}, {end}"
+    return f"{RECIPES[row['preset']]}{seed}, {end}"
 
 
 def _is_cut(row: Row) -> bool:
@@ -217,7 +217,8 @@ def readme_section(rows: Sequence[Row], tables: Iterable[Table]) -> str:
         return ""
     intro = (
         "`python scripts/reproduce_paper.py depth` (`activation`, `weights`, `examples`) makes the "
-        f"paper's tables anew. {measured_on(used)} `fast` is guided by a Kalman smoother of the "
-        "same record; `paper` is the recipe of the paper."
+        f"paper's tables anew. {measured_on(used)} `paper` is the recipe of the paper, `fast, "
+        "paper's loss` a faster one with its loss; `fast, guided` adds a guide, which draws x̂ "
+        "towards a Kalman smoother's estimates of the same record, and L towards Riccati's gain."
     )
     return "\n\n".join([intro, *parts, *PROTOCOL])

@@ -101,7 +101,17 @@ _WEIGHTS = (
 )
 # RMSE and MAE of the method's own bar in the figure that compares four methods.
 _COMPARISON = {"ReverseDuffing": Printed(rmse=0.00236, mae=0.00175)}
-_RECIPES = {name: PinnObsTrainer.configured({"preset": name}) for name in ("paper", "fast")}
+RECIPES = {
+    "paper": "paper",
+    "guided": "fast, guided",
+    "plain": "fast, paper's loss",
+    "transfer": "fast, guided, to transfer",
+}
+"""What the tables call each preset."""
+_CONFIGS = {
+    "paper": PinnObsTrainer.configured({"preset": "paper"}),
+    "fast": PinnObsTrainer.configured({}),
+}
 _EXAMPLES = (
     "ReverseDuffing",
     "InductionMotor",
@@ -170,7 +180,7 @@ TABLES: Mapping[str, Table] = {
         tuple(Case(name, _COMPARISON.get(name, Printed()), system=name) for name in _EXAMPLES),
         (
             "The network is the recipe's own: "
-            + " and ".join(f"{c.depth}x{c.width} in `{name}`" for name, c in _RECIPES.items())
+            + " and ".join(f"{c.depth}x{c.width} in `{name}`" for name, c in _CONFIGS.items())
             + ".",
             "The printed RMSE of ReverseDuffing (MSE 5.56e-6) cannot be of the whole record: the "
             "sample at t₀ alone, where x̂₀ is off by [−1, 2], adds 2.5e-4 to the MSE of 10,000.",

@@ -90,7 +90,7 @@ def test_settings_start_from_the_recipe_of_the_estimator(monkeypatch):
     monkeypatch.setattr(PinnObs, "recipe", {"preset": "transfer"}, raising=False)
     assert settings_of(PinnObs, [])["config"].transfer
     assert settings_of(PinnObs, ["iterations=20"])["config"].transfer
-    assert not settings_of(PinnObs, ["preset=fast"])["config"].transfer
+    assert not settings_of(PinnObs, ["preset=guided"])["config"].transfer
 
 
 def test_a_setting_given_twice():
@@ -148,7 +148,7 @@ def test_a_flag_and_its_opposite():
         ),
         (
             "evaluate --system Academic --estimator pinn_obs --set preset=x --set iterations=20",
-            "preset='x'; expected one of fast, transfer, paper",
+            "preset='x'; expected one of guided, plain, transfer, paper",
         ),
         ("leaderboard --condition nominal --condition fog", "unknown condition 'fog'"),
         ("leaderboard --condition fog --condition nominal", "unknown condition 'fog'"),
@@ -161,8 +161,8 @@ def test_a_flag_and_its_opposite():
         ("report none.jsonl --out a --out b", "--out is given twice; expected once"),
         ("tune ekf --system Academic --seed -3 --trials 1", "seed=-3; expected a whole number"),
         ("train pinn_obs --system Academic --preset", "'--preset'. Expected 1 value"),
-        ("train pinn_obs --preset fast --system Academic --preset paper", "--preset is given tw"),
-        ("train pinn_obs --system Academic --preset=x", "preset='x'; expected one of fast"),
+        ("train pinn_obs --preset plain --system Academic --preset paper", "--preset is given tw"),
+        ("train pinn_obs --system Academic --preset=x", "preset='x'; expected one of guided"),
         ("train pinn_obs --system Academic --episode -3", "episode=-3; expected a whole number"),
         ("train pinn_obs --system Academic --seed -3", "seed=-3; expected a whole number from 0"),
     ],

@@ -128,6 +128,8 @@ def trained_network(system, network, record=None):
         loss=0.25,
         iterations=1,
         seconds=0.0,
+        recipe="paper's loss",
+        knows=(),
     )
 
 

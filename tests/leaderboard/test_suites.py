@@ -64,6 +64,7 @@ def test_a_file_is_read_and_options_change_it(write):
         ('estimators = ["kf"]', "estimators: unknown estimator 'kf'; known are batch_least"),
         ('estimators = ["pinn_obs_direct"]', "estimators: estimator 'pinn_obs_direct' knows one"),
         ('estimators = ["ekf", "ekf"]', "estimators: 'ekf' stands for two; give each a"),
+        ('estimators = ["pinn_obs", "pinn_obs"]', "estimators: 'pinn_obs (guided by a smoother)'"),
         ('estimators = ["ekf", {name = "ekf"}]', "estimators: 'ekf' stands for two; give each a"),
         ('setup = "x"', "setup: unknown setup 'x' of Academic"),
         ('conditions = ["fog"]', "conditions: 'fog' on Academic: unknown condition 'fog'"),
@@ -126,6 +127,34 @@ def test_full_is_every_system_estimator_and_condition(tmp_path):
     }
     assert {job.estimator for job in jobs} == ranked
     assert {job.game.name.condition for job in jobs} == set(CONDITIONS)
+
+
+@pytest.mark.parametrize("name", ["leaderboard", "full", "paper"])
+def test_pinn_obs_is_played_with_and_without_its_guide(name, tmp_path):
+    games = {}
+    for job in jobs_of(suites.load(name), tmp_path):
+        if job.estimator in ("pinn_obs", "pinn_obs_replay"):
+            games.setdefault(job.called, set()).add(job.game.name)
+    recipes = ["guided by a smoother", "paper's loss", *["paper's recipe"] * (name == "paper")]
+    assert set(games) == {f"pinn_obs{s} ({r})" for s in ("", "_replay") for r in recipes}
+    assert len(set(map(frozenset, games.values()))) == 1
+
+
+def test_rows_are_called_as_the_plan_says(tmp_path):
+    small = {"depth": 1, "width": 3, "iterations": 2}
+    entries = [
+        Entry(name, settings={**small, "preset": preset})
+        for name in ("pinn_obs", "pinn_obs_replay")
+        for preset in ("guided", "plain")
+    ]
+    suite = Suite(("ReverseDuffing",), tuple(entries), ("nominal",), episodes=1)
+    jobs = jobs_of(suite, tmp_path)
+    for job in jobs:
+        job.run()
+    stored = rows.load(tmp_path / "rows.jsonl")
+    assert [row["estimator"] for row in stored.rows] == [job.called for job in jobs]
+    assert len({job.called for job in jobs}) == 4
+    assert all(job.known for job in plan.left(jobs, stored, False)[0])
 
 
 def test_budgets_and_seeds_multiply_what_learns(tmp_path):

@@ -106,7 +106,7 @@ def test_settings_are_those_of_the_names():
         assert case.name == f"{config.depth}x{config.width}"
     for case in TABLES["activation"].cases:
         assert of("paper", case) == replace(paper(), activation=case.name)
-    weights = [(c.w0, c.w_ode, c.w_y) for c in (of("fast", k) for k in weighted())]
+    weights = [(c.w0, c.w_ode, c.w_y) for c in (of("guided", k) for k in weighted())]
     assert weights[0] == (1, 1, 1)
     assert weights[5] == (2, 1, 0.5)
 
@@ -122,7 +122,7 @@ def weighted():
 def test_a_case_of_two_tables_is_trained_once():
     (wide,) = (case for case in TABLES["depth"].cases if case.name == "9x20")
     (tanh,) = (case for case in TABLES["activation"].cases if case.name == "tanh")
-    jobs = [running.PaperJob(case, "fast", of("fast", case), Path()) for case in (wide, tanh)]
+    jobs = [running.PaperJob(case, "guided", of("guided", case), Path()) for case in (wide, tanh)]
     assert jobs[0].key == jobs[1].key
     assert jobs[0].folder == jobs[1].folder
 
@@ -137,13 +137,13 @@ def test_a_run_leaves_its_row_table_and_pictures(short, tmp_path, capsys):
     assert row["best_iteration"] <= row["iterations"] <= 60
     assert row["loss"] > 0
     assert row["inference_ms"] > 0
-    (folder,) = tmp_path.glob("ShortDuffing-fast-1x4-tanh-*/budget-120")
+    (folder,) = tmp_path.glob("ShortDuffing-guided-1x4-tanh-*/budget-120")
     for picture in ("states", "replay", "gain", "loss"):
         assert (folder / f"{picture}.png").stat().st_size > 1000
     assert not (folder / "checkpoint.pt").exists()  # it came to its end
     table = (tmp_path / "examples.md").read_text()
     assert "| one | the paper | 0.5000 | 0.25000 |" in table
-    assert f"| one | fast, to the end | {row['rmse']:.4f} |" in table
+    assert f"| one | fast, guided, to the end | {row['rmse']:.4f} |" in table
     assert "| other | the paper |" in table
     assert "100 samples over 2 s: ShortDuffing x₀ = [2, -1], x̂₀ = [1, 1]." in table
     assert "A note." in table
@@ -194,7 +194,7 @@ def test_a_larger_budget_goes_on_from_a_smaller_one(short, tmp_path, monkeypatch
     assert begun == [False, True, True]
     assert rows[0]["iterations"] < rows[1]["iterations"] < rows[2]["iterations"]
     shown = [line[1] for line in report.lines(reproduce_paper.TABLES["depth"], rows)]
-    assert shown[1:3] == ["fast, stopped at 0.2 s", "fast, stopped at 0.4 s"]
+    assert shown[1:3] == ["fast, guided, stopped at 0.2 s", "fast, guided, stopped at 0.4 s"]
     assert report.longest(rows) == [rows[2]]
 
 
@@ -239,7 +239,10 @@ def test_the_readme_gets_a_section(short, tmp_path):
         (["depth", "--only", "9x21"], "unknown case '9x21' of depth; known are 15x30, 15x20"),
         (["weights", "--only", "8"], "unknown case '8' of weights; known are 1, 2"),
         (["width"], "unknown table 'width'; known are depth, activation, weights, examples"),
-        (["depth", "--preset", "slow"], "preset='slow'; expected one of fast, transfer, paper"),
+        (
+            ["depth", "--preset", "slow"],
+            "preset='slow'; expected one of guided, plain, transfer, paper",
+        ),
         (["depth", "--budget", "long"], "budget='long'; expected CPU seconds or none"),
         (["depth", "--budget", "nan"], "budget=nan; expected None or positive seconds"),
         (["depth", "--budget", "-1"], "budget=-1.0; expected None or positive seconds"),
@@ -286,7 +289,8 @@ def test_the_comparison_keeps_what_is_there_and_shows_both(tmp_path, capsys, mon
     assert "z₀ = 0" in text
     for method in comparison.METHODS:
         for statistic in ("mean", "median"):
-            assert f"| {method} | ours | from 10 s | {statistic} |" in text
+            guided = " (guided by a smoother)" if method.startswith("pinn_obs") else ""
+            assert f"| {method}{guided} | ours | from 10 s | {statistic} |" in text
     assert reproduce_paper.main(options) == 0
     assert "trained in" not in capsys.readouterr().out
     assert (tmp_path / "comparison.md").read_text() == text

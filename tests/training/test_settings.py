@@ -41,7 +41,11 @@ def test_every_setting_of_every_trainer_refuses_another_type(trainer, wrong):
         ("pinn_obs", {"points": 50.0}, "points=50.0; expected a whole number"),
         ("pinn_obs", {"preset": "paper", "points": -5}, "points=-5; expected a whole number of"),
         ("pinn_obs", {"transfer": "False"}, "transfer='False'; expected True or False"),
-        ("pinn_obs", {"preset": []}, r"preset=\[\]; expected one of fast, transfer, paper"),
+        (
+            "pinn_obs",
+            {"preset": []},
+            r"preset=\[\]; expected one of guided, plain, transfer, paper",
+        ),
     ],
 )
 def test_wrong_settings(trainer, settings, message):

@@ -21,7 +21,7 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import deferred_interrupt, train
 from pinnobs_gym.training.trainer import Trainer
-from trainers.pinn_obs.config import PinnObsConfig, fast, paper, transfer
+from trainers.pinn_obs.config import PinnObsConfig, guided, paper, plain, transfer
 from trainers.pinn_obs.fast_recipe import FastRecipe
 from trainers.pinn_obs.minimum import BestIterate, Mark, Minimiser
 from trainers.pinn_obs.paper_recipe import PaperRecipe
@@ -48,7 +48,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
     """
 
     name = "pinn_obs"
-    presets = {"fast": fast, "transfer": transfer, "paper": paper}
+    presets = {"guided": guided, "plain": plain, "transfer": transfer, "paper": paper}
 
     def start(self) -> None:
         _check(self.system, self.record, self.config)
@@ -193,6 +193,8 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             t=self.record.t.copy(),
             y=self.record.y[0].copy(),
             covariance=self.recipe.covariance(best.theta),
+            recipe=self.config.recipe,
+            knows=self.config.knows,
         )
 
     def figures(self, trained: TrainedNetwork) -> dict[str, Figure]:

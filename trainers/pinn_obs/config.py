@@ -15,7 +15,7 @@ Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 @dataclass(frozen=True)
 class PinnObsConfig(TrainingConfig):
-    """Settings of PINN-Obs; by default those of the fast recipe, see also `paper`."""
+    """Settings of PINN-Obs; by default those of `guided`, see also `plain` and `paper`."""
 
     may_change = ("iterations", "device")
 
@@ -33,13 +33,13 @@ class PinnObsConfig(TrainingConfig):
     """Weight of the outputs in the loss."""
     guide: float = 10.0
     """Weight of the scaled squared deviation of x̂ from the guide, a Kalman smoother's estimates of
-    the same record; 0 is without a guide, as Adam requires."""
+    the same record; 0 is the paper's loss without a guide, as Adam requires."""
     transfer: bool = False
     """Whether the gain is meant for other records, too, so that x̂ leaves x̂₀ only as fast as the
     Riccati gain allows; needs the guide."""
     gain_penalty: float = 0.1
     """Weight of the scaled squared deviation of the gain from the guide's, or from zero without a
-    guide, where 1e-3 is suitable; 0 with Adam."""
+    guide; 0 with Adam."""
     learning_rate: float = 1e-3
     """Constant step size of Adam."""
     optimiser: Optimiser = "ssbroyden"
@@ -64,6 +64,18 @@ class PinnObsConfig(TrainingConfig):
     log_every: int = 20
     """Iterations between points of the logged curves."""
 
+    @property
+    def recipe(self) -> str:
+        if self.guide:
+            return "guided by a smoother"
+        return "paper's recipe" if self.optimiser == "adam" else "paper's loss"
+
+    @property
+    def knows(self) -> tuple[str, ...]:
+        if self.optimiser == "adam":
+            return ()
+        return ("noise", "a smoother of its training record") if self.guide else ("noise",)
+
     def __post_init__(self) -> None:
         self.check_shared()
         Architecture(1, 1, self.depth, self.width, self.activation, self.dtype)
@@ -86,13 +98,18 @@ class PinnObsConfig(TrainingConfig):
                 check_setting(self, name, "0 with adam", lambda v: v == 0)
 
 
-def fast() -> PinnObsConfig:
-    """A small network in scaled quantities, guided by a smoother; self-scaled Broyden."""
+def guided() -> PinnObsConfig:
+    """The fast recipe, guided by a Kalman smoother of the same record, which is not the paper's."""
     return PinnObsConfig()
 
 
+def plain() -> PinnObsConfig:
+    """The fast recipe with the paper's loss, a small penalty on the gain, and no smoother."""
+    return PinnObsConfig(guide=0.0, gain_penalty=1e-3)
+
+
 def transfer() -> PinnObsConfig:
-    """The fast recipe with a gain that is meant for other records, too."""
+    """The guided fast recipe with a gain that is meant for other records, too."""
     return PinnObsConfig(transfer=True, gain_penalty=0.3)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.estimation.estimator import BaseEstimator, labelled
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import file_name
 from pinnobs_gym.registry import trainer_class
@@ -48,7 +48,7 @@ class Job:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The estimator's own settings."""
     label: str | None = None
-    """Name of the estimator in rows; its own name if None."""
+    """Name of the estimator in rows; its own, with its recipe, if None."""
     known: frozenset[StoredKey] | None = None
     """Keys of the stored rows; see `Results`."""
     fresh: bool = False
@@ -62,11 +62,17 @@ class Job:
         return self.folder / "rows.jsonl"
 
     @property
+    def called(self) -> str:
+        """Name of the estimator in rows, unless its class makes another; see
+        `BaseEstimator.label`."""
+        return self.label or called(ESTIMATORS.resolve(self.estimator), self.training)
+
+    @property
     def name(self) -> str:
         """Short description of the job."""
         many = f"{self.episodes} episodes" if self.episodes > 1 else f"episode {self.seed}"
         system, condition = self.game.system.partition(":")[2], self.game.name.condition
-        return f"{self.label or self.estimator} on {system}, {condition}, {many}"
+        return f"{self.called} on {system}, {condition}, {many}"
 
     @property
     def digest(self) -> str:
@@ -102,13 +108,20 @@ class Job:
             "schema": rows_module.SCHEMA,
             "kind": kind,
             **self.game.name._asdict(),
-            "estimator": self.label or ESTIMATORS.name_of(ESTIMATORS.resolve(self.estimator)),
+            "estimator": self.called,
             "episode": rows_module.episode_of(self.seed),
             "episodes": self.episodes,
             "job": self.digest,
             "versions": versions(),
             "date": now(),
         }
+
+
+def called(cls: type[BaseEstimator], training: Mapping[str, Any]) -> str:
+    """Return the name in rows of an estimator, given values of its trainer's Config if it is
+    trained."""
+    trained = cls.needs_training or cls.trains_on_record
+    return labelled(ESTIMATORS.name_of(cls), cls.trainer_config(training).recipe if trained else "")
 
 
 def run_job(job: Job) -> None:

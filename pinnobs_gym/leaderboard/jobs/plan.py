@@ -12,7 +12,7 @@ from typing import Any
 from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.leaderboard.jobs.job import Job
+from pinnobs_gym.leaderboard.jobs.job import Job, called
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
@@ -21,11 +21,12 @@ from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
 
 
-def default_estimators() -> tuple[str, ...]:
-    """Return the names of all estimators that can be scored on unseen episodes."""
+def default_estimators() -> tuple[Entry, ...]:
+    """Return all estimators that can be scored on unseen episodes, in all their variants."""
     return tuple(
-        name
+        Entry(name, settings=settings)
         for name, cls in ESTIMATORS.classes().items()
+        for settings in cls.variants
         if cls.needs_training is None or cls.track == "online"
     )
 
@@ -40,11 +41,11 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
     Raises:
         ValueError: in one line, naming the invalid value, before anything is run.
     """
-    estimators = suite.estimators or tuple(map(Entry, default_estimators()))
+    estimators = suite.estimators or default_estimators()
     chosen = [(entry, _class(suite, entry)) for entry in estimators]
-    called = [entry.label or ESTIMATORS.name_of(cls) for entry, cls in chosen]
-    for name in called:
-        if called.count(name) > 1:
+    names = [_name(suite, entry, cls) for entry, cls in chosen]
+    for name in names:
+        if names.count(name) > 1:
             message = f"{name!r} stands for two; give each a label of its own"
             raise suite.wrong("estimators", message)
     quick, long = [], []
@@ -113,8 +114,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
         known = None  # the name in rows may be another one: the job reads the file itself
         cls = ESTIMATORS.resolve(job.estimator)
         if job.label is not None or cls.label is BaseEstimator.label:
-            name = job.label or ESTIMATORS.name_of(cls)
-            keys = known_rows[job.game.name, name]
+            keys = known_rows[job.game.name, job.called]
             wanted = set(map(episode_of, range(job.seed, job.seed + job.episodes)))
             known = frozenset(entry for entry in keys if entry[-1] in wanted)
         to_run.append(replace(job, known=known, failed=again))
@@ -134,6 +134,14 @@ def _class(suite: Suite, entry: Entry) -> type[BaseEstimator]:
         except ValueError as error:
             raise suite.wrong("estimators", f"trainer of {entry.name!r}: {error}") from error
     return cls
+
+
+def _name(suite: Suite, entry: Entry, cls: type[BaseEstimator]) -> str:
+    """Return the name in rows of a suite's estimator."""
+    try:
+        return entry.label or called(cls, entry.settings)
+    except (ValueError, TypeError) as error:
+        raise suite.wrong("estimators", f"settings of {entry.name!r}: {error}") from error
 
 
 def _planned_games(suite: Suite, system: str) -> list[PlannedGame]:

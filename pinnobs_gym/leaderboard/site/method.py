@@ -116,7 +116,8 @@ def versions(rows: Iterable[Row]) -> dict[str, str]:
 def commands(runs: Iterable[ScoredRun]) -> list[str]:
     """Return command lines that reproduce these runs: one per setup for the default conditions, and
     one per set of other conditions for the systems played under it. They may produce more rows,
-    since every named estimator plays every named system."""
+    since every named estimator plays every named system. Estimators play by their own recipe; any
+    other, which their names in rows say in brackets, needs a suite of one's own."""
     usual: dict[str, list[ScoredRun]] = {}
     others: dict[tuple[str, str], list[ScoredRun]] = {}
     for run in runs:
@@ -137,7 +138,7 @@ def _command(runs: Sequence[ScoredRun], conditions: Sequence[str] = ()) -> str:
     words = ["pinnobs leaderboard"]
     systems = {run.game.system.rpartition("-v")[0] for run in runs}
     words += ["--systems", *sorted(systems)]
-    words += ["--estimators", *sorted({run.estimator for run in runs})]
+    words += ["--estimators", *sorted({run.estimator.partition(" (")[0] for run in runs})]
     setup = runs[0].game.setup
     words += ["--setup", setup] if setup != "benchmark" else []
     words += ["--condition", *conditions] if conditions else []

@@ -31,7 +31,7 @@ class Entry:
     name: str
     """Name or ``module:Class``."""
     label: str | None = None
-    """Its name in tables; its own name if None."""
+    """Its name in tables; its own, with its recipe if its trainer has several, if None."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Its settings or, if it is trained, its trainer's."""
 
@@ -43,7 +43,7 @@ class Suite:
     systems: tuple[str, ...] = ()
     """Names or ``module:Class``; all known systems if empty."""
     estimators: tuple[Entry, ...] = ()
-    """All estimators that can be ranked if empty."""
+    """All estimators that can be ranked if empty, in all their `BaseEstimator.variants`."""
     conditions: tuple[str, ...] = ()
     """If empty, nominal and the system's ranked condition. With "all", estimators that need no
     training also play every other condition that applies to the system."""

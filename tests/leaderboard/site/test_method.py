@@ -11,7 +11,7 @@ def test_commands_name_what_was_played():
     nominal = [row(seed, estimator=name) for seed in (2, 3) for name in ("ukf", "ekf")]
     other = [row(2, condition="noise5", ranked=False)]
     trained = {"config": {"budget": 4.0}, "per_record": True}
-    setup = [row(0, setup="paper", estimator="pinn_obs", training=trained)]
+    setup = [row(0, setup="paper", estimator="pinn_obs (paper's loss)", training=trained)]
     assert method.commands(runs_of(nominal + other + setup)) == [
         "pinnobs leaderboard --systems A --estimators ekf ukf --episodes 2 --seed 2",
         "pinnobs leaderboard --systems A --estimators pinn_obs --setup paper --episodes 1 "

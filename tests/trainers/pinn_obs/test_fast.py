@@ -21,6 +21,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.mlp import Activation, Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
 from pinnobs_gym.scoring import acceptance
+from pinnobs_gym.scoring.evaluation import run_episodes
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
@@ -28,6 +29,7 @@ from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.passes import flattened
 from trainers.pinn_obs.points import fast_frequencies, points_of
 
+GUIDE = "a smoother of its training record"
 SMALL = PinnObsConfig(depth=2, width=8, iterations=60, log_every=10)
 
 
@@ -206,14 +208,45 @@ def test_presets_are_whole_recipes_of_which_settings_are_changed():
     assert (paper.width, paper.depth, paper.optimiser, paper.guide) == (7, 9, "adam", 0.0)
     assert PinnObsTrainer.configured({}) == PinnObsConfig()
     assert PinnObsTrainer.configured({"preset": "transfer"}).transfer
+    assert PinnObsTrainer.configured({"preset": "plain"}).guide == 0
     for change, message in (
-        ({"preset": "best"}, "preset='best'; expected one of fast, transfer, paper"),
+        ({"preset": "best"}, "preset='best'; expected one of guided, plain, transfer, paper"),
         ({"dtype": "float32"}, "dtype='float32'; expected float64"),
         ({"preset": "paper", "gain_penalty": 1.0}, r"gain_penalty=1\.0; expected 0"),
         ({"deepness": 3}, "setting 'deepness'; expected one of activation, budget, "),
     ):
         with pytest.raises(ValueError, match=message):
             PinnObsTrainer.configured(change)
+
+
+RECIPES = {
+    "guided": ("guided by a smoother", ["model", "prior", "noise", GUIDE]),
+    "transfer": ("guided by a smoother", ["model", "prior", "noise", GUIDE]),
+    "plain": ("paper's loss", ["model", "prior", "noise"]),
+}
+
+
+@pytest.mark.parametrize("preset", RECIPES)
+def test_names_and_knowledge_in_rows_say_the_recipe(preset):
+    """Those of the estimator that trains, and of the one that is trained first."""
+    name, knows = RECIPES[preset]
+    game = Game.of("ReverseDuffing", duration=2.0)
+    small = {"depth": 1, "width": 3, "iterations": 2, "preset": preset}
+    config = PinnObsTrainer.configured(small)
+    trained = train_pinn_obs(game.source.system, config, record=game.record([7]))
+    replay = PinnObsReplay(game.source.system, trained=trained)
+    (row,) = run_episodes(game, replay, range(1)).rows
+    assert (row["estimator"], row["knows"]) == (f"pinn_obs_replay ({name})", knows)
+    (row,) = run_episodes(game, PinnObs(game.source.system, config=config), range(1)).rows
+    assert (row["estimator"], row["knows"]) == (f"pinn_obs ({name})", knows)
+
+
+def test_adam_is_called_the_papers_recipe_and_knows_no_noise():
+    config = PinnObsTrainer.configured({"preset": "paper"})
+    assert PinnObs(SYSTEMS.resolve("Academic")(), config=config).label == (
+        "pinn_obs (paper's recipe)"
+    )
+    assert config.knows == ()
 
 
 @pytest.mark.parametrize("setup", ["benchmark", "paper"])

@@ -20,7 +20,7 @@ from pinnobs_gym.simulation.system import independent, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from trainers.pinn_obs import PinnObsConfig, fast, transfer
+from trainers.pinn_obs import PinnObsConfig, guided, transfer
 from trainers.pinn_obs.guide import observer_gain
 from trainers.pinn_obs.smoother import DRIFT, forward, smooth
 
@@ -196,7 +196,7 @@ def test_a_gain_meant_for_other_records_beats_one_that_is_not():
     prior = Prior(np.zeros((1, 2)), record.prior.cov)
     other = replace(record, y=system.h(record.t, x, record.u[0])[None], prior=prior)
     rmse = []
-    for preset in (fast, transfer):
+    for preset in (guided, transfer):
         config = replace(preset(), iterations=300)
         trained = train_pinn_obs(system, config, record=record)
         replayed = PinnObsReplay(system, trained=trained).run(other).xhat[0]
