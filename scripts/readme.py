@@ -1,19 +1,19 @@
-"""Update the README's picture and tables from stored scores.
+"""Update the README's picture and table, and the tables of docs/results.md, from stored scores.
 
     python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
         [--conditions-file runs/conditions/rows.jsonl]
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
         [--figures-file runs/benchmark.jsonl]
 
-All measured figures go to docs/benchmarks.md, and a summary of them to the README. Sections without
-stored scores are left unchanged.
+The leaderboard goes to the README, the other tables to docs/results.md, and all measured figures to
+docs/benchmarks.md. Sections without stored scores are left unchanged.
 """
 
 from __future__ import annotations
 
 import platform
 import sys
-from datetime import UTC, datetime
+from collections.abc import Mapping
 from pathlib import Path
 
 import measured
@@ -27,21 +27,14 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.files import replacing
-from pinnobs_gym.leaderboard import ranks, ranks_table
+from pinnobs_gym.leaderboard import ranks_table
 from pinnobs_gym.leaderboard.board import board
-from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.chapters import chapters
 from pinnobs_gym.leaderboard.grid import text_table
-from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.scoring import rows
 
 ROOT = Path(__file__).parents[1]
 END = "<!-- end -->"
-PAPER_HEADING = "## The paper's figures"
-CONDITIONS_HEADING = "### Under every condition"
-COMPARISON_HEADING = "### Beside the learned observers"
-FIGURES_HEADING = "## Measured figures"
-BEFORE = "## Development"
-"""Heading before which new sections are inserted."""
 
 
 def picture(path: Path, seed: int = 3) -> None:
@@ -64,20 +57,30 @@ def picture(path: Path, seed: int = 3) -> None:
 
 
 def summary(scored: list[rows.Row]) -> str:
-    """Return the table of estimators across the systems, and the table of ranks if there is one."""
-    date = datetime.now(UTC).date().isoformat()
+    """Return the tables of estimators across the systems: of those that are made before any record
+    is seen, and of those that are trained on each."""
+    dates = sorted(row["date"][:10] for row in scored)
+    seeds = {row["training_seed"] for row in scored if not row["training"].get("per_record")}
+    trainings = len(seeds - {None})
     intro = (
-        f"Measured on {date} with Python {platform.python_version()}, one thread a job "
-        f"({processor()}), by `make leaderboard`, which writes the details of each system to "
-        "`runs/leaderboard/leaderboard.md`."
+        f"Measured on {dates[-1]} with Python {platform.python_version()}, one thread a job "
+        f"({processor()}), by `make leaderboard`{_with_seeds(trainings)}, which writes the details "
+        "of each system to `runs/leaderboard/leaderboard.md`."
     )
-    standings = board(rows.Stored(scored, []))
-    overview = ranks_table.grid(standings.lines)
-    parts = [intro, ranks_table.NOTE, text_table(overview.header, overview.lines)]
-    if len(standings.ranks) > 2:
-        placed = ranks_table.rank_grid(standings.ranks)
-        parts += [ranks_table.RANK_NOTE, text_table(placed.header, placed.lines)]
+    parts = [intro]
+    for chapter in chapters(board(rows.Stored(scored, []))):
+        if chapter.key.endswith("overview"):
+            grid = chapter.tables[0][0][0]
+            parts += [chapter.note, text_table(grid.header, grid.lines)]
     return "\n\n".join(parts)
+
+
+def _with_seeds(trainings: int) -> str:
+    """Return how the trainings of several seeds were added."""
+    if trainings <= 1:
+        return ""
+    seeds = " ".join(map(str, range(trainings)))
+    return f" and `pinnobs leaderboard --training-seeds {seeds}`"
 
 
 def under_conditions(scored: list[rows.Row]) -> str:
@@ -87,23 +90,28 @@ def under_conditions(scored: list[rows.Row]) -> str:
         "Estimators that need no training under every condition, by `pinnobs leaderboard "
         f"--condition all --episodes {episodes}`."
     )
-    ratios = ranks.log_ratios(contenders(runs_of(scored)))
-    placed = ranks_table.rank_grid(ranks.ranks(ratios))
-    table = text_table(placed.header, placed.lines)
-    return "\n\n".join([intro, ranks_table.RANK_NOTE, table])
+    part = board(rows.Stored(scored, [])).main
+    grid = ranks_table.rank_grid(part.conditions, part.knows)
+    table = text_table(grid.header, grid.lines)
+    return "\n\n".join(filter(None, [intro, ranks_table.RANK_NOTE, table, grid.note]))
 
 
-def replaced(text: str, name: str, content: str, heading: str) -> str:
-    """Replace the content between the marks of a name.
-
-    If the text has no such marks, they are inserted, under the heading, before `BEFORE`.
-    """
+def replaced(text: str, name: str, content: str) -> str:
+    """Replace the content between the marks of a name, which the text has to have."""
     start = f"<!-- {name}: written by scripts/readme.py -->"
-    if start not in text:
-        text = text.replace(BEFORE, f"{heading}\n\n{start}\n{END}\n\n{BEFORE}", 1)
-    before, _, rest = text.partition(start)
+    before, mark, rest = text.partition(start)
+    assert mark, start
     after = rest.partition(END)[2]
     return f"{before}{start}\n\n{content}\n\n{END}{after}"
+
+
+def _rewrite(path: Path, sections: Mapping[str, str]) -> None:
+    """Replace the sections of a file that have content."""
+    text = path.read_text(encoding="utf-8")
+    for name, content in sections.items():
+        text = replaced(text, name, content) if content else text
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def main(
@@ -134,24 +142,19 @@ def main(
             file=sys.stderr,
         )
         return 2
-    readme = ROOT / "README.md"
-    text = readme.read_text(encoding="utf-8")
     if scored:
         picture(ROOT / "docs" / "reverse_duffing.png")
-        text = replaced(text, "leaderboard", summary(scored), "## Leaderboard")
-    if section:
-        text = replaced(text, "paper", section, PAPER_HEADING)
-    if everywhere:
-        text = replaced(text, "conditions", under_conditions(everywhere), CONDITIONS_HEADING)
-    if compared:
-        table = compared.partition("\n\n")[2].strip()  # under the README's own heading
-        text = replaced(text, "comparison", table, COMPARISON_HEADING)
+        _rewrite(ROOT / "README.md", {"leaderboard": summary(scored)})
+    sections = {
+        "conditions": under_conditions(everywhere) if everywhere else "",
+        "paper": section,
+        "comparison": compared.partition("\n\n")[2].strip(),  # under the page's own heading
+        "figures": measured.readme_section(figures) if figures else "",
+    }
+    _rewrite(ROOT / "docs" / "results.md", sections)
     if figures:
-        text = replaced(text, "figures", measured.readme_section(figures), FIGURES_HEADING)
         with replacing(ROOT / "docs" / "benchmarks.md") as temporary:
             temporary.write_text(measured.page(figures), encoding="utf-8")
-    with replacing(readme) as temporary:
-        temporary.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks import Figure, at_most
 from paper_case import Case
 
-from pinnobs_gym.leaderboard.standings_table import markdown_table
+from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import PinnObsConfig, guided, plain
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.comparison import Estimate, Results, score
+from pinnobs_gym.leaderboard.comparison import Estimate, score
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender
+from pinnobs_gym.leaderboard.influence import Results
 from pinnobs_gym.leaderboard.intervals import CONFIDENCE, Interval
 from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 

@@ -5,15 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.leaderboard.comparison import (
-    Field,
-    Influence,
-    Results,
-    divergence,
-    estimate,
-    interquartile_mean,
-    p_value,
-)
+from pinnobs_gym.leaderboard.comparison import Field, estimate, p_value
+from pinnobs_gym.leaderboard.influence import Influence, Results, divergence, interquartile_mean
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,12 @@ from scipy.stats import binomtest, trim_mean, ttest_ind, ttest_rel
 
 from pinnobs_gym.leaderboard.comparison import (
     Estimate,
-    Results,
     difference,
     divergence_difference,
     p_value,
     score,
 )
+from pinnobs_gym.leaderboard.influence import Results
 
 
 def results(log_ratio, diverged=None):

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from pinnobs_gym.leaderboard.comparison import Results, difference
+from pinnobs_gym.leaderboard.comparison import difference
+from pinnobs_gym.leaderboard.influence import Results
 from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 
 EPISODES = 100

@@ -212,20 +212,19 @@ def test_a_case_that_fails_does_not_stop_the_others(short, tmp_path, monkeypatch
     assert [row["case"] for row in rows_in(tmp_path)] == ["other"]
 
 
-# The README's section
+# The section of the page of results
 
 
-def test_the_readme_gets_a_section(short, tmp_path):
+def test_the_page_of_results_gets_a_section(short, tmp_path):
     assert command("depth", "--only", "one", out=tmp_path) == 0
     section = report.readme_section(rows_in(tmp_path), [reproduce_paper.TABLES["depth"]])
-    text = f"# X\n\n{readme.BEFORE}\n\nend"
-    for _ in range(2):  # once where there is none, once in its place
-        text = readme.replaced(text, "paper", section, readme.PAPER_HEADING)
-    assert text.count(readme.PAPER_HEADING) == text.count("| one | the paper |") == 1
+    text = "# X\n\n<!-- paper: written by scripts/readme.py -->\n<!-- end -->\n\nend"
+    for _ in range(2):  # once into an empty place, once in place of the former
+        text = readme.replaced(text, "paper", section)
+    assert text.count("| one | the paper |") == 1
     assert "| other |" not in text
     assert "Measured on 20" in text
     assert str(tmp_path) not in text
-    assert text.index(readme.PAPER_HEADING) < text.index(readme.BEFORE)
     assert text.endswith("end")
     assert report.readme_section([], TABLES.values()) == ""
 
