@@ -11,7 +11,7 @@ from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import factor, outer, product, sandwich
+from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -75,7 +75,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         # Propagate each point through the model; then compute mean and covariance.
         points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
-        mean = mean_weights @ points  # (nx, batch)
+        mean = outer(points, mean_weights[None, :, None])[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * np.sqrt(cov_weights)[:, None]
         P = (outer(X, X) + memory.Q).transpose(2, 0, 1)
         return State(mean.T, state.t, state.u, P, state.innovation, None, memory)
@@ -91,7 +91,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         points = X + xhat.T[:, None]
         outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
         outputs = outputs.transpose(2, 0, 1)
-        mean = mean_weights @ outputs
+        mean = outer(outputs, mean_weights[None, :, None])[:, 0]
         X, Y = X * weights, (outputs - mean[:, None]) * weights
         innovation, missing = y - mean.T, np.isnan(y)
         if np.count_nonzero(missing):
@@ -102,7 +102,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         X -= product(K, Y)
         P = outer(X, X)
         P += sandwich(K, memory.R)
-        xhat = (xhat.T + product(K, innovation.T[:, None])[:, 0]).T
+        xhat = xhat + mapped(K, innovation)
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)
 

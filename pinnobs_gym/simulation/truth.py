@@ -135,9 +135,9 @@ def _take_step(system: System, start: float, step: float, last: float, stages: n
     weights = _tableau(step)
     # Each stage evaluates f at the state plus a combination of the earlier slopes.
     for i, row in enumerate(weights[:-1]):
-        stage = np.dot(row, flat[: i + 1]).reshape(stages.shape[1:])
+        stage = np.einsum("k,kn->n", row, flat[: i + 1]).reshape(stages.shape[1:])
         stages[i + 1] = system.f(t[i], stage, u[i])
-    np.dot(weights[-1], flat, out=flat[0])
+    flat[0] = np.einsum("k,kn->n", weights[-1], flat)
 
 
 def _check_finite(system: System, x0: np.ndarray, x: np.ndarray) -> None:
@@ -212,7 +212,7 @@ def _fixed_step(
     for k, (window, weights) in enumerate(mesh.intervals):
         if len(weights):
             inside = slice(mesh.bounds[k], mesh.bounds[k + 1])
-            np.dot(weights, flat[window], out=out.reshape(len(times), -1)[inside])
+            np.einsum("sk,kn->sn", weights, flat[window], out=out.reshape(len(times), -1)[inside])
     return path[-1, 0], _local_error(system, mesh, flat, path[0, 0].shape)
 
 
@@ -224,7 +224,7 @@ def _local_error(
     middle, rate = np.empty((2, len(mesh.checked), *shape))
     # State and slope of the polynomials midway between nodes.
     for i, (window, weights) in enumerate(mesh.checks):
-        middle[i], rate[i] = np.dot(weights, flat[window]).reshape(2, *shape)
+        middle[i], rate[i] = np.einsum("sk,kn->sn", weights, flat[window]).reshape(2, *shape)
     k = mesh.checked
     t = (mesh.nodes[k] + mesh.steps[k] / 2)[:, None]
     # Defect x' − f(t, x).
