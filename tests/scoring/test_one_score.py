@@ -46,7 +46,7 @@ PLAYED = [
 """Gains of observers for the motor take seconds to design."""
 
 
-@pytest.mark.parametrize("env_id, name", PLAYED)
+@pytest.mark.parametrize(("env_id", "name"), PLAYED)
 def test_an_episode_has_one_score_alone_and_in_a_batch(env_id, name):
     game = Game.of(env_id)
     game = Game.of(env_id, duration=30 * game.source.setup.dt)

@@ -60,5 +60,5 @@ def test_the_table_of_an_evaluation_is_that_of_its_file(tmp_path):
 
 def test_without_pandas_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="^to_pandas needs pandas: pip install pandas$"):
+    with pytest.raises(ImportError, match=r"^to_pandas needs pandas: pip install pandas$"):
         Rows([row(0)]).to_pandas()

@@ -23,7 +23,7 @@ def drawn(rng, n, m, batch, transposed):
 
 @pytest.mark.parametrize("batch", [1, 2, 7])
 @pytest.mark.parametrize("transposed", [False, True])
-@pytest.mark.parametrize("n, k, m", SIZES)
+@pytest.mark.parametrize(("n", "k", "m"), SIZES)
 def test_sums_are_formed_in_order_in_any_batch(n, k, m, transposed, batch):
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -39,7 +39,7 @@ def test_sums_are_formed_in_order_in_any_batch(n, k, m, transposed, batch):
         np.testing.assert_array_equal(matrices.inner(A[0], B[:, 0]), expected)
 
 
-@pytest.mark.parametrize("n, m", [(1, 2), (1, 3), (2, 2), (3, 3), (5, 5)])
+@pytest.mark.parametrize(("n", "m"), [(1, 2), (1, 3), (2, 2), (3, 3), (5, 5)])
 def test_the_sandwich_of_a_row_is_that_of_the_batch(n, m):
     rng = np.random.default_rng(0)
     for _ in range(20):
