@@ -138,4 +138,5 @@ def update_with(
     P += sandwich(K, R)
     P = P + P.swapaxes(0, 1)  # remove the asymmetry due to rounding
     P *= 0.5
-    return xhat + mapped(K, innovation), P
+    x = xhat.T + mapped(K, innovation).T
+    return x.T, P

@@ -266,9 +266,9 @@ def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np
     """
     weighted = dt * L * weight[:, None]
     # The batch is the first axis in memory, so that sums are formed alike in any batch.
-    M = np.eye(H.shape[1]) + np.einsum("bpi,biq->bpq", np.ascontiguousarray(H), weighted)
+    M = np.eye(H.shape[1]) + np.ascontiguousarray(H) @ weighted
     # Rows that have diverged give NaN instead of an error.
     usable = np.isfinite(M).all(axis=(1, 2)) & (np.linalg.det(M) != 0)
     inverse = np.full_like(M, np.nan)
     inverse[usable] = np.linalg.inv(M[usable])
-    return np.einsum("bip,bpq->biq", weighted, inverse)
+    return weighted @ inverse

@@ -100,5 +100,5 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
         innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
         H = np.asarray(self.system.h_jacobian(t, xhat, u))
         K = injection(L, H, 1.0 - missing, dt)
-        xhat = xhat + np.einsum("bip,bp->bi", K, innovation)
+        xhat = xhat + (K @ innovation[..., None])[..., 0]
         return State(xhat, t, u, innovation=innovation, memory=L)

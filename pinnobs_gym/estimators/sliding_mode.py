@@ -75,5 +75,5 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         secant = 1 + self.switching / np.maximum(abs(innovation) / layer, 1.0)
         H = np.asarray(self.system.h_jacobian(t, xhat, u))
         K = injection(L, H, np.where(missing, 0.0, secant), dt)
-        xhat = xhat + np.einsum("bip,bp->bi", K, innovation)
+        xhat = xhat + (K @ innovation[..., None])[..., 0]
         return State(xhat, t, u, innovation=innovation, memory=state.memory)

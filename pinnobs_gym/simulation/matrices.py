@@ -116,11 +116,12 @@ def squared_size(innovation: np.ndarray, S: np.ndarray) -> np.ndarray:
 def product(a: Array, b: Array) -> Array:
     """Return the matrix products (n, m, batch) of (n, k, batch) and (k, m, batch). For small
     matrices this is several times faster than with the batch first."""
-    if a.shape[1] == 1:
+    _, terms, batch = a.shape
+    if terms == 1:
         return a * b
     if not isinstance(a, np.ndarray):
         return (a[:, :, None] * b[None]).sum(1)
-    if a.shape[2] > 1 or a.shape[1] == 2:
+    if batch > 1 or terms == 2:
         return np.einsum("ijb,jkb->ikb", a, b)
     if b.shape[1] == 1:
         return np.add.accumulate(a * b[:, 0], axis=1)[:, -1:]
@@ -130,7 +131,8 @@ def product(a: Array, b: Array) -> Array:
 
 def mapped(M: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the vectors Mv, shape (batch, n), for M (n, m, batch) and v (batch, m)."""
-    return product(M, np.ascontiguousarray(v.T)[:, None])[:, 0].T
+    column = v.T if len(v.T) <= 2 else np.ascontiguousarray(v.T)
+    return product(M, column[:, None])[:, 0].T
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
