@@ -108,8 +108,8 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         K, S = gain_of_deviations(X, Y, np.diag(memory.R_std**2)[..., None])
         # Correct each member with its own perturbed output.
         errors = np.where(missing, 0.0, y + noise - outputs)
-        columns = np.ascontiguousarray(K.transpose(1, 2, 0))
-        members = members + np.einsum("pbi,mbp->mbi", columns, errors)
+        for p, column in enumerate(K.transpose(1, 2, 0)):
+            members = members + errors[..., p, None] * column
         xhat = total(members) / self.members
         X = weight * (members - xhat).transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
