@@ -14,6 +14,7 @@ from pinnobs_gym.envs.registration import register_envs, register_system
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.estimator import Estimator, State
     from pinnobs_gym.scoring.evaluation import evaluate
+    from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.system import Setup, System, stack
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "System",
     "__version__",
     "evaluate",
+    "read_rows",
     "register",
     "stack",
 ]
@@ -37,6 +39,7 @@ _HOMES = {
     "System": "simulation.system",
     "stack": "simulation.system",
     "evaluate": "scoring.evaluation",
+    "read_rows": "scoring.table",
 }
 """Submodule that defines each lazily imported public name."""
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.enkf import EnKF
-from pinnobs_gym.leaderboard.comparison import Field, p_value, score
+from pinnobs_gym.leaderboard.comparison import p_value, score
 from pinnobs_gym.leaderboard.contenders import LARGEST
-from pinnobs_gym.leaderboard.influence import Results
+from pinnobs_gym.leaderboard.influence import Field, Results
 from pinnobs_gym.leaderboard.intervals import CONFIDENCE
 from pinnobs_gym.leaderboard.tie_groups import tie_groups
 from pinnobs_gym.scoring.evaluation import make_estimator

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.matrices import divide, identity, outer, product, sandwich
+from pinnobs_gym.simulation.matrices import divide, identity, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.system import Array, System
 
@@ -138,5 +138,5 @@ def update_with(
     P += sandwich(K, R)
     P = P + P.swapaxes(0, 1)  # remove the asymmetry due to rounding
     P *= 0.5
-    x = xhat.T + product(K, innovation.T[:, None])[:, 0]
+    x = xhat.T + mapped(K, innovation).T
     return x.T, P

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import observe
-from pinnobs_gym.simulation.matrices import product
+from pinnobs_gym.simulation.matrices import inner, mapped, product
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.system import System
 
@@ -68,8 +68,9 @@ def linearised(
         G = product(H, X)
         # Accumulate the normal equations.
         weighted = (G / R[:, None, None]).transpose(1, 0, 2)
-        cost += (error**2 / R).sum(axis=-1)
-        right += np.einsum("ipb,bp->ib", weighted, error)
+        e = np.ascontiguousarray(error.T)
+        cost += inner(e / R[:, None], e)
+        right += mapped(weighted, error).T
         information += product(weighted, G)
     return Fit(cost, information, right, states, derivatives)
 

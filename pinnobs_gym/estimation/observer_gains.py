@@ -265,7 +265,8 @@ def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np
         dt: length of the step in s.
     """
     weighted = dt * L * weight[:, None]
-    M = np.eye(H.shape[1]) + H @ weighted
+    # The batch is the first axis in memory, so that sums are formed alike in any batch.
+    M = np.eye(H.shape[1]) + np.ascontiguousarray(H) @ weighted
     # Rows that have diverged give NaN instead of an error.
     usable = np.isfinite(M).all(axis=(1, 2)) & (np.linalg.det(M) != 0)
     inverse = np.full_like(M, np.nan)

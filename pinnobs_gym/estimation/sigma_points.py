@@ -11,7 +11,7 @@ from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import factor, outer, product, sandwich
+from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -25,7 +25,8 @@ class SigmaPointMemory:
     R: np.ndarray
     """Covariance of the output noise, shape (ny, ny, batch)."""
     points: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """The result of `SigmaPointFilter.points`."""
+    """The points, shape (num_points, nx), their weights in means, (num_points, 1, 1), and the square
+    roots of their weights in covariances, (num_points, 1); see `SigmaPointFilter.points`."""
     jitter: np.ndarray
     """Largest relative amount added to the variances so far, shape (batch,); zero if none was."""
 
@@ -62,28 +63,29 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         batch = len(prior.mean)
-        memory = SigmaPointMemory(*self.tuning(batch), self.points(), np.zeros(batch))
+        unit, mean_weights, cov_weights = self.points()
+        points = unit, mean_weights[:, None, None], np.sqrt(cov_weights)[:, None]
+        memory = SigmaPointMemory(*self.tuning(batch), points, np.zeros(batch))
         return State(prior.mean, P=prior.cov, memory=memory)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
         memory: SigmaPointMemory = state.memory
-        unit, mean_weights, cov_weights = memory.points
+        unit, mean_weights, roots = memory.points
         L, memory = _factor(covariances(state), memory)
         points = unit @ L  # (nx, num_points, batch)
         points += state.xhat.T[:, None]
         # Propagate each point through the model; then compute mean and covariance.
         points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
-        mean = mean_weights @ points  # (nx, batch)
-        X = (points - mean[:, None]) * np.sqrt(cov_weights)[:, None]
+        mean = product(points, mean_weights)[:, 0]  # (nx, batch)
+        X = (points - mean[:, None]) * roots
         P = (outer(X, X) + memory.Q).transpose(2, 0, 1)
         return State(mean.T, state.t, state.u, P, state.innovation, None, memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: SigmaPointMemory = state.memory
-        unit, mean_weights, cov_weights = memory.points
-        weights = np.sqrt(cov_weights)[:, None]
+        unit, mean_weights, roots = memory.points
         xhat = state.xhat
         L, memory = _factor(covariances(state), memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
@@ -91,8 +93,8 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         points = X + xhat.T[:, None]
         outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
         outputs = outputs.transpose(2, 0, 1)
-        mean = mean_weights @ outputs
-        X, Y = X * weights, (outputs - mean[:, None]) * weights
+        mean = product(outputs, mean_weights)[:, 0]
+        X, Y = X * roots, (outputs - mean[:, None]) * roots
         innovation, missing = y - mean.T, np.isnan(y)
         if np.count_nonzero(missing):
             innovation = np.where(missing, 0.0, innovation)
@@ -102,7 +104,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         X -= product(K, Y)
         P = outer(X, X)
         P += sandwich(K, memory.R)
-        xhat = (xhat.T + product(K, innovation.T[:, None])[:, 0]).T
+        xhat = (xhat.T + mapped(K, innovation).T).T
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)
 

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import cautious, kalman_gain, observe, predict, update_with
-from pinnobs_gym.simulation.matrices import divide_factored, factor, identity, product, sandwich
+from pinnobs_gym.simulation.matrices import (
+    divide_factored,
+    factor,
+    identity,
+    mapped,
+    product,
+    sandwich,
+)
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -81,14 +88,14 @@ def forward(
         if k and about is None:
             x, P, F[k - 1] = predict(system, (t[k - 1], t[k]), x, P, Q, (u[k - 1], u[k]))
         elif k and about is not None:
-            x = ends[k - 1] + np.einsum("ijb,bj->bi", F[k - 1], x - about[k - 1])
+            x = ends[k - 1] + mapped(F[k - 1], x - about[k - 1])
             P = sandwich(F[k - 1], P) + Q
         before.xhat[k], before.P[k] = x, P
         # Innovation, with h linearised about the same states.
         at = x if about is None else about[k]
         innovation, H[k] = observe(system, float(t[k]), at, y[k], u[k])
         if about is not None:
-            innovation = innovation - np.einsum("pib,bi->bp", H[k], x - about[k])
+            innovation = innovation - mapped(H[k], x - about[k])
         # Update.
         noise = cautious(P, H[k], R, caution)
         K[k], _ = kalman_gain(P, H[k], noise)
@@ -110,7 +117,7 @@ def backward(filtered: Filtered) -> Path:
         C, own = _gains_back(filtered, start, stop)
         for k in range(stop - 1, start - 1, -1):
             gain = C[k - start]
-            x[k] += np.einsum("ijb,bj->bi", gain, x[k + 1] - before.xhat[k + 1])
+            x[k] += mapped(gain, x[k + 1] - before.xhat[k + 1])
             smoothed = own[k - start] + sandwich(gain, P[k + 1])
             P[k] = (smoothed + smoothed.transpose(1, 0, 2)) / 2  # against rounding
     return Path(x, P)
@@ -180,7 +187,9 @@ def _gains_back(filtered: Filtered, start: int, stop: int) -> tuple[np.ndarray, 
         filtered.F[start:stop],
         filtered.predicted.P[start + 1 : stop + 1],
     )
-    P, F, ahead = (a.transpose(1, 2, 0, 3).reshape(*a.shape[1:3], -1) for a in parts)
+    P, F, ahead = (
+        np.ascontiguousarray(a.transpose(1, 2, 0, 3)).reshape(*a.shape[1:3], -1) for a in parts
+    )
     L, _ = factor(ahead, np.zeros(ahead.shape[-1]))
     C = divide_factored(product(P, F.transpose(1, 0, 2)), L)
     own = sandwich(identity(len(C), C.shape[-1]) - product(C, F), P) + sandwich(C, filtered.Q)

@@ -9,7 +9,7 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
-from pinnobs_gym.simulation.matrices import sandwich
+from pinnobs_gym.simulation.matrices import inner, mapped, sandwich
 from pinnobs_gym.simulation.record import Record
 
 
@@ -78,12 +78,12 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
         """Return the fit at z (nx, rows) to the first samples of some of the records, including the
         prior."""
         root_of = L[..., rows]
-        x0 = record.prior.mean[rows] + np.einsum("ijb,jb->bi", root_of, z)
+        x0 = record.prior.mean[rows] + mapped(root_of, z.T)
         y, u = record.y[rows, :length].swapaxes(0, 1), record.u[rows, :length].swapaxes(0, 1)
         R = self.output_variance
         fit = linearised(self.system, record.t[:length], y, u, x0, root_of, R)
         information = fit.information + np.eye(len(z))[..., None]
-        return Fit(fit.cost + (z**2).sum(axis=0), information, fit.right - z, fit.x, fit.X)
+        return Fit(fit.cost + inner(z, z), information, fit.right - z, fit.x, fit.X)
 
     def _fitted(self, record: Record, L: np.ndarray, z: np.ndarray, length: int) -> np.ndarray:
         """Return the z that minimise the cost over the first ``length`` samples, starting from the
@@ -102,7 +102,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
             fit = self._evaluated(record, L, trial, rows, length)
             # Accept the step and reduce the damping where the cost decreases; else increase it.
             accepted = fit.cost < cost
-            gain = (step * right).sum(axis=0)
+            gain = inner(step, right)
             z[:, rows] = np.where(accepted, trial, z[:, rows])
             cost = np.where(accepted, fit.cost, cost)
             information = np.where(accepted, fit.information, information)

@@ -11,7 +11,7 @@ from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import outer
+from pinnobs_gym.simulation.matrices import outer, spread, total
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -77,7 +77,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         L = root(prior.cov.transpose(1, 2, 0))
-        members = prior.mean + np.einsum("ijb,mj->mbi", L, self._draws(0, self.system.nx))
+        members = prior.mean + spread(L, self._draws(0, self.system.nx))
         stds = self.process_noise * np.asarray(self.system.scale), np.sqrt(self.output_variance)
         memory = EnsembleMemory(members, *stds, self._noise(0))
         return State(prior.mean, P=prior.cov, memory=memory)
@@ -87,18 +87,18 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         memory: EnsembleMemory = state.memory
         members = model_step(self.system, state.t, t, memory.members, state.u, u)
         # Inflate the deviations from the ensemble mean, and add the process noise.
-        mean = members.mean(axis=0)
+        mean = total(members) / self.members
         noise = self._noise(memory.sample)
         moved = memory.Q_std * noise[..., : self.system.nx]
         members = mean + self.inflation * (members - mean) + moved
         memory = replace(memory, members=members, noise=noise)
-        return State(members.mean(axis=0), state.t, state.u, memory=memory)
+        return State(total(members) / self.members, state.t, state.u, memory=memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: EnsembleMemory = state.memory
         members = memory.members
-        mean, outputs = members.mean(axis=0), np.asarray(self.system.h(t, members, u))
-        yhat = outputs.mean(axis=0)
+        mean, outputs = total(members) / self.members, np.asarray(self.system.h(t, members, u))
+        yhat = total(outputs) / self.members
         noise = memory.R_std * memory.noise[..., self.system.nx :]
         weight = 1 / np.sqrt(self.members - 1)
         X = weight * (members - mean).transpose(2, 0, 1)
@@ -108,8 +108,9 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         K, S = gain_of_deviations(X, Y, np.diag(memory.R_std**2)[..., None])
         # Correct each member with its own perturbed output.
         errors = np.where(missing, 0.0, y + noise - outputs)
-        members = members + np.einsum("ipb,mbp->mbi", K, errors)
-        xhat = members.mean(axis=0)
+        for p, column in enumerate(K.transpose(1, 2, 0)):
+            members = members + errors[..., p, None] * column
+        xhat = total(members) / self.members
         X = weight * (members - xhat).transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
         memory = replace(memory, members=members, sample=memory.sample + 1)

@@ -10,7 +10,7 @@ from pinnobs_gym.estimation.estimator import Estimator, Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
 from pinnobs_gym.estimation.least_squares import Fit, linearised
-from pinnobs_gym.simulation.matrices import cholesky, divide, identity, product, sandwich
+from pinnobs_gym.simulation.matrices import cholesky, divide, identity, mapped, product, sandwich
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -98,7 +98,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
             step, P = _step(fit, memory.P, memory.arrival - start)
         # Map the last step to the latest sample to first order, without a new trajectory.
         start = start + step
-        xhat = fit.x[-1] + np.einsum("ijb,bj->bi", fit.X[-1], step)
+        xhat = fit.x[-1] + mapped(fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
         memory = replace(memory, start=start)
         S = _innovation_covariance(P, H, memory.R).transpose(2, 0, 1)
@@ -120,13 +120,13 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])
         # Update x̄ − x and P̄ with the sample, with the output linearised about x.
         offset = memory.arrival - start
-        innovation = innovation - np.einsum("pib,bi->bp", H, offset)
+        innovation = innovation - mapped(H, offset)
         offset, P, _ = joseph_update(offset, memory.P, innovation, H, memory.R)
         # Predict x, x̄ and P̄ to the next sample, which becomes the first of the window.
         second, u_second = (*memory.t, t)[1], (*memory.u, u)[1]
         times, inputs = (memory.t[0], second), (memory.u[0], u_second)
         start, P, F = predict(self.system, times, start, P, memory.Q, inputs)
-        arrival = start + product(F, offset.T[:, None])[:, 0].T
+        arrival = start + mapped(F, offset)
         memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
         return replace(memory, arrival=arrival, P=P, start=start)
 
@@ -156,5 +156,5 @@ def _step(fit: Fit, P: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.n
     inner = identity(len(P), P.shape[-1]) + product(product(L_transposed, fit.information), L)
     P = product(divide(L, inner), L_transposed)
     # The step is that to x̄ plus the correction by the outputs from there.
-    right = fit.right - np.einsum("ijb,bj->ib", fit.information, offset)
-    return offset + np.einsum("ijb,jb->bi", P, right), P
+    right = fit.right.T - mapped(fit.information, offset)
+    return offset + mapped(P, right), P

@@ -10,7 +10,7 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import factor, moments
+from pinnobs_gym.simulation.matrices import factor, moments, spread, total, weighted_mean
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -91,7 +91,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         draws = np.random.default_rng([self.seed, 0]).standard_normal(
             (self.particles, self.system.nx)
         )
-        particles = prior.mean + np.einsum("ijb,mj->mbi", L, draws)
+        particles = prior.mean + spread(L, draws)
         log_weights = np.full(particles.shape[:2], -np.log(self.particles))
         return State(prior.mean, P=prior.cov, memory=ParticleMemory(particles, log_weights))
 
@@ -99,7 +99,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         assert state.t is not None
         memory: ParticleMemory = state.memory
         x = model_step(self.system, state.t, t, memory.particles, state.u, u)
-        xhat = np.einsum("mb,mbi->bi", np.exp(memory.log_weights), x)
+        xhat = weighted_mean(np.exp(memory.log_weights), x)
         return State(xhat, state.t, state.u, memory=replace(memory, particles=x))
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
@@ -114,7 +114,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         weights = np.exp(log_weights)
         xhat, P = moments(weights, x)
         # Resample the episodes whose effective number of particles, 1/Σw², is below half.
-        rows = np.flatnonzero((weights**2).sum(axis=0) > 2 / self.particles)
+        rows = np.flatnonzero(total(weights**2) > 2 / self.particles)
         if len(rows):
             x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
         memory = ParticleMemory(x, log_weights, memory.sample + 1)
@@ -139,16 +139,13 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             if not len(rows):
                 break
             # Apply a power of the likelihood to these episodes, and resample them.
-            part = _power(
-                log_weights[:, rows], log_likelihood[:, rows], remaining[rows], self.particles
-            )
+            old, likelihood = log_weights.take(rows, 1), log_likelihood.take(rows, 1)
+            part = _power(old, likelihood, remaining[rows], self.particles)
             log_weights = log_weights.copy()
-            log_weights[:, rows] = _normalised(
-                log_weights[:, rows] + part * log_likelihood[:, rows]
-            )
+            log_weights[:, rows] = _normalised(old + part * likelihood)
             remaining[rows] -= part
             x, log_weights = self._resampled(x, log_weights, rows, (sample, part_number))
-            log_likelihood[:, rows] = self._log_likelihood(x[:, rows], (t, y[rows], u[rows]))
+            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), (t, y[rows], u[rows]))
         return x, _normalised(log_weights + remaining * log_likelihood)
 
     def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
@@ -164,7 +161,8 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         covariance preserved in expectation. The stream identifies the random numbers of this
         resampling."""
         rng = np.random.default_rng([self.seed, 1, *stream])
-        old, weights, count = x[:, rows], np.exp(log_weights[:, rows]), self.particles
+        # `take` keeps the order in memory, on which that of sums depends; indexing changes it.
+        old, weights, count = x.take(rows, 1), np.exp(log_weights.take(rows, 1)), self.particles
         shrinkage = (3 * self.discount - 1) / (2 * self.discount)
         mean, P = moments(weights, old)
         # Systematic resampling: the number of copies of each particle.
@@ -176,7 +174,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         # Shrink the copies towards the mean, and restore the covariance by Gaussian noise.
         L, _ = factor(P.transpose(1, 2, 0), np.zeros(len(rows)))
         L = np.sqrt(1 - shrinkage**2) * L
-        noise = np.einsum("ijb,mj->mbi", L, rng.standard_normal((count, x.shape[-1])))
+        noise = spread(L, rng.standard_normal((count, x.shape[-1])))
         x, log_weights = x.copy(), log_weights.copy()
         x[:, rows] = shrinkage * drawn + (1 - shrinkage) * mean + noise
         log_weights[:, rows] = -np.log(count)
@@ -186,13 +184,13 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
 def _normalised(log_weights: np.ndarray) -> np.ndarray:
     """Return the logarithms of the weights, normalised so that the weights sum to one."""
     log_weights = log_weights - log_weights.max(axis=0)
-    return log_weights - np.log(np.exp(log_weights).sum(axis=0))
+    return log_weights - np.log(total(np.exp(log_weights)))
 
 
 def _effective(log_weights: np.ndarray) -> np.ndarray:
     """Return the effective number of particles, (Σw)²/Σw², shape (batch,)."""
     weights = np.exp(log_weights - log_weights.max(axis=0))
-    return weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)
+    return total(weights) ** 2 / total(weights**2)
 
 
 def _power(

@@ -22,6 +22,7 @@ from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.simulation.matrices import mapped
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, output_scale, vector
@@ -127,5 +128,5 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
         known_noise = np.broadcast_to(std, e.shape)
         K, memory = recurrent_gain(self.trained.layers, scale, size, x, e, known_noise, memory)
-        xhat = xhat + np.einsum("ipb,bp->bi", K, innovation)
+        xhat = xhat + mapped(K, innovation)
         return State(xhat, t, u, innovation=innovation, memory=(fixed, memory))

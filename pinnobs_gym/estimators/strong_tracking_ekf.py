@@ -10,6 +10,7 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
 from pinnobs_gym.estimation.kalman import cautious, joseph_update, observe
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.simulation.matrices import inner
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -64,7 +65,8 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         Q, _, variance, growth = state.memory
         assert state.innovation is not None
-        Q = Q + growth * (state.innovation**2 / variance).mean(axis=-1)
+        e = np.ascontiguousarray(state.innovation.T)
+        Q = Q + growth * inner(e / variance[:, None], e) / len(e)
         return predicted(self.system, state, covariances(state), Q, t, u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:

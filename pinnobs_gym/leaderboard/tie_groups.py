@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.leaderboard.comparison import Field, estimate, p_value
-from pinnobs_gym.leaderboard.influence import Influence, Results, divergence, interquartile_mean
+from pinnobs_gym.leaderboard.comparison import estimate, p_value
+from pinnobs_gym.leaderboard.influence import (
+    Field,
+    Influence,
+    Results,
+    divergence,
+    interquartile_mean,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,6 +93,7 @@ def _normalised_squares(vectors: np.ndarray, covariances: np.ndarray) -> np.ndar
 def _lag_one_correlation(values: np.ndarray) -> np.ndarray:
     """Return the correlation (batch,) of zero-mean values (batch, num_samples, n) with those one
     sample later; infinite where they are not finite, NaN where all are zero."""
+    values = np.ascontiguousarray(values)  # the order of a sum depends on the order in memory
     now, later = values[:, :-1], values[:, 1:]
     product = np.einsum("bki,bki->b", now, later)
     size = np.sqrt(np.einsum("bki,bki->b", now, now) * np.einsum("bki,bki->b", later, later))

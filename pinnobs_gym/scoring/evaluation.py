@@ -26,6 +26,7 @@ from pinnobs_gym.scoring.provenance import (
     versions,
 )
 from pinnobs_gym.scoring.rows import SCHEMA, Row
+from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.system import System
@@ -79,7 +80,7 @@ def evaluate(
     fresh: bool = False,
     log: Log = SILENT,
     progress: Callable[[int], None] | None = None,
-) -> list[Row]:
+) -> Rows:
     """Score an estimator on the episodes of an env.
 
     All estimators get the same episodes: that of seed s is the first episode of the single env
@@ -105,7 +106,7 @@ def evaluate(
         progress: called after each batch with its number of episodes.
 
     Returns:
-        The rows, in the order of seeds.
+        The rows, in the order of seeds; a list of dicts with a method ``to_pandas``.
 
     Raises:
         ValueError: in one line, for an unknown id, setup, condition or option, or an estimator
@@ -119,7 +120,7 @@ def evaluate(
         _LOGGER.warning(evaluated.reuse(Path(results or "")))
     log_episodes(log, evaluated.rows, evaluated.first_played)
     log_summary(log, evaluated.rows)
-    return evaluated.rows
+    return Rows(evaluated.rows)
 
 
 def seeds_of(seed: int, episodes: int) -> range:
@@ -184,8 +185,7 @@ def run_episodes(
         if results is not None:
             # Curves first: if a crash follows, episodes without rows are run again.
             save(folder_of(results.path), done[0], curves_of(played))
-            new = estimator.trains_on_record is not None and not results.fresh
-            rows_module.append(results.path, done, new=new, replace=results.fresh)
+            rows_module.append(results.path, done, replace=results.fresh)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))

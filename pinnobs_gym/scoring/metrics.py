@@ -215,6 +215,7 @@ def error_scores(
         raise ValueError(f"xhat has shape {xhat.shape}; expected {x.shape}, that of the states")
     finite = np.isfinite(xhat).all(axis=(1, 2))
     with np.errstate(all="ignore"):  # rows that are not finite are overwritten below
+        xhat = np.ascontiguousarray(xhat)  # the order of a sum depends on the order in memory
         error = xhat - x
         square = error**2
         size = abs(x) + abs(xhat)

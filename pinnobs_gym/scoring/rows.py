@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.scoring.present import Present, present_in
 
 SCHEMA = 5
 """Version of the row format."""
@@ -110,15 +111,17 @@ key: Callable[[Row], tuple[Any, ...]] = itemgetter(*KEY)
 """Return the values of `KEY` of a row."""
 
 
-def append(path: Path, rows: Iterable[Row], *, new: bool = False, replace: bool = False) -> None:
+def append(path: Path, rows: Iterable[Row], *, replace: bool = False) -> None:
     """Append rows to a file, all or none of them, under a lock: several processes and machines may
     share the file. An incomplete line at its end, left by a killed process, is cut off first.
+
+    Scored episodes that are already in the file are left out, whoever wrote them: of two runs whose
+    scores differ, the first counts. The first call reads the file, and later ones what was appended
+    in between.
 
     Args:
         path: the file; created if it does not exist.
         rows: the rows to append.
-        new: leave out scored episodes that are already in the file, which is read for this purpose.
-            Of two runs whose scores may differ, the first counts.
         replace: delete earlier rows of the same episodes, together with the appending: the file is
             written anew.
 
@@ -131,18 +134,22 @@ def append(path: Path, rows: Iterable[Row], *, new: bool = False, replace: bool 
             if replace:
                 _replace(path, file, rows)
                 return
-            present = _keys(file) if new else set()
-            rows = [row for row in rows if row["kind"] != "score" or key(row) not in present]
-            _write(file, b"".join(_line(row) for row in rows))
+            present = present_in(path, file, _key_in)
+            _write(file, b"".join(_line(row) for row in _new(rows, present)))
     except OSError as error:
         raise CannotWrite(f"cannot write rows to {path}: {error}") from None
 
 
-def _keys(file: FileIO) -> set[tuple[Any, ...]]:
-    """Return the keys of the scored episodes in an open file."""
-    file.seek(0)
-    rows = [_parsed(line) for line in file.readall().splitlines()]
-    return {key(row) for row in rows if row is not None and row.get("kind") == "score"}
+def _new(rows: Iterable[Row], present: Present) -> Iterator[Row]:
+    """Yield the rows without the scored episodes that are present or occur before."""
+    seen = set()
+    for row in rows:
+        if row["kind"] == "score":
+            name = key(row)
+            if name in present or name in seen:
+                continue
+            seen.add(name)
+        yield row
 
 
 def _replace(path: Path, file: FileIO, rows: Sequence[Row]) -> None:
@@ -161,6 +168,10 @@ def _key_in(line: bytes) -> tuple[Any, ...] | None:
     """Return the key of the scored row in a line; None if it is another line."""
     row = _parsed(line)
     if row is None or (row.get("schema"), row.get("kind")) != (SCHEMA, "score"):
+        return None
+    try:
+        hash(key(row))
+    except (KeyError, TypeError):  # a field is missing, or is a list or an object
         return None
     return key(row)
 

@@ -1,6 +1,11 @@
 """Operations on batches of small matrices. The batch is the last axis, which is several times
 faster.
 
+Sums are formed in the order of the index, in batches of any size, so that the result of a row is
+the same to the last bit alone and in any batch. `numpy.einsum` does so in batches of several rows,
+where its innermost loop is over the batch. In a batch of one row its innermost loop may be over the
+index of the sum, which is then split into parts. BLAS chooses the order by the shape.
+
 Functions annotated with `Array` take NumPy arrays and torch tensors, and preserve gradients.
 """
 
@@ -19,15 +24,22 @@ JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
 
 def sandwich(M: Array, P: Array) -> Array:
     """Return MPMᵀ for M (n, m, batch) and P (m, m, batch or 1)."""
-    if len(M) * len(P) <= 4 and isinstance(M, np.ndarray):
-        # A single sum over both indices is faster for the smallest matrices only.
+    if len(M) * len(P) > 4 or not isinstance(M, np.ndarray):
+        return product(product(M, P), M.swapaxes(0, 1))
+    # A single sum over both indices is faster for the smallest matrices only.
+    if M.shape[-1] > 1:
         return np.einsum("ijb,jkb,lkb->ilb", M, P, M)
-    return product(product(M, P), M.swapaxes(0, 1))
+    if len(M) > 1:  # the innermost loop is over l if M is transposed in memory
+        return np.einsum("ijb,jkb,klb->ilb", M, P, np.ascontiguousarray(M.swapaxes(0, 1)))
+    terms = (M.swapaxes(0, 1) * P * M).reshape(1, -1, P.shape[-1])
+    return np.add.accumulate(terms, axis=1)[:, -1:]
 
 
 def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return ABᵀ, shape (n, k, batch), for A (n, m, batch) and B (k, m, batch)."""
-    return np.einsum("imb,jmb->ijb", A, B)
+    if A.shape[-1] > 1:
+        return np.einsum("imb,jmb->ijb", A, B)
+    return np.add.accumulate(A[:, None] * B, axis=2)[:, :, -1]
 
 
 def divide(A: Array, S: Array) -> Array:
@@ -48,11 +60,11 @@ def divide_factored(A: np.ndarray, L: np.ndarray) -> np.ndarray:
     m = len(L)
     X = np.empty((*A.shape[:2], max(A.shape[2], L.shape[2])))
     for j in range(m):  # forward substitution: X = A(Lᵀ)⁻¹
-        rest = A[:, j] - np.einsum("ikb,kb->ib", X[:, :j], L[j, :j]) if j else A[:, j]
+        rest = A[:, j] - product(X[:, :j], L[j, :j, None])[:, 0] if j else A[:, j]
         X[:, j] = rest / L[j, j]
     X[:, -1] /= L[-1, -1]
     for j in reversed(range(m - 1)):  # back substitution: X becomes XL⁻¹
-        X[:, j] = (X[:, j] - np.einsum("ikb,kb->ib", X[:, j + 1 :], L[j + 1 :, j])) / L[j, j]
+        X[:, j] = (X[:, j] - product(X[:, j + 1 :], L[j + 1 :, j, None])[:, 0]) / L[j, j]
     return X
 
 
@@ -97,26 +109,65 @@ def factor(P: np.ndarray, jitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def squared_size(innovation: np.ndarray, S: np.ndarray) -> np.ndarray:
     """Return the normalised innovation squared (NIS), eᵀS⁻¹e, shape (batch,), for innovations e
     (batch, ny) and their covariances S (ny, ny, batch)."""
-    e = innovation.T[None]
-    return product(divide(e, S), e.transpose(1, 0, 2))[0, 0]
+    e = np.ascontiguousarray(innovation.T)
+    return inner(divide(e[None], S)[0], e)
 
 
 def product(a: Array, b: Array) -> Array:
     """Return the matrix products (n, m, batch) of (n, k, batch) and (k, m, batch). For small
     matrices this is several times faster than with the batch first."""
-    if a.shape[1] == 1:
+    _, terms, batch = a.shape
+    if terms == 1:
         return a * b
-    if isinstance(a, np.ndarray):
+    if not isinstance(a, np.ndarray):
+        return (a[:, :, None] * b[None]).sum(1)
+    if batch > 1 or terms == 2:
         return np.einsum("ijb,jkb->ikb", a, b)
-    return (a[:, :, None] * b[None]).sum(1)
+    if b.shape[1] == 1:
+        return np.add.accumulate(a * b[:, 0], axis=1)[:, -1:]
+    # With rows of b contiguous in memory, the innermost loop is over k.
+    return np.einsum("ijb,jkb->ikb", a, np.ascontiguousarray(b))
+
+
+def mapped(M: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the vectors Mv, shape (batch, n), for M (n, m, batch) and v (batch, m)."""
+    column = v.T if len(v.T) <= 2 else np.ascontiguousarray(v.T)
+    return product(M, column[:, None])[:, 0].T
+
+
+def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the inner products aᵀb, shape (batch,), of vectors (n, batch)."""
+    return product(a[None], b[:, None])[0, 0]
+
+
+def spread(L: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Return Lξ for each of the vectors ξ of ``draws`` (num_points, m), shape (num_points, batch,
+    n), for L (n, m, batch)."""
+    columns = np.ascontiguousarray(L.transpose(1, 2, 0))
+    return np.einsum("jbi,mj->mbi", columns, draws)
+
+
+def total(x: np.ndarray) -> np.ndarray:
+    """Return the sum of x (num_points, batch, ...) over the points."""
+    return x.sum(axis=0) if x[0].size > 1 else np.add.accumulate(x, axis=0)[-1]
 
 
 def moments(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weighted means (batch, n) and covariances (batch, n, n) of points x (num_points,
     batch, n) with weights (num_points, batch), which sum to one. Here the batch is first."""
-    mean = np.einsum("mb,mbi->bi", weights, x)
+    mean = weighted_mean(weights, x)
     deviations = (x - mean).transpose(2, 0, 1)
-    return mean, np.einsum("imb,jmb->bij", weights * deviations, deviations)
+    if x[0].size > 1:
+        return mean, np.einsum("imb,jmb->bij", weights * deviations, deviations)
+    return mean, outer(weights * deviations, deviations)
+
+
+def weighted_mean(weights: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the weighted means (batch, n) of points x (num_points, batch, n) with weights
+    (num_points, batch), which sum to one."""
+    if x[0].size > 1:
+        return np.einsum("mb,mbi->bi", weights, x)
+    return total(weights[..., None] * x)
 
 
 @lru_cache(maxsize=16)

@@ -135,9 +135,9 @@ def _take_step(system: System, start: float, step: float, last: float, stages: n
     weights = _tableau(step)
     # Each stage evaluates f at the state plus a combination of the earlier slopes.
     for i, row in enumerate(weights[:-1]):
-        stage = np.dot(row, flat[: i + 1]).reshape(stages.shape[1:])
+        stage = _combined(row, flat[: i + 1]).reshape(stages.shape[1:])
         stages[i + 1] = system.f(t[i], stage, u[i])
-    np.dot(weights[-1], flat, out=flat[0])
+    flat[0] = _combined(weights[-1], flat)[0]
 
 
 def _check_finite(system: System, x0: np.ndarray, x: np.ndarray) -> None:
@@ -212,7 +212,7 @@ def _fixed_step(
     for k, (window, weights) in enumerate(mesh.intervals):
         if len(weights):
             inside = slice(mesh.bounds[k], mesh.bounds[k + 1])
-            np.dot(weights, flat[window], out=out.reshape(len(times), -1)[inside])
+            out.reshape(len(times), -1)[inside] = _combined(weights, flat[window])
     return path[-1, 0], _local_error(system, mesh, flat, path[0, 0].shape)
 
 
@@ -224,7 +224,7 @@ def _local_error(
     middle, rate = np.empty((2, len(mesh.checked), *shape))
     # State and slope of the polynomials midway between nodes.
     for i, (window, weights) in enumerate(mesh.checks):
-        middle[i], rate[i] = np.dot(weights, flat[window]).reshape(2, *shape)
+        middle[i], rate[i] = _combined(weights, flat[window]).reshape(2, *shape)
     k = mesh.checked
     t = (mesh.nodes[k] + mesh.steps[k] / 2)[:, None]
     # Defect x' − f(t, x).
@@ -235,10 +235,22 @@ def _local_error(
 
 @lru_cache(maxsize=64)
 def _tableau(step: float) -> list[np.ndarray]:
-    """Return the weights of (state, slopes of the earlier stages) in each stage, followed by those
-    in the next state."""
-    rows = [np.append(1.0, step * row[:i]) for i, row in enumerate(dop853.A)]
-    return [*rows, np.append(1.0, step * dop853.B)]
+    """Return the weights (1, num_values) of (state, slopes of the earlier stages) in each stage,
+    followed by those in the next state."""
+    rows = [np.append(1.0, step * row[:i])[None] for i, row in enumerate(dop853.A)]
+    return [*rows, np.append(1.0, step * dop853.B)[None]]
+
+
+def _combined(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sums of values (num_values, n) with each row of weights (num_sums, num_values),
+    shape (num_sums, n).
+
+    They are formed in the order of the values for any n, so that the truth of an episode is the
+    same to the last bit in any batch. With BLAS it would depend on the shape.
+    """
+    if values.shape[1] == 1:  # the innermost loop of einsum would be over the values
+        return np.add.accumulate(weights * values[:, 0], axis=1)[:, -1:]
+    return np.einsum("sk,kn->sn", weights, values)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,14 @@ from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
 
+def concatenate(path, some):
+    """Append rows without regard to what the file holds, as ``cat`` does."""
+    with path.open("a") as file:
+        for each in some:
+            shown = {k: None if v == float("inf") else v for k, v in each.items()}
+            file.write(json.dumps(shown) + "\n")
+
+
 def test_round_trip_keeps_infinity_as_valid_json(tmp_path):
     path = tmp_path / "deep" / "rows.jsonl"
     rows.append(path, [row(0, nrmse=float("inf"), diverged=True), row(1)])
@@ -149,14 +157,78 @@ def test_another_schema_and_missing_fields_are_refused(tmp_path):
 
 def test_equal_duplicates_count_once_and_contradictory_ones_are_an_error(tmp_path):
     path = tmp_path / "rows.jsonl"
-    rows.append(path, [row(0), row(0), row(0, nrmse=0.5 * (1 + 1e-9), date="later")])
+    concatenate(path, [row(0), row(0), row(0, nrmse=0.5 * (1 + 1e-9), date="later")])
     assert len(rows.read(path)) == 1
     lost = {"diverged": True}
-    rows.append(path, [row(1, **lost, nrmse=1e30), row(1, **lost, nrmse=float("inf"))])
+    concatenate(path, [row(1, **lost, nrmse=1e30), row(1, **lost, nrmse=float("inf"))])
     assert len(rows.read(path)) == 2
-    rows.append(path, [row(0, nrmse=0.5001)])
+    concatenate(path, [row(0, nrmse=0.5001)])
     with pytest.raises(ValueError, match="lines 1 and 6, give different scores"):
         rows.read(path)
+
+
+def seeds_in(path):
+    return [json.loads(line)["episode_seed"] for line in path.read_text().splitlines()]
+
+
+def test_an_episode_in_the_file_is_not_written_again(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(1), row(0, nrmse=0.7)])
+    rows.append(path, [row(1, nrmse=0.7), row(2), row(2, estimator="other")])
+    assert seeds_in(path) == [0, 1, 2, 2]
+    assert {r["nrmse"] for r in rows.read(path)} == {0.5}
+
+
+def test_what_others_append_is_not_written_again(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    concatenate(path, [row(1), row(2, schema=99)])
+    rows.append(path, [row(1), row(2)])  # a row of another schema is another row
+    assert seeds_in(path) == [0, 1, 2, 2]
+    path.write_text(path.read_text()[:-1])  # the last line lacks its newline, but is whole
+    rows.append(path, [row(2), row(3)])
+    assert seeds_in(path) == [0, 1, 2, 2, 3]
+
+
+@pytest.mark.parametrize("kept", [[], [5], [5, 6, 7, 8]])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_file_that_was_replaced_or_cut_is_read_anew(tmp_path, kept, replaced):
+    path, other = tmp_path / "rows.jsonl", tmp_path / "other"
+    rows.append(path, [row(0), row(1)])
+    concatenate(other, [row(i) for i in kept])
+    if replaced:
+        other.replace(path)
+    else:
+        path.write_bytes(other.read_bytes())  # in place: the same file with other content
+    rows.append(path, [row(0), row(5)])
+    assert seeds_in(path) == [*kept, 0, *([] if 5 in kept else [5])]
+
+
+def test_a_deleted_file_is_written_again(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    path.unlink()
+    rows.append(path, [row(0)])
+    assert seeds_in(path) == [0]
+
+
+def test_replaced_rows_are_known_afterwards(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(1)])
+    rows.append(path, [row(0, nrmse=0.7)], replace=True)
+    rows.append(path, [row(0, nrmse=0.9)])
+    assert {r["episode_seed"]: r["nrmse"] for r in rows.read(path)} == {0: 0.7, 1: 0.5}
+
+
+def test_two_writers_of_the_same_episodes_write_each_once(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    context = multiprocessing.get_context("spawn")
+    workers = [context.Process(target=write_fifty, args=(path, first)) for first in (0, 25)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert sorted(seeds_in(path)) == list(range(75))
 
 
 def test_an_unwritable_place_is_one_clear_line(tmp_path):
