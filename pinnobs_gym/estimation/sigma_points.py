@@ -25,8 +25,8 @@ class SigmaPointMemory:
     R: np.ndarray
     """Covariance of the output noise, shape (ny, ny, batch)."""
     points: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """The points, shape (num_points, nx), their weights in means, (num_points, 1, 1), and the square
-    roots of their weights in covariances, (num_points, 1); see `SigmaPointFilter.points`."""
+    """Points (num_points, nx), their weights in means (num_points, 1, 1), and the square roots of
+    their weights in covariances (num_points, 1); see `SigmaPointFilter.points`."""
     jitter: np.ndarray
     """Largest relative amount added to the variances so far, shape (batch,); zero if none was."""
 
