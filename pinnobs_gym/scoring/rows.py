@@ -71,7 +71,7 @@ JOB = ("env_id", "setup", "condition", "estimator", "episode", "episodes", "job"
 TOLERANCE = 1e-6
 """Largest relative difference between scores of the same episode from different machines."""
 
-_OPTIONAL = (*OPTIONAL_SCORES, "free_over_known", "nominal_over_free")
+OPTIONAL = (*OPTIONAL_SCORES, "free_over_known", "nominal_over_free")
 """The numbers that may be absent."""
 _BEGINNING = b'{"schema": '
 """The beginning of every line."""
@@ -321,7 +321,7 @@ def _same(row: Row, other: Row) -> bool:
 
 def _line(row: Row) -> bytes:
     first = {"schema": row["schema"]}  # the first key identifies an incomplete line
-    absent = {name for name in _OPTIONAL if row.get(name) is None}
+    absent = {name for name in OPTIONAL if row.get(name) is None}
     return json_line({n: v for n, v in (first | row).items() if n not in absent})
 
 
@@ -438,7 +438,7 @@ def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
     if kind == "score":
         for name in (*SCORES, "us_per_step"):
             row[name] = _score(path, number, name, row[name])
-        for name in _OPTIONAL:
+        for name in OPTIONAL:
             row[name] = _score(path, number, name, row[name]) if name in row else None
         row["state_rmse"] = {
             window: _states(path, number, window, states)

@@ -7,8 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES
-from pinnobs_gym.scoring.rows import Row, key, load_all
+from pinnobs_gym.scoring.rows import OPTIONAL, Row, key, load_all
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -20,8 +19,9 @@ class Rows(list[Row]):
         """Return a ``pandas.DataFrame`` with a line per episode and a column per key.
 
         An episode that is in the list twice counts once. Infinite scores are ``inf``, and scores
-        that do not apply NaN. ``options``, ``training``, ``versions`` and ``knows`` are columns of
-        Python objects.
+        that do not apply NaN. ``state_rmse`` has a column for each window and state, such as
+        ``state_rmse.steady.x1``. ``options``, ``training``, ``versions`` and ``knows`` are columns
+        of Python objects.
 
         Raises:
             ImportError: in one line, if pandas is not installed.
@@ -32,9 +32,17 @@ class Rows(list[Row]):
             raise ImportError("to_pandas needs pandas: pip install pandas") from None
         once: dict[tuple[Any, ...], Row] = {}
         for row in self:
-            once.setdefault(key(row), row)
+            once.setdefault(key(row), _flat(row))
         table = pandas.DataFrame(list(once.values()))
-        return table.astype({name: float for name in OPTIONAL_SCORES if name in table})
+        return table.astype({name: float for name in OPTIONAL if name in table})
+
+
+def _flat(row: Row) -> Row:
+    """Return a row with a field for each error of a state."""
+    flat = {name: value for name, value in row.items() if name != "state_rmse"}
+    for window, errors in row["state_rmse"].items():
+        flat |= {f"state_rmse.{window}.{state}": error for state, error in errors.items()}
+    return flat
 
 
 def read_rows(path: Path | str) -> Rows:

@@ -51,7 +51,10 @@ def _differences(name: str) -> Iterator[float]:
 def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
     """Return the largest relative difference between the scores of two rows; infinite where only
     one of them has a score, or it is finite in one of them only."""
-    return max(_relative(one[name], other[name]) for name in one)
+    found = [_relative(one[name], other[name]) for name in one if name != "state_rmse"]
+    for window, errors in one["state_rmse"].items():
+        found += [_relative(errors[name], other["state_rmse"][window][name]) for name in errors]
+    return max(found)
 
 
 def _relative(a: float | None, b: float | None) -> float:

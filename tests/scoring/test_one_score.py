@@ -32,6 +32,9 @@ def assert_same_scores(alone, together):
     for seed, one in alone.items():
         (own,), row = one.scores.rows(), rows[seed]
         assert own.keys() == row.keys()
+        states, expected = own.pop("state_rmse"), row.pop("state_rmse")
+        for window, errors in states.items():
+            assert expected[window] == pytest.approx(errors, rel=TOLERANCE / 100, abs=0)
         for name, value in own.items():
             expected = value if value is None else pytest.approx(value, rel=TOLERANCE / 100, abs=0)
             assert row[name] == expected, name

@@ -168,7 +168,7 @@ def test_equal_duplicates_count_once_and_contradictory_ones_are_an_error(tmp_pat
 
 
 def seeds_in(path):
-    return [json.loads(line)["episode_seed"] for line in path.read_text().splitlines()]
+    return [rows.seed_of(json.loads(line)) for line in path.read_text().splitlines()]
 
 
 def test_an_episode_in_the_file_is_not_written_again(tmp_path):
@@ -217,7 +217,7 @@ def test_replaced_rows_are_known_afterwards(tmp_path):
     rows.append(path, [row(0), row(1)])
     rows.append(path, [row(0, nrmse=0.7)], replace=True)
     rows.append(path, [row(0, nrmse=0.9)])
-    assert {r["episode_seed"]: r["nrmse"] for r in rows.read(path)} == {0: 0.7, 1: 0.5}
+    assert {rows.seed_of(r): r["nrmse"] for r in rows.read(path)} == {0: 0.7, 1: 0.5}
 
 
 def test_two_writers_of_the_same_episodes_write_each_once(tmp_path):

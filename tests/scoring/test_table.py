@@ -15,7 +15,7 @@ def test_a_file_is_read_with_each_episode_once(tmp_path):
     path.write_bytes(path.read_bytes() * 2)
     read = read_rows(str(path))
     assert isinstance(read, Rows)
-    assert [(r["episode_seed"], r["nrmse"]) for r in read] == [(0, math.inf), (1, 0.5)]
+    assert [(r["episode"], r["nrmse"]) for r in read] == [("seed:0", math.inf), ("seed:1", 0.5)]
 
 
 def test_what_cannot_be_read_is_one_clear_line(tmp_path):
@@ -33,7 +33,7 @@ def test_a_cut_line_is_left_out_with_a_warning(tmp_path, caplog):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(0), row(1)])
     path.write_bytes(path.read_bytes()[:-9])
-    assert [r["episode_seed"] for r in read_rows(path)] == [0]
+    assert [r["episode"] for r in read_rows(path)] == ["seed:0"]
     assert "is cut off" in caplog.text
 
 
@@ -42,7 +42,7 @@ def test_a_table_has_each_episode_once_and_infinities(tmp_path):
     options = {"window": 5}
     some = [row(0, nrmse=math.inf, options=options), row(1, anees=2.0), row(0, nrmse=math.inf)]
     table = Rows(some).to_pandas()
-    assert list(table["episode_seed"]) == [0, 1]
+    assert list(table["episode"]) == ["seed:0", "seed:1"]
     assert list(table["nrmse"]) == [math.inf, 0.5]
     assert table["options"][0] == options
     assert table["anees"].dtype == float
