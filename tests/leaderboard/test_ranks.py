@@ -38,10 +38,10 @@ def played():
 
 def test_the_factor_is_the_geometric_mean_over_systems():
     found = lines(played())
-    assert [*found][0] == "half"
+    assert next(iter(found)) == "half"
     assert {*found} == {"half", "ukf", "same", "smooth"}
     half = found["half"].places["steady"]
-    assert half.factor.value == pytest.approx(4) ** -1
+    assert half.factor.value == pytest.approx(1 / 4)
     assert half.factor.value == pytest.approx((half.factor.low + half.factor.high) / 2)
     assert half.rank == 1
     ukf, same = (found[name].places["steady"] for name in ("ukf", "same"))

@@ -31,11 +31,11 @@ def test_estimators_are_ranked_within_their_track():
 
 
 def test_markdown_has_a_table_per_game_with_all_columns():
-    text = standings_table.markdown(tables(rows_of("ekf", [0.1, 0.2, 0.3])))
-    lines = text.splitlines()
+    text = chapters.markdown(board(Stored(rows_of("ekf", [0.1, 0.2, 0.3]), [])))
+    lines = text[text.index("# Each game") :].splitlines()
     header = next(line for line in lines if line.startswith("| "))
     body = lines[lines.index(header) + 2]
-    assert header.count("|") == body.count("|") == len(standings_table.COLUMNS) + 3
+    assert header.count("|") == body.count("|") == len(standings_table.COLUMNS) + 1
     assert "## pinnobs/X-v0, benchmark, nominal" in lines
     assert "ekf" in body
     assert "0.2" in body
