@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pinnobs_gym.leaderboard import ranks_table, standings_table
 from pinnobs_gym.leaderboard.board import Board, Part
@@ -49,23 +49,27 @@ def markdown(board: Board) -> str:
 
 
 def _chapters(part: Part, key: str, title: str, note: str) -> list[Chapter]:
-    """Return the chapters of one part, with these additions to their keys, titles and notes."""
+    """Return the chapters of one part, with these additions to their keys, titles (and those of
+    their tables) and notes."""
 
     def noted(own: str) -> str:
         return " ".join(filter(None, (note, own)))
 
+    def titled(layouts: Layouts) -> Layouts:
+        return [[replace(grid, title=grid.title + title) for grid in grids] for grids in layouts]
+
     found = []
     if part.lines:
-        overview = ranks_table.layouts(part.lines, part.places.peer)
+        overview = titled(ranks_table.layouts(part.lines, part.places.peer))
         found.append(
             Chapter(f"{key}overview", f"Leaderboard{title}", noted(ranks_table.NOTE), (overview,))
         )
     if len(part.conditions) > 1:
-        ranks = ranks_table.rank_layouts(part.conditions, part.knows)
+        ranks = titled(ranks_table.rank_layouts(part.conditions, part.knows))
         found.append(
             Chapter(f"{key}ranks", f"Conditions{title}", noted(ranks_table.RANK_NOTE), (ranks,))
         )
-    tables = tuple(map(standings_table.layouts, part.tables))
+    tables = tuple(titled(standings_table.layouts(table)) for table in part.tables)
     games = Chapter(
         f"{key}games", f"Each game{title}", noted(standings_table.NOTE), tables, part.tables
     )
