@@ -32,7 +32,8 @@ class Chapter:
 
 def chapters(board: Board) -> list[Chapter]:
     """Return the chapters of a leaderboard: overview, ranks by condition and games, first of the
-    estimators that are made before any record is seen, then on the records of the others."""
+    estimators that are made before any record is seen, then, without ranks by condition, on the
+    records of the others."""
     found = _chapters(board.main, "", "", "")
     if board.on_record is not None:
         found += _chapters(board.on_record, "on-record ", ", trained on each record", ON_RECORD)
@@ -64,7 +65,7 @@ def _chapters(part: Part, key: str, title: str, note: str) -> list[Chapter]:
         found.append(
             Chapter(f"{key}overview", f"Leaderboard{title}", noted(ranks_table.NOTE), (overview,))
         )
-    if len(part.conditions) > 1:
+    if len(part.conditions) > 1 and not key:  # no online estimator is trained on a record
         ranks = titled(ranks_table.rank_layouts(part.conditions, part.knows))
         found.append(
             Chapter(f"{key}ranks", f"Conditions{title}", noted(ranks_table.RANK_NOTE), (ranks,))

@@ -20,25 +20,25 @@ COLUMNS: tuple[tuple[Column, Callable[[Entry, Show], str]], ...] = (
     (Column("rank"), lambda e, _: _rank(e.ranks["steady"])),
     (Column("estimator", numeric=False), lambda e, _: e.name),
     (Column("steady"), lambda e, show: _steady(e.standing, show)),
-    (Column("transient rank", 1), lambda e, _: _rank(e.ranks["transient"])),
-    (Column("transient"), lambda e, show: show(e.standing.transient)),
-    (Column("diverged %"), lambda e, show: show(e.standing.diverged.percent)),
-    (Column("settled s", 3), lambda e, _: number(e.standing.settling.value)),
-    (Column("track", 5, numeric=False), lambda e, _: e.standing.track),
-    (Column("episodes", 3), lambda e, _: _episodes(e.standing)),
-    (Column("/ CRR", 4), lambda e, _: _optional(e.standing.over_reference)),
-    (Column("ANEES", 4), lambda e, _: _banded(e.standing.anees)),
-    (Column("covers %", 4), lambda e, _: _optional(_percent(e.standing.coverage), 2)),
-    (Column("90th pct.", 6), lambda e, _: number(e.standing.steady_90)),
-    (Column("first", 7), lambda e, _: number(e.standing.first)),
-    (Column("whole", 6), lambda e, _: number(e.standing.whole)),
-    (Column("last 75 %", 7), lambda e, _: number(e.standing.late)),
-    (Column("last 25 %", 7), lambda e, _: number(e.standing.tail)),
-    (Column("NIS", 6), lambda e, _: _optional(e.standing.nis)),
-    (Column("corr.", 6), lambda e, _: _optional(e.standing.innovation_correlation, 2)),
-    (Column("µs/step", 5), lambda e, _: number(e.standing.us_per_step)),
+    (Column("transient rank", 4), lambda e, _: _rank(e.ranks["transient"])),
+    (Column("transient", 2), lambda e, show: show(e.standing.transient)),
+    (Column("diverged %", 1), lambda e, show: show(e.standing.diverged.percent)),
+    (Column("settled s", 5), lambda e, _: number(e.standing.settling.value)),
+    (Column("track", 3, numeric=False), lambda e, _: e.standing.track),
+    (Column("episodes", 5), lambda e, _: _episodes(e.standing)),
+    (Column("/ CRR", 6), lambda e, _: _optional(e.standing.over_reference)),
+    (Column("ANEES", 6), lambda e, _: _banded(e.standing.anees)),
+    (Column("covers %", 6), lambda e, _: _optional(_percent(e.standing.coverage), 2)),
+    (Column("90th pct.", 8), lambda e, _: number(e.standing.steady_90)),
+    (Column("first", 9), lambda e, _: number(e.standing.first)),
+    (Column("whole", 8), lambda e, _: number(e.standing.whole)),
+    (Column("last 75 %", 9), lambda e, _: number(e.standing.late)),
+    (Column("last 25 %", 9), lambda e, _: number(e.standing.tail)),
+    (Column("NIS", 8), lambda e, _: _optional(e.standing.nis)),
+    (Column("corr.", 8), lambda e, _: _optional(e.standing.innovation_correlation, 2)),
+    (Column("µs/step", 7), lambda e, _: number(e.standing.us_per_step)),
     (Column("knows", numeric=False), lambda e, _: ", ".join(e.standing.knows)),
-    (Column("training", 8, numeric=False), lambda e, _: e.standing.training),
+    (Column("training", 10, numeric=False), lambda e, _: e.standing.training),
 )
 """The columns of a table, and the text of each for a line."""
 
@@ -110,7 +110,8 @@ NOTE = (
     "infinite, comparisons as an error of the whole scale or more. 5 × 100 are 100 episodes of "
     "each of five trainings; a single training says nothing about how much trainings differ. "
     "Online estimators are causal; offline ones see the whole record first and are ranked apart, "
-    "as are those that were trained under the very condition that is scored. `initial set`: the "
+    "as are those that were trained under the very condition that is scored; a rule stands between "
+    "tracks. `initial set`: the "
     "estimator knows the set that initial states are drawn from, beyond its mean and covariance, "
     "which all are given. In brackets: modulo states that no output tells apart. Seconds behind a "
     "name are the CPU time that each training was given. / CRR: root mean square over episodes of "

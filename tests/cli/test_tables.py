@@ -97,7 +97,7 @@ def test_a_file_has_all_columns_at_any_width(printed, tmp_path, monkeypatch):
     assert "not shown" not in text
     narrow = printed("--table", "X")
     assert "µs/step, training (-o FILE writes all)" in " ".join(narrow.split())
-    assert "\nrank  estimator  steady  transient rank  transient  diverged %  knows\n" in narrow
+    assert "\nrank  estimator  steady  transient  diverged %  track   knows\n" in narrow
     assert max(map(len, narrow.splitlines())) <= 80
     monkeypatch.delenv("COLUMNS")
     assert printed("--table", "X") == text
