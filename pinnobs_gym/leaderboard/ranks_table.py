@@ -66,7 +66,7 @@ def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Gr
         (Column(f"steady / {peer}"), lambda line: _factor(line.places.get("steady"))),
         (Column("transient rank", 4), lambda line: _rank(line.places.get("transient"))),
         (Column(f"transient / {peer}", 2), lambda line: _factor(line.places.get("transient"))),
-        (Column("diverged %", 1), lambda line: f"{100 * line.diverged:.2g}"),
+        (Column("diverged %", 1), lambda line: number(100 * line.diverged, 2)),
         *(
             (Column(label(game)), lambda line, game=game: _of_game(line.games.get(game)))
             for game in games
