@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pinnobs_gym.leaderboard import ranks_table, standings_table
 from pinnobs_gym.leaderboard.board import Board, Part
@@ -32,7 +32,8 @@ class Chapter:
 
 def chapters(board: Board) -> list[Chapter]:
     """Return the chapters of a leaderboard: overview, ranks by condition and games, first of the
-    estimators that are made before any record is seen, then on the records of the others."""
+    estimators that are made before any record is seen, then, without ranks by condition, on the
+    records of the others."""
     found = _chapters(board.main, "", "", "")
     if board.on_record is not None:
         found += _chapters(board.on_record, "on-record ", ", trained on each record", ON_RECORD)
@@ -49,23 +50,27 @@ def markdown(board: Board) -> str:
 
 
 def _chapters(part: Part, key: str, title: str, note: str) -> list[Chapter]:
-    """Return the chapters of one part, with these additions to their keys, titles and notes."""
+    """Return the chapters of one part, with these additions to their keys, titles (and those of
+    their tables) and notes."""
 
     def noted(own: str) -> str:
         return " ".join(filter(None, (note, own)))
 
+    def titled(layouts: Layouts) -> Layouts:
+        return [[replace(grid, title=grid.title + title) for grid in grids] for grids in layouts]
+
     found = []
     if part.lines:
-        overview = ranks_table.layouts(part.lines, part.places.peer)
+        overview = titled(ranks_table.layouts(part.lines, part.places.peer))
         found.append(
             Chapter(f"{key}overview", f"Leaderboard{title}", noted(ranks_table.NOTE), (overview,))
         )
-    if len(part.conditions) > 1:
-        ranks = ranks_table.rank_layouts(part.conditions, part.knows)
+    if len(part.conditions) > 1 and not key:  # no online estimator is trained on a record
+        ranks = titled(ranks_table.rank_layouts(part.conditions, part.knows))
         found.append(
             Chapter(f"{key}ranks", f"Conditions{title}", noted(ranks_table.RANK_NOTE), (ranks,))
         )
-    tables = tuple(map(standings_table.layouts, part.tables))
+    tables = tuple(titled(standings_table.layouts(table)) for table in part.tables)
     games = Chapter(
         f"{key}games", f"Each game{title}", noted(standings_table.NOTE), tables, part.tables
     )

@@ -16,6 +16,8 @@ GAP = "  "
 """What separates two columns of plain text."""
 PROSE = 100
 """Width in characters at which sentences are wrapped where there is no terminal."""
+WANTED = 3
+"""Columns up to this priority are shown if a table has a layout with room for them (`fitting`)."""
 DROPPED = "not shown at this width:"
 """What stands before the names of dropped columns."""
 
@@ -80,10 +82,10 @@ class Grid:
             lines=tuple(tuple(line[i] for i in places) for line in self.lines),
         )
 
-    def fits(self, width: int | None) -> bool:
-        """Return whether the columns that are never dropped fit in this width, or in
-        any width (None)."""
-        kept = [i for i, column in enumerate(self.columns) if not column.priority]
+    def fits(self, width: int | None, priority: int = 0) -> bool:
+        """Return whether the columns of up to this priority, by default those that are never
+        dropped, fit in this width, or in any width (None)."""
+        kept = [i for i, column in enumerate(self.columns) if column.priority <= priority]
         return width is None or self._total(kept) <= width
 
     def text(self, width: int | None = None, hint: str = "") -> str:
@@ -207,9 +209,14 @@ Layouts: TypeAlias = Sequence[Sequence[Grid]]
 
 
 def fitting(layouts: Layouts, width: int | None) -> Sequence[Grid]:
-    """Return the first layout whose grids all fit in this width; otherwise the last."""
-    fits = (grids for grids in layouts if all(grid.fits(width) for grid in grids))
-    return next(fits, layouts[-1])
+    """Return the layout that drops the fewest of its `WANTED` columns: the first whose grids all
+    have room in this width for columns of up to that priority, or else up to the next lower one,
+    and so on; otherwise the last."""
+    for priority in range(WANTED, -1, -1):
+        for grids in layouts:
+            if all(grid.fits(width, priority) for grid in grids):
+                return grids
+    return layouts[-1]
 
 
 def markdown_table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:

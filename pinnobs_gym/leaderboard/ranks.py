@@ -28,6 +28,11 @@ class Line:
     """Median over games."""
 
     @property
+    def diverged(self) -> float:
+        """Rate of diverged episodes, the mean over games."""
+        return float(np.mean([standing.diverged.value for standing in self.games.values()]))
+
+    @property
     def knows(self) -> tuple[str, ...]:
         """The information given to it, the most in any of its games."""
         return max((standing.knows for standing in self.games.values()), key=len, default=())

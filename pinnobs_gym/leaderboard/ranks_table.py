@@ -11,7 +11,7 @@ from pinnobs_gym.leaderboard.numerals import number
 from pinnobs_gym.leaderboard.places import FEWEST, Place, Places
 from pinnobs_gym.leaderboard.ranks import Line, worst_ranks
 from pinnobs_gym.leaderboard.standings import Standing
-from pinnobs_gym.leaderboard.standings_table import track_blocks, with_letters
+from pinnobs_gym.leaderboard.standings_table import facts_of, track_blocks, with_letters
 
 NOTE = (
     "Under the condition that each system is ranked under. The factor is the error over the "
@@ -21,8 +21,9 @@ NOTE = (
     "Estimators of one rank cannot be told apart: none is significantly worse than the best of "
     "them (5 % for each group). Diverging significantly more often outranks a smaller error; in "
     "the factors a diverged episode counts as an error of the whole scale or more. Columns of "
-    "systems have the median steady NRMSE and, as `div`, how many episodes diverged. Without a "
-    "rank are those that did not play every episode that the peer played."
+    "systems have the median steady NRMSE and, as `div`, how many episodes diverged; `diverged %` "
+    "is the mean over systems. Without a rank are those that did not play every episode that the "
+    "peer played. A rule stands between tracks."
 )
 """Explanation of the overview."""
 RANK_NOTE = (
@@ -32,13 +33,13 @@ RANK_NOTE = (
 )
 """Explanation of the table of ranks."""
 TITLE = "Across systems"
-AT_ONCE = 5
-"""Conditions in one table of ranks where not all fit."""
+AT_ONCE = (5, 3, 1)
+"""Conditions in one table of ranks where not all fit: the most for which there is room."""
 OF_GAME: tuple[tuple[Column, Callable[[Standing], str]], ...] = (
     (Column("steady"), lambda s: number(s.steady.value)),
-    (Column("transient"), lambda s: number(s.transient.value)),
-    (Column("diverged %"), lambda s: number(s.diverged.percent.value)),
-    (Column("µs/step", 1), lambda s: number(s.us_per_step, 2)),
+    (Column("transient", 2), lambda s: number(s.transient.value)),
+    (Column("diverged %", 1), lambda s: number(s.diverged.percent.value)),
+    (Column("µs/step", 4), lambda s: number(s.us_per_step, 2)),
 )
 """The columns of one game in an overview that has a table per game."""
 
@@ -51,8 +52,9 @@ def grid(found: Sequence[Line], peer: str) -> Grid:
 def layouts(found: Sequence[Line], peer: str) -> Layouts:
     """Return the overview with a column per game and, where that does not fit, as a table across
     games followed by one of each game."""
-    across = with_letters(_overview(found, peer, ()), [line.knows for line in found])
-    narrow = (across, *(_game(game, found) for game in _games(found)))
+    facts = facts_of(line.knows for line in found)
+    across = with_letters(_overview(found, peer, ()), [line.knows for line in found], facts)
+    narrow = (across, *(_game(game, found, facts) for game in _games(found)))
     return ((grid(found, peer),), narrow)
 
 
@@ -62,14 +64,15 @@ def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Gr
         (Column("rank"), lambda line: _rank(line.places.get("steady"))),
         (Column("estimator", numeric=False), lambda line: line.estimator),
         (Column(f"steady / {peer}"), lambda line: _factor(line.places.get("steady"))),
-        (Column("rank, transient", 1), lambda line: _rank(line.places.get("transient"))),
-        (Column(f"transient / {peer}"), lambda line: _factor(line.places.get("transient"))),
+        (Column("transient rank", 4), lambda line: _rank(line.places.get("transient"))),
+        (Column(f"transient / {peer}", 2), lambda line: _factor(line.places.get("transient"))),
+        (Column("diverged %", 1), lambda line: number(100 * line.diverged, 2)),
         *(
             (Column(label(game)), lambda line, game=game: _of_game(line.games.get(game)))
             for game in games
         ),
         (Column("track", 3, numeric=False), lambda line: line.track),
-        (Column("µs/step", 2), lambda line: number(line.us_per_step, 2)),
+        (Column("µs/step", 5), lambda line: number(line.us_per_step, 2)),
         (Column("knows", numeric=False), lambda line: ", ".join(line.knows)),
     ]
     return Grid(
@@ -84,15 +87,26 @@ def _games(found: Sequence[Line]) -> list[GameName]:
     return sorted({game for line in found for game in line.games}, key=label)
 
 
-def _game(game: GameName, found: Sequence[Line]) -> Grid:
-    """Return the overview's lines of one game, of the estimators that played it."""
+def _game(game: GameName, found: Sequence[Line], facts: Sequence[str]) -> Grid:
+    """Return the overview's lines of one game, of the estimators that played it, with letters for
+    what they know."""
     played = [line for line in found if game in line.games]
-    return Grid(
+    known = [line.games[game].knows for line in played]
+    whole = Grid(
         label(game),
-        (Column("estimator", numeric=False), *(column for column, _ in OF_GAME)),
-        tuple((x.estimator, *(cell(x.games[game]) for _, cell in OF_GAME)) for x in played),
+        (
+            Column("estimator", numeric=False),
+            *(column for column, _ in OF_GAME),
+            Column("track", 3, numeric=False),
+            Column("knows", numeric=False),
+        ),
+        tuple(
+            (line.estimator, *(cell(own) for _, cell in OF_GAME), line.track, ", ".join(own.knows))
+            for line, own in ((line, line.games[game]) for line in played)
+        ),
         track_blocks([line.track for line in played]),
     )
+    return with_letters(whole, known, facts)
 
 
 def rank_grid(found: Mapping[str, Places], knows: Mapping[str, Sequence[str]]) -> Grid:
@@ -111,12 +125,16 @@ def rank_layouts(found: Mapping[str, Places], knows: Mapping[str, Sequence[str]]
     """Return the table of ranks with all conditions and, where that does not fit, in parts."""
     ranked, notes = _ranked(found)
     known = [knows[name] for name in worst_ranks(found)]
+
+    def part(first: int, count: int) -> Grid:
+        last = first + count >= len(ranked)
+        grid = _ranks(found, ranked[first : first + count], knows, notes if last else "")
+        return with_letters(grid, known, facts_of(known))
+
     parts = [
-        with_letters(_ranks(found, ranked[first : first + AT_ONCE], knows, ""), known)
-        for first in range(0, len(ranked), AT_ONCE)
+        [part(first, count) for first in range(0, max(len(ranked), 1), count)] for count in AT_ONCE
     ]
-    last = [Grid("", (), (), note=notes)] if notes else []
-    return ((rank_grid(found, knows),), (*parts, *last))
+    return ((rank_grid(found, knows),), *parts)
 
 
 def _ranks(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from string import ascii_lowercase
 from typing import TypeAlias
@@ -20,25 +20,25 @@ COLUMNS: tuple[tuple[Column, Callable[[Entry, Show], str]], ...] = (
     (Column("rank"), lambda e, _: _rank(e.ranks["steady"])),
     (Column("estimator", numeric=False), lambda e, _: e.name),
     (Column("steady"), lambda e, show: _steady(e.standing, show)),
-    (Column("rank, transient", 1), lambda e, _: _rank(e.ranks["transient"])),
-    (Column("transient"), lambda e, show: show(e.standing.transient)),
-    (Column("diverged %"), lambda e, show: show(e.standing.diverged.percent)),
-    (Column("settled s", 3), lambda e, _: number(e.standing.settling.value)),
-    (Column("track", 5, numeric=False), lambda e, _: e.standing.track),
-    (Column("episodes", 3), lambda e, _: _episodes(e.standing)),
-    (Column("/ CRR", 4), lambda e, _: _optional(e.standing.over_reference)),
-    (Column("ANEES", 4), lambda e, _: _banded(e.standing.anees)),
-    (Column("covers %", 4), lambda e, _: _optional(_percent(e.standing.coverage), 2)),
-    (Column("90th pct.", 6), lambda e, _: number(e.standing.steady_90)),
-    (Column("first", 7), lambda e, _: number(e.standing.first)),
-    (Column("whole", 6), lambda e, _: number(e.standing.whole)),
-    (Column("last 75 %", 7), lambda e, _: number(e.standing.late)),
-    (Column("last 25 %", 7), lambda e, _: number(e.standing.tail)),
-    (Column("NIS", 6), lambda e, _: _optional(e.standing.nis)),
-    (Column("corr.", 6), lambda e, _: _optional(e.standing.innovation_correlation, 2)),
-    (Column("µs/step", 5), lambda e, _: number(e.standing.us_per_step)),
+    (Column("transient rank", 4), lambda e, _: _rank(e.ranks["transient"])),
+    (Column("transient", 2), lambda e, show: show(e.standing.transient)),
+    (Column("diverged %", 1), lambda e, show: show(e.standing.diverged.percent)),
+    (Column("settled s", 5), lambda e, _: number(e.standing.settling.value)),
+    (Column("track", 3, numeric=False), lambda e, _: e.standing.track),
+    (Column("episodes", 5), lambda e, _: _episodes(e.standing)),
+    (Column("/ CRR", 6), lambda e, _: _optional(e.standing.over_reference)),
+    (Column("ANEES", 6), lambda e, _: _banded(e.standing.anees)),
+    (Column("covers %", 6), lambda e, _: _optional(_percent(e.standing.coverage), 2)),
+    (Column("90th pct.", 8), lambda e, _: number(e.standing.steady_90)),
+    (Column("first", 9), lambda e, _: number(e.standing.first)),
+    (Column("whole", 8), lambda e, _: number(e.standing.whole)),
+    (Column("last 75 %", 9), lambda e, _: number(e.standing.late)),
+    (Column("last 25 %", 9), lambda e, _: number(e.standing.tail)),
+    (Column("NIS", 8), lambda e, _: _optional(e.standing.nis)),
+    (Column("corr.", 8), lambda e, _: _optional(e.standing.innovation_correlation, 2)),
+    (Column("µs/step", 7), lambda e, _: number(e.standing.us_per_step)),
     (Column("knows", numeric=False), lambda e, _: ", ".join(e.standing.knows)),
-    (Column("training", 8, numeric=False), lambda e, _: e.standing.training),
+    (Column("training", 10, numeric=False), lambda e, _: e.standing.training),
 )
 """The columns of a table, and the text of each for a line."""
 
@@ -60,29 +60,37 @@ def layouts(table: Table) -> Layouts:
     for what estimators know; and where that does not fit either, and lines become records, with
     intervals again."""
     whole = grid(table)
-    short = with_letters(
-        grid(table, intervals=False), [entry.standing.knows for entry in table.entries]
-    )
+    known = [entry.standing.knows for entry in table.entries]
+    short = with_letters(grid(table, intervals=False), known, facts_of(known))
     note = " ".join(filter(None, [short.note, "95 % intervals are not shown at this width."]))
     return ((whole,), (replace(short, note=note),), (whole,))
 
 
-def with_letters(grid: Grid, known: Sequence[Sequence[str]]) -> Grid:
-    """Return a table in which letters stand for what each line's estimator knows, with a legend."""
-    facts = list(dict.fromkeys(fact for facts in known for fact in facts))
+def facts_of(known: Iterable[Sequence[str]]) -> list[str]:
+    """Return what any of some estimators knows, in the order in which it first appears."""
+    return list(dict.fromkeys(fact for facts in known for fact in facts))
+
+
+def with_letters(grid: Grid, known: Sequence[Sequence[str]], facts: Sequence[str]) -> Grid:
+    """Return a table in which letters stand for what each line's estimator knows, with a legend.
+
+    Args:
+        grid: a table with a column ``knows``.
+        known: what the estimator of each line knows.
+        facts: what the letters stand for, in the order of the alphabet; tables that are shown
+            together have the same. If there are more than letters, the table stays as it is.
+    """
     if len(facts) > len(ascii_lowercase):
         return grid
+    letters = dict(zip(facts, ascii_lowercase, strict=False))
     place = grid.header.index("knows")
     lines = tuple(
-        (
-            *line[:place],
-            "".join(ascii_lowercase[facts.index(fact)] for fact in own),
-            *line[place + 1 :],
-        )
+        (*line[:place], "".join(letters[fact] for fact in own), *line[place + 1 :])
         for line, own in zip(grid.lines, known, strict=True)
     )
-    legend = ", ".join(f"{ascii_lowercase[i]} {fact}" for i, fact in enumerate(facts))
-    note = " ".join(filter(None, [f"knows: {legend}.", grid.note]))
+    used = facts_of(known)
+    legend = ", ".join(f"{letters[fact]} {fact}" for fact in facts if fact in used)
+    note = " ".join(filter(None, [f"knows: {legend}." if legend else "", grid.note]))
     return replace(grid, lines=lines, note=note)
 
 
@@ -102,7 +110,8 @@ NOTE = (
     "infinite, comparisons as an error of the whole scale or more. 5 × 100 are 100 episodes of "
     "each of five trainings; a single training says nothing about how much trainings differ. "
     "Online estimators are causal; offline ones see the whole record first and are ranked apart, "
-    "as are those that were trained under the very condition that is scored. `initial set`: the "
+    "as are those that were trained under the very condition that is scored; a rule stands between "
+    "tracks. `initial set`: the "
     "estimator knows the set that initial states are drawn from, beyond its mean and covariance, "
     "which all are given. In brackets: modulo states that no output tells apart. Seconds behind a "
     "name are the CPU time that each training was given. / CRR: root mean square over episodes of "

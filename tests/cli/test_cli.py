@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -179,7 +180,8 @@ def test_leaderboard_prints_ranks_writes_and_resumes(folder, capsys):
     assert len(stored.splitlines()) == 8
     assert run(*arguments) == 0
     assert (folder / "lb" / "rows.jsonl").read_text() == stored
-    assert "| ekf | online |" in (folder / "lb" / "leaderboard.md").read_text()
+    text = (folder / "lb" / "leaderboard.md").read_text()
+    assert re.search(r"^\| 1 \| ekf \| .* \| online \| 4 \| ", text, re.MULTILINE)
     assert list((folder / "lb" / "tensorboard").rglob("events.*"))
 
 
@@ -207,13 +209,14 @@ def test_all_conditions_are_played_by_those_that_need_no_training(folder, capsys
 
 
 def test_conditions_are_ranked(folder, capsys):
-    where = [*QUICK, "--estimators", "open_loop", "ekf", "--out", "lb"]
+    where = [*QUICK[:3], "50", *QUICK[4:], "--estimators", "open_loop", "ekf", "--out", "lb"]
     assert run("leaderboard", *where, "--condition", "nominal", "outliers+mismatch10") == 0
     printed = capsys.readouterr().out
     assert "Ranks" in printed
     assert "mismatch10+outliers" in printed  # the one name of both orders
     text = (folder / "lb" / "leaderboard.md").read_text()
-    assert "| condition | ekf | open_loop |" in text
+    assert "| estimator | nominal | mismatch10+outliers | worst | knows |" in text
+    assert "| ekf | 1 | 1 | 1 | model, prior, noise |\n| open_loop | 2 | 2 | 2 |" in text
     assert run("leaderboard", *where, "--condition", "all", "noise5") == 2
 
 
@@ -225,7 +228,7 @@ def test_a_damaged_rows_file_is_refused_before_anything_runs(folder, capsys):
     assert "lb/rows.jsonl, line 1, is cut off" in capsys.readouterr().err
     path.write_text('{"schema": 2}\n')
     assert run("leaderboard", *QUICK, "--out", "lb") == 2
-    assert "lb/rows.jsonl, line 1: rows of schema 2; expected 4" in capsys.readouterr().err
+    assert "lb/rows.jsonl, line 1: rows of schema 2; expected 5" in capsys.readouterr().err
     assert path.read_text() == '{"schema": 2}\n'
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 
 import pytest
 from made_rows import rows_of
@@ -10,6 +9,7 @@ from rich.console import Console
 
 from pinnobs_gym.cli import console, main
 from pinnobs_gym.leaderboard.grid import Column, Grid
+from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.rows import SCHEMA
 
 MOTOR = {"env_id": "pinnobs/Motor-v0"}
@@ -17,17 +17,18 @@ LOADED = {**MOTOR, "condition": "load_step", "ranked": False}
 MIXED = {**MOTOR, "condition": "dropout10+noise5", "ranked": False}
 
 
+FACTS = {"schema": SCHEMA, "kind": "score", "versions": {}, "knows": ["model", "noise"]}
+
+
 @pytest.fixture
 def path(tmp_path):
     """A file of two estimators, one of an evil name, on two systems and three conditions."""
-    facts = {"schema": SCHEMA, "kind": "score", "versions": {}, "knows": ["model", "noise"]}
-    rows = []
+    scored = []
     for game in ({}, MOTOR, LOADED, MIXED):
-        rows += rows_of("ekf", [0.2, 0.2], **game, **facts)
-        rows += rows_of("=a_b|\x1b[1m", [0.1, 0.1], **game, **facts)
-    path = tmp_path / "rows.jsonl"
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    return path
+        scored += rows_of("ekf", [0.2] * 60, **game, **FACTS)
+        scored += rows_of("=a_b|\x1b[1m", [0.1] * 60, **game, **FACTS)
+    rows.append(tmp_path / "rows.jsonl", scored)
+    return tmp_path / "rows.jsonl"
 
 
 @pytest.fixture
@@ -74,10 +75,10 @@ def test_tables_are_chosen_by_name(printed, names, expected):
 def test_markdown_latex_and_csv(printed):
     markdown = printed("--table", "X", "--format", "markdown")
     assert markdown.startswith(
-        "## pinnobs/X-v0, benchmark, nominal\n\n| rank | estimator | track |"
+        "## pinnobs/X-v0, benchmark, nominal\n\n| rank | estimator | steady |"
     )
     assert "| 1 | =a_b\\|�" in markdown
-    latex = printed("--table", "X", "--format", "latex", "--columns", "estimator", "NRMSE")
+    latex = printed("--table", "X", "--format", "latex", "--columns", "estimator", "steady")
     assert r"\begin{tabular}{lr}" in latex
     assert r"=a\_b\textbar{}? & 0.1 \\" in latex
     header, first, second = csv.reader(io.StringIO(printed("--table", "X", "--format", "csv")))
@@ -95,7 +96,8 @@ def test_a_file_has_all_columns_at_any_width(printed, tmp_path, monkeypatch):
     assert "  knows " in text
     assert "not shown" not in text
     narrow = printed("--table", "X")
-    assert "knows, training (-o FILE writes all)" in " ".join(narrow.split())
+    assert "µs/step, training (-o FILE writes all)" in " ".join(narrow.split())
+    assert "\nrank  estimator  steady  transient  diverged %  track   knows\n" in narrow
     assert max(map(len, narrow.splitlines())) <= 80
     monkeypatch.delenv("COLUMNS")
     assert printed("--table", "X") == text
@@ -135,10 +137,21 @@ def test_no_rows_are_mistakes_too(tmp_path, capsys):
     assert "no scored episodes in" in capsys.readouterr().err
 
 
+def test_estimators_trained_on_each_record_have_tables_of_their_own(path, printed):
+    assert "trained on each record" not in printed()
+    own = {"training": {"per_record": True}, "track": "offline", "estimator_hash": "pinn"}
+    rows.append(path, rows_of("pinn", [0.1, 0.1], **FACTS, **own))
+    apart = [f"{ALL[0]}, trained on each record", f"{ALL[5]}, trained on each record"]
+    assert titles(printed()) == [*ALL, *apart]
+    assert titles(printed("--table", "X")) == [ALL[5], apart[1]]
+    chosen = printed("--table", "on-record overview")
+    assert titles(chosen) == apart[:1]
+    assert "pinn" in chosen
+    assert "pinn" not in printed("--table", "overview")
+
+
 def test_what_is_left_out_is_told_beside_the_tables(path, capsys):
-    facts = {"schema": SCHEMA, "kind": "score", "versions": {}}
-    old = rows_of("ekf", [0.3], game_hash="older", date="2029-01-01", **facts)
-    path.write_text(path.read_text() + "".join(json.dumps(row) + "\n" for row in old))
+    rows.append(path, rows_of("ekf", [0.3], game_hash="older", date="2029-01-01", **FACTS))
     assert main(["tables", str(path), "--table", "X"]) == 0
     printed = capsys.readouterr()
     assert "1 episodes of pinnobs/X-v0, benchmark, nominal are left out" in printed.err

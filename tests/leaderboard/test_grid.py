@@ -12,7 +12,7 @@ from rich.cells import cell_len
 
 from pinnobs_gym.leaderboard.display import filled, padded, printable, width_of
 from pinnobs_gym.leaderboard.escapes import PACKAGES, csv_text, latex_text, markdown_text
-from pinnobs_gym.leaderboard.grid import GAP, Column, Grid, fitting, markdown_table
+from pinnobs_gym.leaderboard.grid import GAP, WANTED, Column, Grid, fitting, markdown_table
 
 COLUMNS = (
     Column("rank"),
@@ -250,6 +250,27 @@ def test_the_first_layout_that_fits_is_taken_and_otherwise_the_last():
     assert fitting(layouts, 20) == [wide]
     assert fitting(layouts, 19) == [narrow, narrow]
     assert fitting(layouts, 5) == [narrow, narrow]
+
+
+def test_a_layout_with_room_for_wanted_columns_is_taken_before_one_that_drops_them():
+    def made(size, wanted):
+        columns = (Column("n" * size), Column("w" * 6, wanted), Column("d" * 6, WANTED + 1))
+        return Grid("", columns, ())
+
+    for wanted in range(1, WANTED + 1):
+        long, short = made(20, wanted), made(10, wanted)
+        assert fitting([[long], [short]], 28) == [long]  # 20 + 2 + 6
+        assert fitting([[long], [short]], 27) == [short]
+        assert fitting([[long], [short]], 18) == [short]
+        assert fitting([[short], [made(5, wanted)], [long]], 17) == [made(5, wanted)]
+        assert fitting([[long], [long, short]], 22) == [long]  # room for the wanted in neither
+    some = made(20, 2), made(10, 3)
+    assert fitting([[each] for each in some], 27) == [some[1]]
+    first, second = (
+        Grid("", (Column("n" * n), Column("w", 1), Column("v", 3)), ()) for n in (9, 8)
+    )
+    assert fitting([[first], [second]], 11) == [second]  # 8 + 2 + 1
+    assert fitting([[made(20, WANTED + 1)], [short]], 20) == [made(20, WANTED + 1)]
 
 
 NASTY = ["a|b", "<script>alert(1)</script>", "[x](y)", "`code`", "two\nlines", "*a*", "a\\b", ""]

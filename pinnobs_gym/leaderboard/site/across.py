@@ -30,15 +30,20 @@ class Factors:
     no states are identifiable or too few episodes were played."""
 
 
-def factors(contenders: Sequence[Contender]) -> list[Factors]:
+def factors(contenders: Sequence[Contender], over_all: Mapping[str, Places]) -> list[Factors]:
     """Return the factors over all systems and, if there are several systems, of each system; only
-    those with several conditions."""
+    those with several conditions.
+
+    Args:
+        contenders: estimators of all tracks.
+        over_all: their places under each condition, over all systems.
+    """
     online = [contender for contender in contenders if contender.track == "online"]
     systems = sorted({game.system for contender in online for game in contender.games})
-    groups = {"all systems": online}
+    found = {"all systems": over_all}
     for system in systems if len(systems) > 1 else ():
-        groups[system] = among(online, lambda run, wanted=system: run.game.system == wanted)
-    found = {of: by_condition(group) for of, group in groups.items()}
+        own = among(online, lambda run, wanted=system: run.game.system == wanted)
+        found[system] = by_condition(own)
     return [_factors(of, placed) for of, placed in found.items() if len(placed) > 1]
 
 

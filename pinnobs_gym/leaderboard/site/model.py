@@ -75,7 +75,7 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
         on_record=on_record,
         costs=costs(main.lines, seconds),
         sections=tuple(_sections(games_of(drawn, tables.values(), folders))),
-        factors=tuple(factors(main.contenders)),
+        factors=tuple(factors(main.contenders, main.conditions)),
         method=method_of(stored, drawn, results.notes),
     )
 

@@ -38,7 +38,7 @@ def draw(page: Page) -> str:
         note=ranks_table.NOTE,
         on_record=ON_RECORD,
         grid=standings_table.grid,
-        heat=[_heat(each) for each in page.factors],
+        heat=[_heat(each, page.main.knows) for each in page.factors],
         styles=drawn,
         charts=charts.charts,
         css=Markup(_text("page.css")),
@@ -79,11 +79,14 @@ class Heat:
     lines: tuple[HeatLine, ...]
     worst: Sequence[int | None]
     """Worst rank of each estimator."""
+    knows: Sequence[str]
+    """What each estimator knows."""
 
 
-def _heat(factors: Factors) -> Heat:
-    lines = (_line(factors, condition) for condition in factors.values)
-    return Heat(factors.of, factors.estimators, tuple(lines), factors.worst)
+def _heat(factors: Factors, knows: Mapping[str, Sequence[str]]) -> Heat:
+    lines = tuple(_line(factors, condition) for condition in factors.values)
+    known = tuple(", ".join(knows[name]) for name in factors.estimators)
+    return Heat(factors.of, factors.estimators, lines, factors.worst, known)
 
 
 def _line(factors: Factors, condition: str) -> HeatLine:

@@ -6,7 +6,7 @@ import pytest
 from made_rows import rows_of
 from page_rows import curves
 
-from pinnobs_gym.leaderboard import ranks, standings
+from pinnobs_gym.leaderboard import places, standings
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.site.model import page_model
 from pinnobs_gym.leaderboard.site.page import draw
@@ -36,7 +36,7 @@ def scored():
 @pytest.fixture
 def counted(monkeypatch):
     """How often each interval is computed from rows."""
-    calls = dict.fromkeys(("median", "rate", "bootstrapped"), 0)
+    calls = dict.fromkeys(("median", "rate", "score"), 0)
 
     def count(module, name):
         original = getattr(module, name)
@@ -49,25 +49,40 @@ def counted(monkeypatch):
 
     count(standings, "median")
     count(standings, "rate")
-    count(ranks, "bootstrapped")
+    count(places, "score")
     return calls
+
+
+GAMES = 4 + 3 * 2
+"""Lines of the tables of games: X, and the motor under three conditions."""
+OVERVIEW = 4
+CONDITIONS = 3 + 2 + 2
+"""Online estimators under nominal, load_step and noise5, over all systems."""
+BY_SYSTEM = 3 + 3 * 2
+"""The same on X and on the motor by themselves."""
+# Both training seeds of the gain together are a line of its game and one of the overview; other
+# lines of the overview are those of a game.
+STANDINGS = {"median": 3 * (GAMES + 1), "rate": GAMES + 1}
+
+
+def lines(part):
+    return sum(len(table.entries) for table in part.tables)
 
 
 def test_the_page_computes_an_interval_once_per_cell(counted):
     page = page_model(Stored(scored(), []), [])
     tables = [each.table for section in page.sections for each in section.games]
-    assert [len(table.standings) for table in tables] == [2, 2, 5]  # the motor's two, and X
-    lines = sum(len(table.standings) for table in tables)
-    # Both training seeds of the gain together are one more cell, of the overview.
-    assert counted == {"median": 3 * (lines + 1), "rate": lines + 1, "bootstrapped": 2 * 4}
-    assert len(page.lines) == 4
+    assert [len(table.entries) for table in tables] == [2, 2, 4]  # the motor's two, and X
+    assert (lines(page.main), len(page.main.lines), page.on_record) == (GAMES, OVERVIEW, None)
+    # A factor in each of two windows.
+    scores = 2 * (GAMES + OVERVIEW + CONDITIONS + BY_SYSTEM)
+    assert counted == {**STANDINGS, "score": scores}
 
 
 def test_the_board_computes_an_interval_once_per_cell(counted):
     found = board(Stored(scored(), []))
-    lines = sum(len(table.standings) for table in found.tables)
-    assert lines == 2 + 3 + 2 * 3
-    assert counted == {"median": 3 * (lines + 1), "rate": lines + 1, "bootstrapped": 2 * 4}
+    assert (lines(found.main), len(found.main.lines)) == (GAMES, OVERVIEW)
+    assert counted == {**STANDINGS, "score": 2 * (GAMES + OVERVIEW + CONDITIONS)}
 
 
 def test_drawing_needs_neither_rows_nor_curves(tmp_path, counted):
@@ -98,6 +113,8 @@ def test_a_contender_has_one_name_in_all_sections():
     rows += rows_of("ekf", [0.2, 0.2], **gated, **COMMON)
     page = page_model(Stored(rows, []), [])
     gate = "ekf (gate=0.9)"
-    assert {line.estimator for line in page.lines} == set(page.tracks) == {"ekf", gate}
-    medians = {line.estimator: [s.nrmse.value for s in line.games.values()] for line in page.lines}
+    assert {line.estimator for line in page.main.lines} == set(page.tracks) == {"ekf", gate}
+    medians = {
+        line.estimator: [s.steady.value for s in line.games.values()] for line in page.main.lines
+    }
     assert medians == {"ekf": [0.1], gate: [0.2]}

@@ -28,10 +28,18 @@ def test_a_settling_curve_of_many_episodes_is_that_of_all_at_the_times_drawn():
 
 
 def test_ratios_are_quantiles_of_those_that_have_one():
-    values = [4.0, 1.0, 2.0, np.inf, None]
-    group = [row(i, reference_ratio=value) for i, value in enumerate(values)]
-    best = [row(0, reference_ratio=0.5)]
-    table = over_episodes.ratios({"ekf": group, "none": [row(0)], "best": best})
-    assert table["estimator"] == ["best", "ekf"]
-    assert table["median"] == [0.5, 3.0]
-    assert [table[q][1] for q in ("q10", "q25", "q75", "q90")] == [1.0, 1.0, 4.0, None]
+    """The reference of each episode is another, so that the ratio of root mean squares is not that
+    of the ratios."""
+    cases = [(4.0, 1.0), (2.0, 2.0), (1.0, 0.5), (9.0, None)]
+    group = [
+        row(i, nrmse_steady_modulo=error, nrmse_steady=99.0, reference_steady=reference)
+        for i, (error, reference) in enumerate(cases)
+    ]
+    best = [row(0, nrmse_steady_modulo=0.5, reference_steady=1.0)]
+    lost = [row(i, nrmse_steady_modulo=e, reference_steady=1.0) for i, e in enumerate((np.inf, 1))]
+    table = over_episodes.ratios({"lost": lost, "ekf": group, "none": [row(0)], "best": best})
+    assert table["estimator"] == ["best", "ekf", "lost"]
+    # (16 + 4 + 1)/(1 + 4 + 1/4) = 4
+    assert table["rms"] == [0.5, 2.0, None]
+    assert [table[q][1] for q in ("q10", "q25", "q75", "q90")] == [1.0, 1.0, 4.0, 4.0]
+    assert [table[q][2] for q in ("q10", "q25", "q75", "q90")] == [1.0, 1.0, None, None]

@@ -1,11 +1,13 @@
 """`pinnobs report`: what it refuses, what it writes, and the page in a browser."""
 
 import json
+import re
 import shutil
 import sys
 
 import altair as alt
 import pytest
+from made_rows import rows_of
 from playwright.sync_api import sync_playwright
 from waiting import PATIENCE
 
@@ -13,9 +15,12 @@ from pinnobs_gym import evaluate
 from pinnobs_gym.cli import main
 from pinnobs_gym.leaderboard.site.charts import Styled
 from pinnobs_gym.leaderboard.site.comparisons import cost, factors, ratios
+from pinnobs_gym.leaderboard.site.model import page_model
 from pinnobs_gym.leaderboard.site.over_time import errors, settling, state
+from pinnobs_gym.leaderboard.site.page import draw
 from pinnobs_gym.leaderboard.site.palette import styles
 from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.rows import Stored
 
 CHROMIUM = shutil.which("chromium")
 ARGUMENTS = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
@@ -84,6 +89,53 @@ def test_without_rows_it_says_so(capsys, tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "empty.jsonl"]
 
 
+COMMON = {"date": "2030-01-02T00:00:00", "versions": {"numpy": "2"}}
+
+
+def drawn(*more):
+    """The page of made rows of two estimators on two systems and two conditions, and of more."""
+    made = [row for name in ("ekf", "ukf") for row in rows_of(name, [0.1] * 60, **COMMON)]
+    for condition in ("load_step", "noise5"):
+        facts = {"condition": condition, "ranked": condition == "load_step", **COMMON}
+        for name in ("ekf", "ukf"):
+            made += rows_of(name, [0.1] * 60, env_id="pinnobs/Motor-v0", **facts)
+    return draw(page_model(Stored([*made, *more], []), []))
+
+
+def tables_of(text):
+    markup = text.partition("<script")[0]
+    return re.findall(r"<table.*?</table>", markup, re.DOTALL)
+
+
+def test_those_trained_on_each_record_have_a_section_if_there_are_any():
+    own = {"training": {"per_record": True, "seconds": 1.0}, "track": "offline"}
+    text = drawn(*rows_of("pinn (guided)", [0.1] * 4, **own, **COMMON))
+    section = text[text.index('<section id="on-record">') :].partition("</section>")[0]
+    assert "<h2>Trained on each record</h2>" in section
+    assert '<a href="#on-record">Trained on each record</a>' in text
+    overview, game = tables_of(section)  # of the one game that it played
+    for table in (overview, game):
+        assert [name in table for name in ("ekf", "ukf", "pinn (guided)")] == [True] * 3
+    assert "pinnobs/X-v0, benchmark, nominal" in section
+    main = text[text.index('<section id="overview">') :].partition("</section>")[0]
+    assert "ekf" in main
+    assert "pinn (guided)" not in main
+    plain = drawn()
+    assert "on-record" not in plain
+    assert "rained on each record" not in plain
+
+
+def test_every_table_says_what_each_estimator_knows():
+    own = {"training": {"per_record": True}, "track": "offline", "knows": ["true states"]}
+    text = drawn(*rows_of("pinn", [0.1] * 4, **own, **COMMON))
+    tables = tables_of(text)
+    # Overviews, games, those on each record, conditions of all and of one system, methods.
+    assert len(tables) == 2 + 2 + 1 + 2 + 1
+    for table in tables:
+        assert re.search(r">knows<", table)
+        assert table.count("model") == 2
+
+
 def changed(scored, path, **changes):
     first = {**json.loads(scored.read_text().splitlines()[0]), **changes}
     path.write_text(json.dumps(first) + "\n")
@@ -124,7 +176,7 @@ def test_several_files_make_one_page_and_curves_may_be_missing(capsys, scored, t
 
 
 def test_charts_are_valid():
-    styled = Styled(styles(["ekf", "ukf"]))
+    styled = Styled(styles(["ekf", "ukf"]), "ukf")
     for spec in (
         errors(styled, 20.0, 1e-3, 1.0),
         settling(styled, 20.0),
@@ -215,21 +267,22 @@ def column(page, table, i):
 def test_columns_sort_both_ways(opened):
     page = opened(viewport={"width": 1280, "height": 900})
     table = "#ReverseDuffing-v0 table"
-    before = column(page, table, 7)
-    head = page.locator(f"{table} thead th").nth(6)  # NRMSE
-    assert head.inner_text() == "NRMSE"
+    before = column(page, table, 3)
+    head = page.locator(f"{table} thead th").nth(2)
+    assert head.inner_text() == "steady"
     head.locator("button").click()
-    values = [float(text.split()[0].replace("∞", "inf")) for text in column(page, table, 7)]
+    values = [float(text.split()[0].replace("∞", "inf")) for text in column(page, table, 3)]
     assert values == sorted(values)
+    assert len(set(values)) > 1
     assert head.get_attribute("aria-sort") == "ascending"
     head.locator("button").click()
     assert [
-        float(text.split()[0].replace("∞", "inf")) for text in column(page, table, 7)
+        float(text.split()[0].replace("∞", "inf")) for text in column(page, table, 3)
     ] == sorted(values, reverse=True)
     page.locator(f"{table} thead button").nth(1).click()
     names = column(page, table, 2)
     assert names == ["ekf", "open_loop", "rts_smoother"]
-    assert sorted(before) == sorted(column(page, table, 7))
+    assert sorted(before) == sorted(column(page, table, 3))
 
 
 def test_nothing_is_wider_than_a_phone(opened):
