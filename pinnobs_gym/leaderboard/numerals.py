@@ -20,4 +20,4 @@ def interval_text(interval: Interval) -> str:
     """Format a number with its interval."""
     if interval.low == interval.high:
         return number(interval.value)
-    return f"{number(interval.value)} ({number(interval.low, 2)} to {number(interval.high, 2)})"
+    return f"{number(interval.value)} ({number(interval.low, 2)}–{number(interval.high, 2)})"

@@ -194,4 +194,4 @@ def _factor(place: Place | None) -> str:
     if place is None:
         return ""
     factor = place.factor
-    return f"{number(factor.value, 2)} ({number(factor.low, 2)}-{number(factor.high, 2)})"
+    return f"{number(factor.value, 2)} ({number(factor.low, 2)}–{number(factor.high, 2)})"

@@ -73,46 +73,46 @@ OVERVIEW_80 = """\
 Across systems
 rank  estimator           steady / ekf   transient / ekf  diverged %  knows
 ----  --------------  ----------------  ----------------  ----------  -----
-   1  kkl_pinn, 45 s     0.5 (0.5-0.5)     0.5 (0.5-0.5)           0  ab
-   2  ekf                      1 (1-1)           1 (1-1)         2.5  a
+   1  kkl_pinn, 45 s     0.5 (0.5–0.5)     0.5 (0.5–0.5)           0  ab
+   2  ekf                      1 (1–1)           1 (1–1)         2.5  a
 ----  --------------  ----------------  ----------------  ----------  -----
-      rts_smoother    0.29 (0.29-0.29)  0.29 (0.29-0.29)           0  a
+      rts_smoother    0.29 (0.29–0.29)  0.29 (0.29–0.29)           0  a
 knows: a model, b true states.
 not shown at this width: transient rank, track, µs/step (leaderboard.md has all)"""
 OVERVIEW_120 = """\
 Across systems
 rank  estimator           steady / ekf  transient rank   transient / ekf  diverged %  track    µs/step  knows
 ----  --------------  ----------------  --------------  ----------------  ----------  -------  -------  -----
-   1  kkl_pinn, 45 s     0.5 (0.5-0.5)               1     0.5 (0.5-0.5)           0  online         1  ab
-   2  ekf                      1 (1-1)               2           1 (1-1)         2.5  online         1  a
+   1  kkl_pinn, 45 s     0.5 (0.5–0.5)               1     0.5 (0.5–0.5)           0  online         1  ab
+   2  ekf                      1 (1–1)               2           1 (1–1)         2.5  online         1  a
 ----  --------------  ----------------  --------------  ----------------  ----------  -------  -------  -----
-      rts_smoother    0.29 (0.29-0.29)                  0.29 (0.29-0.29)           0  offline        1  a
+      rts_smoother    0.29 (0.29–0.29)                  0.29 (0.29–0.29)           0  offline        1  a
 knows: a model, b true states."""  # noqa: E501
 OVERVIEW_200 = """\
 Across systems
 rank  estimator           steady / ekf  transient rank   transient / ekf  diverged %  Academic-v0  HarmonicOscillator-v0  InductionMotor-v0 (load_step)  ReverseDuffing-v0  track    knows
 ----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  ------------------
-   1  kkl_pinn, 45 s     0.5 (0.5-0.5)               1     0.5 (0.5-0.5)           0       0.0206                 0.0206                         0.0206             0.0206  online   model, true states
-   2  ekf                      1 (1-1)               2           1 (1-1)         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online   model
+   1  kkl_pinn, 45 s     0.5 (0.5–0.5)               1     0.5 (0.5–0.5)           0       0.0206                 0.0206                         0.0206             0.0206  online   model, true states
+   2  ekf                      1 (1–1)               2           1 (1–1)         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online   model
 ----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  ------------------
-      rts_smoother    0.29 (0.29-0.29)                  0.29 (0.29-0.29)           0                                                                                0.0118  offline  model
+      rts_smoother    0.29 (0.29–0.29)                  0.29 (0.29–0.29)           0                                                                                0.0118  offline  model
 not shown at this width: µs/step (leaderboard.md has all)"""  # noqa: E501
 OVERVIEW = """\
 Across systems
 rank  estimator           steady / ekf  transient rank   transient / ekf  diverged %  Academic-v0  HarmonicOscillator-v0  InductionMotor-v0 (load_step)  ReverseDuffing-v0  track    µs/step  knows
 ----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  -------  ------------------
-   1  kkl_pinn, 45 s     0.5 (0.5-0.5)               1     0.5 (0.5-0.5)           0       0.0206                 0.0206                         0.0206             0.0206  online         1  model, true states
-   2  ekf                      1 (1-1)               2           1 (1-1)         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online         1  model
+   1  kkl_pinn, 45 s     0.5 (0.5–0.5)               1     0.5 (0.5–0.5)           0       0.0206                 0.0206                         0.0206             0.0206  online         1  model, true states
+   2  ekf                      1 (1–1)               2           1 (1–1)         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online         1  model
 ----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  -------  ------------------
-      rts_smoother    0.29 (0.29-0.29)                  0.29 (0.29-0.29)           0                                                                                0.0118  offline        1  model"""  # noqa: E501
+      rts_smoother    0.29 (0.29–0.29)                  0.29 (0.29–0.29)           0                                                                                0.0118  offline        1  model"""  # noqa: E501
 GAME_80 = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
 rank  estimator       steady  transient  diverged %  track    knows
 ----  --------------  ------  ---------  ----------  -------  ------------------
-   1  kkl_pinn, 45 s  0.0206      0.206     0 (0-6)  online   model, true states
-   2  ekf             0.0412      0.412     0 (0-6)  online   model
+   1  kkl_pinn, 45 s  0.0206      0.206     0 (0–6)  online   model, true states
+   2  ekf             0.0412      0.412     0 (0–6)  online   model
 ----  --------------  ------  ---------  ----------  -------  ------------------
-   1  rts_smoother    0.0118      0.118     0 (0-6)  offline  model
+   1  rts_smoother    0.0118      0.118     0 (0–6)  offline  model
 not shown at this width: transient rank, settled s, episodes, / CRR, ANEES,
 covers %, 90th pct., first, whole, last 75 %, last 25 %, NIS, corr., µs/step,
 training (leaderboard.md has all)"""
@@ -120,29 +120,29 @@ GAME_120 = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
 rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  knows
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  ------------------
-   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0-6)     0.0206  online         60  model, true states
-   2  ekf             0.0412               2      0.412     0 (0-6)     0.0412  online         60  model
+   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0–6)     0.0206  online         60  model, true states
+   2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60  model
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  ------------------
-   1  rts_smoother    0.0118               1      0.118     0 (0-6)     0.0118  offline        60  model
+   1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60  model
 not shown at this width: / CRR, ANEES, covers %, 90th pct., first, whole, last 75 %, last 25 %, NIS, corr., µs/step,
 training (leaderboard.md has all)"""  # noqa: E501
 GAME_200 = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
 rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  / CRR  ANEES  covers %  90th pct.   first   whole   NIS  corr.  µs/step  knows
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ----  -----  -------  ------------------
-   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0-6)     0.0206  online         60                             0.0206  0.0206  0.0206                     1  model, true states
-   2  ekf             0.0412               2      0.412     0 (0-6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412  1.04               1  model
+   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0–6)     0.0206  online         60                             0.0206  0.0206  0.0206                     1  model, true states
+   2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412  1.04               1  model
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ----  -----  -------  ------------------
-   1  rts_smoother    0.0118               1      0.118     0 (0-6)     0.0118  offline        60                             0.0118  0.0118  0.0118                     1  model
+   1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60                             0.0118  0.0118  0.0118                     1  model
 not shown at this width: last 75 %, last 25 %, training (leaderboard.md has all)"""  # noqa: E501
 GAME = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
 rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  / CRR  ANEES  covers %  90th pct.   first   whole  last 75 %  last 25 %   NIS  corr.  µs/step  knows               training
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ---------  ----  -----  -------  ------------------  ----------------------------------------
-   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0-6)     0.0206  online         60                             0.0206  0.0206  0.0206     0.0206     0.0206                     1  model, true states  budget 45 s, 700 iterations, 45.02 CPU s
-   2  ekf             0.0412               2      0.412     0 (0-6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412     0.0412     0.0412  1.04               1  model
+   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0–6)     0.0206  online         60                             0.0206  0.0206  0.0206     0.0206     0.0206                     1  model, true states  budget 45 s, 700 iterations, 45.02 CPU s
+   2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412     0.0412     0.0412  1.04               1  model
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ---------  ----  -----  -------  ------------------  ----------------------------------------
-   1  rts_smoother    0.0118               1      0.118     0 (0-6)     0.0118  offline        60                             0.0118  0.0118  0.0118     0.0118     0.0118                     1  model"""  # noqa: E501
+   1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60                             0.0118  0.0118  0.0118     0.0118     0.0118                     1  model"""  # noqa: E501
 
 
 @pytest.fixture(scope="module")
@@ -175,17 +175,17 @@ def test_the_table_of_a_game(part, width, expected):
 RECORD = """\
 rank:           1
 estimator:      an estimator of some length
-steady:         0.0421 (0.042-0.043)
+steady:         0.0421 (0.042–0.043)
 transient rank: 1
-transient:      0.0421 (0.042-0.043)
-diverged %:     0 (0-16)
+transient:      0.0421 (0.042–0.043)
+diverged %:     0 (0–16)
 """
 
 
 def test_intervals_are_left_out_before_the_table_becomes_records():
     rows = rows_of("an estimator of some length", [0.0412 + i / 1e4 for i in range(20)])
     layouts = standings_table.layouts(board(Stored(rows, [])).main.tables[0])
-    assert "0.0421 (0.042-0.043)" in shown(layouts, 105)
+    assert "0.0421 (0.042–0.043)" in shown(layouts, 105)
     assert "  0.0421     0.0421 " in shown(layouts, 75)
     assert "\nknows: a model. 95 % intervals are not shown at this width.\n" in shown(layouts, 75)
     assert RECORD in shown(layouts, 40)
