@@ -45,9 +45,10 @@ _NOISY = 5
 class FastRecipe(Recipe):
     """Minimisation of the loss in scaled quantities by self-scaled Broyden steps.
 
-    States are scaled by `System.scale`, outputs by the effect of that scale on them, and time by
-    twentieths of the record, so that the terms of the loss have similar sizes on all systems. The
-    loss that is logged and returned is the paper's.
+    States are scaled by `System.scale`, or by their range in the guide if that is smaller, outputs
+    by the effect of the system's scale on them, and time by twentieths of the record, so that the
+    terms of the loss have similar sizes on all systems. The loss that is logged and returned is the
+    paper's.
 
     The loss is taken at some of the samples and at further points right after t₀, where y is
     interpolated linearly, as in the replay. Without these points the network could jump from x̂₀ to
@@ -142,12 +143,15 @@ class FastRecipe(Recipe):
         L = np.zeros((n, *L_scale.shape))
         if self.guide is not None:
             xhat, L = self.guide.xhat, self.guide.L
-        each = (weights + 1 / n)[:, None]  # points in the initial layer count as well
+        # A guide draws x̂ and L in the short initial layer, too, by a weight for each point. Without
+        # one, the penalty on L is an integral over time, so that L may be large in that layer.
+        each = (weights + 1 / n)[:, None]
+        by_gain = weights[:, None] if self.guide is None else each
         return Lead(
             xhat,
             config.guide * each / x_scale**2,
             L,
-            config.gain_penalty * each[..., None] / (L_scale**2 + L**2),
+            config.gain_penalty * by_gain[..., None] / (L_scale**2 + L**2),
         )
 
     def draw(self, generator: torch.Generator) -> np.ndarray:
