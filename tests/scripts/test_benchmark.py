@@ -4,6 +4,8 @@ import importlib
 
 import benchmark
 import pytest
+import three_recipes
+from benchmarks import pinn
 
 
 @pytest.mark.parametrize("name", benchmark.GROUPS)
@@ -14,3 +16,25 @@ def test_a_group_gives_figures(name):
 def test_an_unknown_group_is_refused(capsys):
     assert benchmark.main(("nothing",)) == 2
     assert "unknown group 'nothing'; known are" in capsys.readouterr().err
+
+
+def test_the_table_of_pinn_obs_has_a_line_for_each_recipe(monkeypatch):
+    """Errors of 1 to 5 by the seed: median 3, worst 5; a replay that diverges for one seed."""
+
+    class Trained:
+        def __init__(self, seed):
+            self.seconds = self.error = 1.0 + seed
+
+    class Made:
+        of = staticmethod(lambda name: Made())
+        trained = staticmethod(lambda config: Trained(config.seed))
+        direct = staticmethod(lambda trained: trained.error)
+        replayed = staticmethod(lambda t: float("nan") if t.error == 2 else 10 * t.error)
+
+    monkeypatch.setattr(three_recipes, "Case", Made)
+    found = [vars(figure) for figure in three_recipes.paper_setup("ReverseDuffing")]
+    table = pinn.readme_table(found).splitlines()
+    cells = "3 | 5 | 40 | diverges | 3.0 |"
+    assert table[-3].startswith("| ReverseDuffing | paper | 0.045 | 0.045 | 0.253 | 0.253 |")
+    assert table[-2] == f"| ReverseDuffing | fast, paper's loss | {cells}"
+    assert table[-1] == f"| ReverseDuffing | fast, guided by a smoother | {cells}"

@@ -20,7 +20,7 @@ from pinnobs_gym.simulation.system import independent, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
-from trainers.pinn_obs import PinnObsConfig, guided, transfer
+from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer, guided, plain, transfer
 from trainers.pinn_obs.guide import observer_gain
 from trainers.pinn_obs.smoother import DRIFT, forward, smooth
 
@@ -173,6 +173,20 @@ def test_from_any_seed_direct_estimates_and_replay_find_the_states(name):
         error = trained.xhat(record.t) - x
         nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(P), error)[5:]
         assert 0.1 < nees.mean() / system.nx < 4
+
+
+def test_a_state_that_moves_little_is_scaled_by_its_range_and_others_by_the_systems_scale():
+    """On the motor's paper setup the range of the true speed is 0.25 rad/s, and its scale 270."""
+    record, x = played("InductionMotor", 0, "paper")
+    system = InductionMotor.configured("paper")[0]
+    recipe = PinnObsTrainer(system, guided(), record=record, noise_std=0.0).recipe
+    moves = np.ptp(np.vstack([record.prior.mean, x]), axis=0)
+    expected = np.minimum(moves, system.scale)
+    assert expected[4] < 1e-3 * system.scale[4] < 2 * expected[4]
+    expected[4] = 1e-3 * system.scale[4]
+    np.testing.assert_allclose(recipe.architecture.scale[:5], expected, rtol=0.02)
+    unguided = PinnObsTrainer(system, plain(), record=record, noise_std=0.0).recipe
+    assert unguided.architecture.scale[:5] == system.scale
 
 
 def test_a_record_too_long_for_the_points_is_told():
