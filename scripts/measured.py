@@ -64,7 +64,7 @@ def readme_section(groups: dict[str, list[dict[str, Any]]]) -> str:
         if table is not None:
             tables.append(table(figures))
     summary = markdown_table(("group", "hold", "missed"), lines)
-    link = "All of them are in [docs/benchmarks.md](docs/benchmarks.md)."
+    link = "All of them are in [benchmarks.md](benchmarks.md)."
     return "\n\n".join([f"{_intro(groups)} {link}", summary, *tables])
 
 

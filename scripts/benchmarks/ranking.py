@@ -8,8 +8,9 @@ from pathlib import Path
 
 import null_test
 import numpy as np
+import one_score
 
-from benchmarks import Figure, at_least
+from benchmarks import Figure, at_least, at_most
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
@@ -47,6 +48,9 @@ def figures(repeats: int) -> Iterator[Figure]:
         bound = None if "one seed" in name else 0.93
         yield at_least(f"null test, EnKF, {name}: all tied", rate, "", bound)
     yield from groups()
+    for name, largest in one_score.differences().items():
+        what = f"{name}: scores alone and in batches of 7, 60 and 256, largest relative difference"
+        yield at_most(what, largest, "", 1e-12)
 
 
 def with_fair_prior() -> Iterator[Figure]:

@@ -267,7 +267,7 @@ def test_a_failed_job_is_told_left_out_and_tried_again_if_asked(folder, capsys):
 
     assert run(*arguments) == 1
     printed = capsys.readouterr().out
-    name = "failing_module:Broken on ReverseDuffing, nominal, 4 episodes"
+    name = "broken on ReverseDuffing, nominal, 4 episodes"
     assert f"failed: {name}: RuntimeError: out of luck" in printed
     assert "Failed: broken, 4 episodes: RuntimeError: out of luck." in printed
     assert scored() == {"ekf"}
