@@ -277,6 +277,7 @@ class PinnObs(OfflineEstimator):
         for name, reason in OfflineEstimator.exempt_from.items()
         if name != "irregular_times"
     }
+    knows = ("model", "prior")
     trains_on_record = "pinn_obs"
     variants = (MappingProxyType({}), MappingProxyType({"preset": "plain"}))
 

@@ -58,7 +58,7 @@ class Board:
 
 def board(stored: Stored) -> Board:
     """Compute all tables from stored scores."""
-    kept, notes = distinct(stored.rows)
+    kept, notes = distinct(stored.rows, stored.uses)
     made_before, on_record = apart(runs_of(kept))
     main = _part(made_before, stored.failures)
     return Board(main, _part(on_record, ()) if on_record else None, notes)

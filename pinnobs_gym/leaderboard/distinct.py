@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.rows import Row, game_of
 
 _SHOWN = 6
@@ -22,17 +22,26 @@ class Distinct(NamedTuple):
     """What was left out, a sentence each."""
 
 
-def distinct(rows: Sequence[Row]) -> Distinct:
-    """Return the rows of the newest code of each game, in which estimators that differ have names
+def distinct(rows: Sequence[Row], uses: Sequence[Row] = ()) -> Distinct:
+    """Return the rows of the present code of each game, in which estimators that differ have names
     that differ.
 
-    Episodes of a game whose code or settings have changed are not comparable: the newest are kept,
-    and a note says what is left out. Of the estimators of one name and training budget that differ
-    in settings or code, the one with the most rows keeps its name, and the names of the others say
-    what differs. Runs of a game that still look alike are named by their hashes.
+    The present code is that used last (`pinnobs_gym.scoring.recency`). Episodes of a game whose
+    code or settings have changed are not comparable: a note says what is left out. Names have the
+    settings that are not the defaults. Of the estimators of one name that differ otherwise, in
+    code, the one that was used last keeps the name, and the names of the others say what differs.
+    Runs of a game that still look alike are named by their hashes.
+
+    Args:
+        rows: scored episodes.
+        uses: rows of the kind ``use``.
     """
-    kept, notes = _of_newest_games(rows)
-    return Distinct(_named_by_hash(_named_by_difference(kept)), notes)
+    last_use = LastUse.of([*rows, *uses])
+    kept, notes = _of_present_games(rows, last_use)
+    named = _named_by_difference(
+        [_with_settings(row) for row in kept], [last_use.date(row) for row in kept]
+    )
+    return Distinct(_named_by_hash(named, [last_use.date(row) for row in kept]), notes)
 
 
 def name_of(row: Row) -> str:
@@ -41,42 +50,46 @@ def name_of(row: Row) -> str:
     return row["estimator"] if budget is None else f"{row['estimator']}, {budget:g} s"
 
 
-def _of_newest_games(rows: Sequence[Row]) -> tuple[list[Row], tuple[str, ...]]:
-    """Return the rows of the newest hash of each game, and a note on those of each other hash."""
-    newest: dict[GameName, tuple[str, str]] = {}
-    for row in rows:
-        game, version = game_of(row), (row["date"], row["game_hash"])
-        newest[game] = max(newest.get(game, version), version)
-    kept = [row for row in rows if row["game_hash"] == newest[game_of(row)][1]]
+def _with_settings(row: Row) -> Row:
+    """Return a row in which the name of the estimator has the settings that are not the usual."""
+    settings = ", ".join(f"{name}={value}" for name, value in row["settings"].items())
+    return row | {"estimator": f"{row['estimator']} ({settings})"} if settings else row
+
+
+def _of_present_games(rows: Sequence[Row], last_use: LastUse) -> tuple[list[Row], tuple[str, ...]]:
+    """Return the rows of the present code of each game, and a note on those of other code."""
+    present = {game: last_use.newest_game(game) for game in {game_of(row) for row in rows}}
+    kept = [row for row in rows if row["game_hash"] == present[game_of(row)]]
     older = Counter(
         (game_of(row), row["game_hash"])
         for row in rows
-        if row["game_hash"] != newest[game_of(row)][1]
+        if row["game_hash"] != present[game_of(row)]
     )
     return kept, tuple(
-        f"{count} episodes of {', '.join(game)} are left out: the code or the settings of the "
-        f"system, the simulation or the scores have changed since (hash {old[:_SHOWN]}, now "
-        f"{newest[game][1][:_SHOWN]})."
-        for (game, old), count in sorted(older.items())
+        f"{count} episodes of {', '.join(game)} are left out: they are of other code or settings "
+        f"of the system, the simulation or the scores (hash {other[:_SHOWN]}) than those used last "
+        f"({present[game][:_SHOWN]})."
+        for (game, other), count in sorted(older.items())
     )
 
 
-def _named_by_difference(rows: Sequence[Row]) -> list[Row]:
-    """Return rows whose estimators are renamed where several have one name."""
-    groups: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        groups[name_of(row)][json.dumps(_facts(row), sort_keys=True)].append(row)
-    names: dict[tuple[str, str], str] = {}
-    for name, variants in groups.items():
-        plain, *others = sorted(variants, key=lambda facts: _precedence(variants[facts]))
-        for facts in others:
-            names[name, facts] = _difference(json.loads(facts), json.loads(plain))
-    renamed = []
-    for row in rows:
-        suffix = names.get((name_of(row), json.dumps(_facts(row), sort_keys=True)))
-        changed = {} if suffix is None else {"estimator": f"{row['estimator']} ({suffix})"}
-        renamed.append(row | changed)
-    return renamed
+def _named_by_difference(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]:
+    """Return rows whose estimators are renamed where several have one name; dates are those of the
+    last use of each row's code."""
+    keys = [(name_of(row), json.dumps(_facts(row), sort_keys=True)) for row in rows]
+    last: dict[tuple[str, str], str] = {}
+    for key, date in zip(keys, dates, strict=True):
+        last[key] = max(last.get(key, date), date)
+    suffixes: dict[tuple[str, str], str] = {}
+    for name in {name for name, _ in last}:
+        variants = sorted((facts for n, facts in last if n == name), key=lambda f: last[name, f])
+        plain = json.loads(variants[-1])
+        for facts in variants[:-1]:
+            suffixes[name, facts] = _difference(json.loads(facts), plain)
+    return [
+        row | {"estimator": f"{row['estimator']} ({suffixes[key]})"} if key in suffixes else row
+        for row, key in zip(rows, keys, strict=True)
+    ]
 
 
 def _facts(row: Row) -> dict[str, Any]:
@@ -90,11 +103,6 @@ def _facts(row: Row) -> dict[str, Any]:
     return {**settings, "code": row["estimator_code"]}
 
 
-def _precedence(rows: Sequence[Row]) -> tuple[int, tuple[int, ...]]:
-    """Return the sort key of variants: the most rows first, then the latest."""
-    return -len(rows), tuple(-ord(character) for character in max(row["date"] for row in rows))
-
-
 def _difference(facts: Mapping[str, Any], plain: Mapping[str, Any]) -> str:
     """Return in words how an estimator differs from the one that keeps the name."""
     missing = object()
@@ -105,17 +113,17 @@ def _difference(facts: Mapping[str, Any], plain: Mapping[str, Any]) -> str:
     return ", ".join(parts + ([] if code is None else [f"code {code[:_SHOWN]}"]))
 
 
-def _named_by_hash(rows: Sequence[Row]) -> list[Row]:
+def _named_by_hash(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]:
     """Return rows in which runs of one name and training seed in a game are named by their hashes,
-    but for the latest."""
-    latest: dict[tuple[Any, ...], tuple[str, str]] = {}
-    for row in rows:
-        line, version = _line(row), (row["date"], row["estimator_hash"])
-        latest[line] = max(latest.get(line, version), version)
+    but for the one used last."""
+    last: dict[tuple[Any, ...], tuple[str, str]] = {}
+    for row, date in zip(rows, dates, strict=True):
+        line, version = _line(row), (date, row["estimator_hash"])
+        last[line] = max(last.get(line, version), version)
     renamed = []
     for row in rows:
         own = row["estimator_hash"]
-        same = own == latest[_line(row)][1]
+        same = own == last[_line(row)][1]
         changed = {} if same else {"estimator": f"{row['estimator']} (run {own[:_SHOWN]})"}
         renamed.append(row | changed)
     return renamed

@@ -15,6 +15,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
+from pinnobs_gym.scoring.deviations import deviations
 from pinnobs_gym.scoring.identifiability import Identifiability, identifiability
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.provenance import (
@@ -25,6 +26,7 @@ from pinnobs_gym.scoring.provenance import (
     now,
     versions,
 )
+from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.rows import SCHEMA, Row
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
@@ -55,6 +57,8 @@ class Results:
     """The stored rows of the same estimator and game; if None, the file is read."""
     fresh: bool = False
     """Whether episodes are run again even if they are stored; the new rows replace the old."""
+    last_use: LastUse | None = None
+    """When the code of the same game was used last; if ``known`` is None, the file tells."""
 
     def stored(self, wanted: Sequence[Row]) -> dict[tuple[Any, ...], Row]:
         """Return those of the wanted rows that are stored, by their key. Their scores are included
@@ -65,6 +69,16 @@ class Results:
             return {rows_module.key(row): row for row in rows_module.read(self.path)}
         stored = (row for row in wanted if stored_key(row) in self.known)
         return {rows_module.key(row): row for row in stored}
+
+    def note_use(self, common: Row) -> None:
+        """Append that the code of these rows is the present one, if other code was used later."""
+        last_use = self.last_use
+        if self.known is None or last_use is None:
+            stored = rows_module.load(self.path)
+            last_use = LastUse.of([*stored.rows, *stored.uses])
+        if not last_use.is_last(common):
+            used = {name: common[name] for name in rows_module.USE if name in common}
+            rows_module.append(self.path, [used | {"kind": "use", "date": now()}])
 
 
 def evaluate(
@@ -172,7 +186,9 @@ def run_episodes(
         progress: called after each batch with its number of episodes.
         label: name of the estimator in rows; its own if None.
     """
-    common = _common(estimator, game) | {"estimator": label or estimator.label}
+    common = _common(estimator, game)
+    if label is not None:
+        common |= {"estimator": label, "settings": {}}  # the label stands for the settings
     wanted = [{**common, "episode": rows_module.episode_of(seed)} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
@@ -189,6 +205,8 @@ def run_episodes(
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))
+    if results is not None and not missing:
+        results.note_use(common)
     rows = [stored[rows_module.key(row)] for row in wanted]
     return Evaluated(rows, first_played, len(wanted) - len(missing))
 
@@ -259,6 +277,7 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
         "knows": list(dict.fromkeys(knows)),
         "options": canonical(estimator.options),
+        "settings": deviations(estimator, game),
         "estimator_code": estimator_code(type(estimator)),
         "estimator_hash": estimator_hash(estimator),
         "training": canonical(estimator.training),

@@ -67,3 +67,30 @@ def test_fresh_scores_replace_those_that_are_stored(tmp_path):
     assert taken == []
     assert [row["nrmse"] for row in again] == [row["nrmse"] for row in first]
     assert all(a["date"] > b["date"] for a, b in zip(again, first, strict=True))
+
+
+@pytest.mark.parametrize("edit", ["f", "a helper module"])
+def test_after_an_edit_is_reverted_the_tables_show_the_present_code(tmp_path, edit):
+    """Its scores are taken from the file, in which those of the edit are later."""
+    write(tmp_path)
+    scores(tmp_path, "leaderboard")
+    first = (tmp_path / "out" / "leaderboard.md").read_text()
+    write(tmp_path, edit)
+    scores(tmp_path, "leaderboard")
+    edited = (tmp_path / "out" / "leaderboard.md").read_text()
+    write(tmp_path, "a comment")
+    stored, (said,) = scores(tmp_path, "leaderboard")
+    assert said.startswith("3 of 3 episodes")
+    assert [row["kind"] for row in stored[6:]] == ["use"]
+    again = (tmp_path / "out" / "leaderboard.md").read_text()
+
+    def cells(text):
+        """The line of the estimator in the table of the game, without its cost."""
+        lines = text.partition("# Each game")[2].splitlines()
+        (line,) = (line.split(" | ") for line in lines if " | obs | " in line)
+        return line[:6]
+
+    assert cells(again) == cells(first) != cells(edited)
+    scores(tmp_path, "leaderboard")
+    assert (tmp_path / "out" / "leaderboard.md").read_text() == again
+    assert len((tmp_path / "out" / "rows.jsonl").read_text().splitlines()) == 7  # said once

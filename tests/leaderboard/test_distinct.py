@@ -26,8 +26,16 @@ def test_only_the_newest_code_of_a_game_is_kept_and_the_rest_is_named():
     elsewhere = rows_of("ekf", [3.0], condition="noise5", game_hash="cccccccccc", **OLD)
     kept, (note,) = distinct([*old, *new, *elsewhere])
     assert kept == [*new, *elsewhere]
-    assert note.startswith("3 episodes of pinnobs/X-v0, benchmark, nominal are left out: the code")
-    assert "hash aaaaaa, now bbbbbb" in note
+    assert note.startswith(
+        "3 episodes of pinnobs/X-v0, benchmark, nominal are left out: they are of"
+    )
+    assert "(hash aaaaaa) than those used last (bbbbbb)" in note
+
+
+def test_names_have_the_settings_that_are_not_the_usual_ones():
+    rows = [*rows_of("ekf", [1.0], settings={"gate": 0.9}), *rows_of("ekf", [1.0])]
+    rows += rows_of("ekf", [1.0] * 9, settings={"gate": 0.9, "huber": 1.0}, **NEW)
+    assert names(rows) == ["ekf (gate=0.9)", "ekf", *["ekf (gate=0.9, huber=1.0)"] * 9]
 
 
 @pytest.mark.parametrize(
@@ -42,19 +50,32 @@ def test_only_the_newest_code_of_a_game_is_kept_and_the_rest_is_named():
         ),
     ],
 )
-def test_estimators_of_one_name_are_named_by_what_differs(changes, expected):
-    plain = {"options": {"gate": None, "huber": None}, **OLD}
+def test_of_one_name_the_one_used_last_keeps_it_and_others_say_what_differs(changes, expected):
+    """As with labels, which stand for settings, or after an edit. The number of rows is nothing."""
+    plain = {"options": {"gate": None, "huber": None}, **NEW}
     rows = [
-        *rows_of("ekf", [1.0, 1.0], **plain),
-        *rows_of("ekf", [1.0], estimator_hash="other", **{**plain, **NEW, **changes}),
+        *rows_of("ekf", [1.0], **plain),
+        *rows_of("ekf", [1.0] * 2, estimator_hash="other", **{**plain, **OLD, **changes}),
     ]
-    assert names(rows) == ["ekf", "ekf", expected]
+    assert names(rows) == ["ekf", expected, expected]
 
 
-def test_of_as_many_rows_the_latest_keep_the_name():
-    old = rows_of("ekf", [1.0], estimator_hash="old", estimator_code="0123456789", **OLD)
-    new = rows_of("ekf", [1.0], estimator_hash="new", estimator_code="abcdefghij", **NEW)
-    assert names([*old, *new]) == ["ekf (code 012345)", "ekf"]
+def test_code_that_is_used_again_is_the_present_one():
+    """Of a game and of an estimator: edited, run, reverted, and run again from the file."""
+    first = rows_of("ekf", [1.0], estimator_hash="old", estimator_code="0123456789", **OLD)
+    edited = rows_of("ekf", [1.0], estimator_hash="new", estimator_code="abcdefghij", **NEW)
+    assert names([*first, *edited]) == ["ekf (code 012345)", "ekf"]
+    use = {**first[0], "kind": "use", "date": "2030-01-04"}
+    renamed = [row["estimator"] for row in distinct([*first, *edited], [use]).rows]
+    assert renamed == ["ekf", "ekf (code abcdef)"]
+    first, edited = (
+        rows_of("ekf", [1.0], game_hash=code, **date) for code, date in (("a", OLD), ("b", NEW))
+    )
+    use = {**first[0], "kind": "use", "date": "2030-01-04"}
+    assert distinct([*first, *edited]).rows == edited
+    kept, (note,) = distinct([*first, *edited], [use])
+    assert kept == first
+    assert "(hash b) than those used last (a)" in note
 
 
 def test_training_settings_tell_apart_and_training_seeds_do_not():
@@ -63,7 +84,7 @@ def test_training_settings_tell_apart_and_training_seeds_do_not():
         facts = {"training": {"config": config}, "training_seed": seed}
         return rows_of("gain", [1.0, 1.0], estimator_hash=f"{seed}{width}", **facts, **changes)
 
-    rows = [*trained(0, 8), *trained(1, 8), *trained(0, 16)[:1]]
+    rows = [*trained(0, 8, **NEW), *trained(1, 8, **NEW), *trained(0, 16, **OLD)[:1]]
     assert names(rows) == ["gain"] * 4 + ["gain (width=16)"]
 
 
@@ -77,8 +98,8 @@ def test_what_still_looks_alike_is_named_by_its_hash():
 def test_no_two_lines_of_a_table_look_alike():
     """Settings, code, training seeds, training settings and hashes: each of them is seen."""
     rows = [
-        *rows_of("ekf", [1.0] * 3, options={"gate": None}),
-        *rows_of("ekf", [1.0], options={"gate": 0.9}, estimator_hash="a"),
+        *rows_of("ekf", [1.0] * 3, options={"gate": None}, **NEW),
+        *rows_of("ekf", [1.0], options={"gate": 0.9}, settings={"gate": 0.9}, estimator_hash="a"),
         *rows_of("ekf", [1.0], options={"gate": None}, estimator_code="b", estimator_hash="b"),
         *rows_of("ekf", [1.0], options={"gate": None}, estimator_hash="c", **OLD),
     ]

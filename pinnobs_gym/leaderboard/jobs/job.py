@@ -25,6 +25,7 @@ from pinnobs_gym.scoring.provenance import (
     training_code,
     versions,
 )
+from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder
 from pinnobs_gym.training.by_name import load, train_by_name
@@ -51,6 +52,8 @@ class Job:
     """Name of the estimator in rows; its own, with its recipe, if None."""
     known: frozenset[StoredKey] | None = None
     """Keys of the stored rows; see `Results`."""
+    last_use: LastUse | None = None
+    """When the code of the same game was used last; see `Results`."""
     fresh: bool = False
     """Whether stored episodes are run again; see `Results`."""
     failed: bool = False
@@ -77,7 +80,7 @@ class Job:
     @property
     def digest(self) -> str:
         """Hash of the job's specification and of the code that it runs."""
-        aside = ("folder", "known", "fresh", "failed")
+        aside = ("folder", "known", "last_use", "fresh", "failed")
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in aside}
         cls = ESTIMATORS.resolve(self.estimator)
         code = [game_hash(self.game.source), estimator_code(cls)]
@@ -93,7 +96,7 @@ class Job:
 
     def anew(self) -> Self:
         """Return the same job without its knowledge of stored rows."""
-        return replace(self, known=None)
+        return replace(self, known=None, last_use=None)
 
     def fail(self, error: str) -> None:
         """Append a row with the error.
@@ -144,7 +147,7 @@ def run_job(job: Job) -> None:
         chosen = trained(cls, job)
     estimator = make_estimator(chosen, job.game, options)
     seeds = range(job.seed, job.seed + job.episodes)
-    results = Results(job.rows, job.known, job.fresh)
+    results = Results(job.rows, job.known, job.fresh, job.last_use)
     evaluated = run_episodes(job.game, estimator, seeds, results, label=job.label)
     scored = [row for row in evaluated.rows if "nrmse" in row]
     if evaluated.first_played is not None:  # some episodes were not stored

@@ -16,6 +16,7 @@ from pinnobs_gym.leaderboard.jobs.job import Job, called
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
+from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.rows import Stored, episode_of, game_of
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
@@ -104,6 +105,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
     known_rows: dict[tuple[GameName, str], list[StoredKey]] = defaultdict(list)
     for row in stored.rows:
         known_rows[game_of(row), row["estimator"]].append(stored_key(row))
+    last_use = LastUse.of([*stored.rows, *stored.uses])
     failed = {row["job"] for row in stored.failures}
     to_run, left_out = [], []
     for job in jobs:
@@ -117,7 +119,8 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
             keys = known_rows[job.game.name, job.called]
             wanted = set(map(episode_of, range(job.seed, job.seed + job.episodes)))
             known = frozenset(entry for entry in keys if entry[-1] in wanted)
-        to_run.append(replace(job, known=known, failed=again))
+        own = last_use.among(job.game.name)
+        to_run.append(replace(job, known=known, last_use=own, failed=again))
     return to_run, left_out
 
 

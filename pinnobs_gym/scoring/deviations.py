@@ -1,0 +1,81 @@
+"""Settings of an estimator that are not the usual ones, which its name in tables shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.envs.game import Game
+from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.scoring.provenance import canonical
+from pinnobs_gym.simulation.system import output_noise
+from pinnobs_gym.training.settings import ALWAYS_MAY_CHANGE
+
+_ASIDE = ("seed", *ALWAYS_MAY_CHANGE)
+"""Settings of trainers that names do not show, or show otherwise."""
+
+
+def deviations(estimator: BaseEstimator, game: Game) -> dict[str, Any]:
+    """Return what differs between an estimator and the one that its name stands for in a game: its
+    settings or those of its training that are not the defaults, a noise level or a model other than
+    those of the game, and a condition that it was trained under."""
+    found = _of_training(estimator) if estimator.training else _of_options(estimator)
+    if "noise" in estimator.knows:
+        known, played = (
+            output_noise(game.source.system, std)
+            for std in (estimator.noise_std, game.source.setup.noise_std)
+        )
+        if not np.allclose(known, played, rtol=1e-9, atol=0.0):
+            found["noise_std"] = canonical(known if len(known) > 1 else known[0])
+    own, model = (canonical(each.parameters) for each in (estimator.system, game.source.system))
+    found |= {name: value for name, value in own.items() if model.get(name) != value}
+    trained_under = estimator.training.get("condition", "nominal")
+    if trained_under not in ("nominal", game.name.condition):
+        found["trained_under"] = trained_under
+    return found
+
+
+def _of_options(estimator: BaseEstimator) -> dict[str, Any]:
+    """Return the options that are not the defaults of the class."""
+    found = {}
+    for field in estimator.setting_fields():
+        default = field.default
+        if default is MISSING and field.default_factory is not MISSING:
+            default = field.default_factory()
+        value = canonical(getattr(estimator, field.name))
+        if default is MISSING or canonical(default) != value:
+            found[field.name] = value
+    return found
+
+
+def _of_training(estimator: BaseEstimator) -> dict[str, Any]:
+    """Return the settings of the training that are not those of the estimator's own recipe; a
+    preset's name stands for its settings, unless the name of the estimator's recipe says it."""
+    cls, config = type(estimator), canonical(estimator.training.get("config", {}))
+    try:
+        trainer, usual = trainer_class(cls), cls.trainer_config({})
+    except (AttributeError, ValueError):  # there is no trainer of this kind
+        return {}
+    # The preset that is nearest to the settings; the estimator's own one if several are.
+    makers = {"": lambda: usual, **trainer.presets}
+    presets = {name: make() for name, make in makers.items()}
+    differences = {name: _differences(config, asdict(each)) for name, each in presets.items()}
+    nearest = min(differences, key=lambda name: len(differences[name]))
+    found: dict[str, Any] = {}
+    if nearest and presets[nearest].recipe == usual.recipe:
+        found["preset"] = nearest
+    return found | differences[nearest]
+
+
+def _differences(config: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a config that are not those of a preset."""
+    usual = canonical(preset)
+    return {
+        name: value
+        for name, value in config.items()
+        if name not in _ASIDE and (name not in usual or usual[name] != value)
+    }
