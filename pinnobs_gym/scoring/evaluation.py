@@ -25,7 +25,7 @@ from pinnobs_gym.scoring.provenance import (
     now,
     versions,
 )
-from pinnobs_gym.scoring.rows import SCHEMA, Row
+from pinnobs_gym.scoring.row_format import SCHEMA, Row, check_names
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.simulation.conditions import canonical_name
@@ -173,6 +173,7 @@ def run_episodes(
         label: name of the estimator in rows; its own if None.
     """
     common = _common(estimator, game) | {"estimator": label or estimator.label}
+    check_names(common)
     wanted = [{**common, "episode": rows_module.episode_of(seed)} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
@@ -259,6 +260,7 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
         "knows": list(dict.fromkeys(knows)),
         "options": canonical(estimator.options),
+        "settings": {},
         "estimator_code": estimator_code(type(estimator)),
         "estimator_hash": estimator_hash(estimator),
         "training": canonical(estimator.training),
