@@ -23,7 +23,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.registry import TRAINERS
-from pinnobs_gym.scoring import consistency, metrics, rows
+from pinnobs_gym.scoring import consistency, metrics, row_format
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
@@ -60,7 +60,7 @@ def pages() -> dict[str, str]:
         "trainers/index.md": _trainers(trainers),
         "conditions.md": _conditions(),
         "metrics.md": _metrics(),
-        "row_schema.txt": variable_docs(rows)["Row"] + "\n",
+        "row_schema.txt": variable_docs(row_format)["Row"] + "\n",
     }
 
 

@@ -113,11 +113,20 @@ def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
 
 def json_line(values: Mapping[str, Any]) -> bytes:
     """Return one line of JSON, with null for numbers that are not finite."""
-    encoded = {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }
-    return json.dumps(encoded).encode() + b"\n"
+    try:
+        text = json.dumps(values, allow_nan=False)
+    except ValueError:
+        text = json.dumps(_finite(values), allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def _finite(value: Any) -> Any:
+    """Return a value with None in place of numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextmanager

@@ -30,7 +30,7 @@ class ScoredRun:
 
     @property
     def hashes(self) -> tuple[str, str]:
-        """Hashes of the game and of the estimator; see `pinnobs_gym.scoring.rows.Row`."""
+        """Hashes of the game and of the estimator; see `pinnobs_gym.scoring.row_format.Row`."""
         return self.rows[0]["game_hash"], self.rows[0]["estimator_hash"]
 
     @property

@@ -1,8 +1,9 @@
 """Hashes of code, on which a score depends beside the settings.
 
 The syntax trees of a module and of all modules of its project that it imports are hashed, also
-those imported inside functions. Docstrings and comments do not count. Packages of others count by
-their version alone, which rows carry; files that code reads at run time are not seen.
+those imported inside functions or by ``importlib.import_module`` and ``__import__`` with a constant
+name, and the packages that these are in. Docstrings and comments do not count. Packages of others
+count by their version alone, which rows carry; files that code reads at run time are not seen.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import importlib.util
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from importlib.machinery import ModuleSpec
@@ -27,7 +29,8 @@ from pinnobs_gym.registry import discard_stale_bytecode
 from pinnobs_gym.simulation.system import System
 
 _OWN = frozenset({"pinnobs_gym", "trainers"})
-"""Packages that are followed wherever they are installed."""
+"""Packages that are followed wherever they are installed. Their own files ``__init__`` only export
+names, and count where they are imported themselves."""
 _FACE = "pinnobs_gym"
 """The package whose names are imported lazily from the modules below it."""
 
@@ -54,6 +57,7 @@ def code_hash(*subjects: type | str) -> str:
         name = waiting.pop()
         if name not in digests:
             digests[name], imports = _loaded(name)
+            waiting += _packages_of(name)
             followed = [pair for pair in imports if _is_followed(pair[0], home)]
             waiting += [_home_of(base, part) for base, part in followed]
     return digest(sorted(digests.items()))
@@ -118,6 +122,18 @@ def _is_followed(name: str, home: set[str] | frozenset[str]) -> bool:
     return not _is_installed(top)
 
 
+def _packages_of(name: str) -> Iterator[str]:
+    """Yield the packages that a module is in, whose ``__init__`` Python runs before it. Packages
+    without one have no code."""
+    parts = name.split(".")
+    if parts[0] in _OWN:
+        return
+    for count in range(1, len(parts)):
+        package = ".".join(parts[:count])
+        if _file_of(package) is not None:
+            yield package
+
+
 @lru_cache(maxsize=512)
 def _is_installed(top: str) -> bool:
     """Return whether a package comes from the folders of installed packages, or from nowhere."""
@@ -151,8 +167,7 @@ def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
         same, spec, code, imports = _LOADED[name]
         if same is module and spec is module.__spec__:
             return code, imports
-    spec = _spec(name)
-    file = getattr(module, "__file__", None) or (spec.origin if spec else None)
+    spec, file = _spec(name), _file_of(name)
     if file is None or not file.endswith(".py"):
         raise Unreadable(f"module {name} has no source file")
     if discard_stale_bytecode(Path(file)) and module is not None:
@@ -161,11 +176,13 @@ def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
             "held before; run again"
         )
     try:
-        tree = ast.parse(Path(file).read_bytes())
+        source = Path(file).read_bytes()
+        tree = ast.parse(source)
     except (OSError, SyntaxError) as error:
         raise Unreadable(f"module {name}: {error}") from None
-    package = spec.parent if spec else name.rpartition(".")[0]
-    code, imports = digest(_shape(tree)), tuple(_imports(package or "", tree))
+    package = (spec.parent if spec else name.rpartition(".")[0]) or ""
+    imports = (*_imports(package, tree), *_imports_by_call(package, tree, source))
+    code = digest(_shape(tree))
     if module is not None:
         _LOADED[name] = module, module.__spec__, code, imports
     return code, imports
@@ -216,6 +233,39 @@ def _imports(package: str, tree: ast.Module) -> Iterator[_Import]:
                 yield base, alias.name
 
 
+_CALLS = ("import_module", "__import__")
+"""The functions that import a module by its name."""
+
+
+def _imports_by_call(package: str, tree: ast.Module, source: bytes) -> Iterator[_Import]:
+    """Yield the modules that calls of `_CALLS` in a module of a package import, where the name is a
+    constant."""
+    if not any(function.encode() in source for function in _CALLS):
+        return  # a walk through all expressions takes as long as all the rest
+    for statement in _executed(tree):
+        for node in _expressions(statement):
+            if not isinstance(node, ast.Call):
+                continue
+            function = getattr(node.func, "attr", getattr(node.func, "id", None))
+            given = [*node.args[:1], *(part.value for part in node.keywords if part.arg == "name")]
+            if function not in _CALLS or not given or not isinstance(given[0], ast.Constant):
+                continue
+            name = given[0].value
+            with suppress(ImportError):  # a relative name outside a package, which Python refuses
+                if type(name) is str and name:
+                    yield importlib.util.resolve_name(name, package), ""
+
+
+def _expressions(statement: ast.AST) -> Iterator[ast.AST]:
+    """Yield the expressions of a statement, without those of the statements in its blocks."""
+    waiting = [statement]
+    while waiting:
+        for node in ast.iter_child_nodes(waiting.pop()):
+            if not isinstance(node, ast.stmt | ast.ExceptHandler | ast.match_case):
+                waiting.append(node)
+                yield node
+
+
 _BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
 """The fields of statements that hold statements."""
 
@@ -238,6 +288,15 @@ def _home_of(base: str, name: str) -> str:
     if base == _FACE and name in pinnobs_gym.__all__:
         return getattr(getattr(pinnobs_gym, name), "__module__", base)
     return f"{base}.{name}" if name and _spec(f"{base}.{name}") else base
+
+
+def _file_of(name: str) -> str | None:
+    """Return the file of a module, loaded or not; None if there is none, as for a namespace."""
+    file = getattr(sys.modules.get(name), "__file__", None)
+    if file is not None:
+        return file
+    spec = _spec(name)
+    return None if spec is None else spec.origin
 
 
 def _spec(name: str) -> ModuleSpec | None:

@@ -27,7 +27,7 @@ from pinnobs_gym.scoring.provenance import (
     versions,
 )
 from pinnobs_gym.scoring.recency import LastUse
-from pinnobs_gym.scoring.rows import SCHEMA, Row
+from pinnobs_gym.scoring.row_format import NEEDED, SCHEMA, Row, check_names
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.simulation.conditions import canonical_name
@@ -77,8 +77,10 @@ class Results:
             stored = rows_module.load(self.path)
             last_use = LastUse.of([*stored.rows, *stored.uses])
         if not last_use.is_last(common):
-            used = {name: common[name] for name in rows_module.USE if name in common}
-            rows_module.append(self.path, [used | {"kind": "use", "date": now()}])
+            used = {name: common[name] for name in NEEDED["use"] if name in common}
+            rows_module.append(
+                self.path, [{"schema": SCHEMA} | used | {"kind": "use", "date": now()}]
+            )
 
 
 def evaluate(
@@ -189,6 +191,7 @@ def run_episodes(
     common = _common(estimator, game)
     if label is not None:
         common |= {"estimator": label, "settings": {}}  # the label stands for the settings
+    check_names(common)
     wanted = [{**common, "episode": rows_module.episode_of(seed)} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -93,8 +94,11 @@ def _unique() -> str:
 
 
 def canonical(value: Any) -> Any:
-    """Convert a value to JSON's types, equal values to equal results. Objects other than data are
-    converted to the name of their class or function."""
+    """Convert a value to JSON's types, equal values to equal results. Numbers that are not finite
+    are converted to texts such as ``inf``, and objects other than data to the name of their class
+    or function."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(float(value))
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray):
@@ -108,7 +112,7 @@ def canonical(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: canonical(getattr(value, f.name)) for f in fields(value) if f.repr}
     if isinstance(value, np.generic):
-        return value.item()
+        return canonical(value.item())
     return getattr(value, "__qualname__", type(value).__qualname__)
 
 

@@ -6,73 +6,25 @@ import gc
 import json
 import math
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import FileIO
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.scoring.present import Present, present_in
+from pinnobs_gym.scoring.row_format import KEY, OPTIONAL, SCHEMA, Row, checked
 
-SCHEMA = 5
-"""Version of the row format."""
-
-Row: TypeAlias = dict[str, Any]
-"""One scored episode (``kind`` is ``score``). Its keys:
-
-- ``schema``: version of this format.
-- ``env_id``, ``setup``, ``condition``, ``episode``: the episode; ``seed:12`` is that of seed 12.
-- ``game_hash``: hash of the code and settings that make and score the episode.
-- ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
-- ``free_over_known``, ``nominal_over_free``: how what the condition changes without estimators
-  being told enlarges steady errors (`pinnobs_gym.scoring.identifiability.Identifiability`); absent
-  where there is nothing of this kind.
-- ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
-  and its settings. One that was trained under the condition that is scored has a track of its own.
-- ``estimator_code``: hash of the estimator's code.
-- ``estimator_hash``: hash of its code, settings, model and training.
-- ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,
-  ...
-- the scores of `pinnobs_gym.scoring.metrics.score` by name; ``null`` stands for infinity.
-- ``state_rmse``: RMSE of each state in its unit, by window (``transient``, ``steady``) and name.
-- the scores of `pinnobs_gym.scoring.metrics.OPTIONAL_SCORES` that apply, in the same format; the
-  others are None here and absent from the file.
-- ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
-- ``batch``: the size of that batch.
-- ``versions``, ``date``: versions of the packages, and time of the run (UTC).
-
-Other rows are a job of a leaderboard that failed (``kind`` is ``failure``), or one that failed
-before and then succeeded (``recovery``). Their keys:
-
-- ``schema``, ``env_id``, ``setup``, ``condition``, ``estimator``, ``versions``, ``date``: as above.
-- ``episode``, ``episodes``: the first episode of the job, and the number of episodes.
-- ``job``: a hash of the job's full specification.
-- ``error``: the error in one line; for failures only.
-"""
-
-KEY = (
-    "env_id",
-    "setup",
-    "condition",
-    "game_hash",
-    "estimator",
-    "estimator_hash",
-    "training_seed",
-    "episode",
-)
-"""The fields that identify a scored row; they are unique in a file."""
-JOB = ("env_id", "setup", "condition", "estimator", "episode", "episodes", "job")
-"""The fields of a job in failures and recoveries."""
 TOLERANCE = 1e-6
-"""Largest relative difference between scores of the same episode from different machines."""
-
-OPTIONAL = (*OPTIONAL_SCORES, "free_over_known", "nominal_over_free")
-"""The numbers that may be absent."""
+"""Largest relative difference between numbers of the same episode from different machines."""
+_ASIDE = ("us_per_step", "batch", "versions", "date")
+"""The fields in which two rows of an episode may differ."""
+_ESTIMATES = frozenset((*SCORES, *OPTIONAL_SCORES, "state_rmse"))
+"""The fields with numbers that depend on the estimates."""
 _BEGINNING = b'{"schema": '
 """The beginning of every line."""
 
@@ -101,6 +53,8 @@ class Stored(NamedTuple):
     """The jobs that failed and have not succeeded since."""
     warning: str = ""
     """A warning about the file, or an empty string."""
+    uses: list[Row] = []
+    """The rows of kind ``use``, in the order of the file."""
 
 
 class CannotWrite(ValueError):
@@ -154,7 +108,7 @@ def _new(rows: Iterable[Row], present: Present) -> Iterator[Row]:
 
 def _replace(path: Path, file: FileIO, rows: Sequence[Row]) -> None:
     """Write a locked file anew: without the earlier rows of these episodes, and with these."""
-    keys = {key(row) for row in rows}
+    keys = {key(row) for row in rows if row["kind"] == "score"}
     file.seek(0)
     *lines, tail = file.readall().split(b"\n")
     lines += [] if _is_cut(tail) or not tail else [tail]
@@ -232,33 +186,36 @@ def load(path: Path) -> Stored:
             f"out, and what it held is run anew"
         )
     with _garbage_collection_paused():
-        rows, failed = _merged(path, lines)
-    return Stored(rows, failed, warning)
+        return _merged(path, lines)._replace(warning=warning)
 
 
-def _merged(path: Path, lines: list[bytes]) -> tuple[list[Row], list[Row]]:
-    """Return the scored episodes of the lines, each once, and the jobs that failed."""
+def _merged(path: Path, lines: list[bytes]) -> Stored:
+    """Return the content of the lines: each scored episode once, and the jobs that failed."""
     rows: dict[tuple[Any, ...], Row] = {}
     numbers: dict[tuple[Any, ...], int] = {}
     failures: dict[str, Row] = {}
-    parsed = _parsed_together(lines)
-    for number, line in enumerate(lines, 1):
-        row = _checked(path, number, line, _parsed(line) if parsed is None else parsed[number - 1])
-        if row["kind"] != "score":
+    uses: list[Row] = []
+    # Blank lines, as an editor or a concatenation leaves them, do not count.
+    kept = [(n, line) for n, line in enumerate(lines, 1) if line and not line.isspace()]
+    parsed = _parsed_together([line for _, line in kept])
+    for i, (number, line) in enumerate(kept):
+        row = checked(path, number, line, _parsed(line) if parsed is None else parsed[i])
+        if row["kind"] == "use":
+            uses.append(row)
+        elif row["kind"] != "score":
             known = failures.get(row["job"])
             if known is None or known["date"] <= row["date"]:  # concatenated files are in any order
                 failures[row["job"]] = row
-            continue
-        name = key(row)
-        if name not in rows:
+        elif (name := key(row)) not in rows:
             rows[name], numbers[name] = row, number
-        elif not _same(rows[name], row):
+        elif differing := _differing(rows[name], row):
             raise ValueError(
                 f"{path}, lines {numbers[name]} and {number}, give different scores of the same "
-                f"episode: {dict(zip(KEY, name, strict=True))}; delete one of them"
+                f"episode: {dict(zip(KEY, name, strict=True))} differs in {differing}; delete one "
+                "of them"
             )
     failed = [row for row in failures.values() if row["kind"] == "failure"]
-    return list(rows.values()), failed
+    return Stored(list(rows.values()), failed, uses=uses)
 
 
 @contextmanager
@@ -292,31 +249,57 @@ def load_all(paths: Iterable[Path]) -> Stored:
     """
     rows: dict[tuple[Any, ...], tuple[Path, Row]] = {}
     failures: dict[str, Row] = {}
-    warnings = []
+    warnings: list[str] = []
+    uses: list[Row] = []
     for path in paths:
         if not path.exists():
             raise ValueError(f"there is no rows file {path}")
         stored = load(path)
         failures |= {row["job"]: row for row in stored.failures}
         warnings += [stored.warning] if stored.warning else []
+        uses += stored.uses
         for row in stored.rows:
             first, earlier = rows.setdefault(key(row), (path, row))
-            if first != path and not _same(earlier, row):
+            if first != path and (differing := _differing(earlier, row)):
                 raise ValueError(
                     f"{first} and {path} give different scores of the same episode: "
-                    f"{dict(zip(KEY, key(row), strict=True))}; leave one of them out"
+                    f"{dict(zip(KEY, key(row), strict=True))} differs in {differing}; leave one of "
+                    "them out"
                 )
-    return Stored([row for _, row in rows.values()], list(failures.values()), "; ".join(warnings))
+    scored, failed = [row for _, row in rows.values()], list(failures.values())
+    return Stored(scored, failed, "; ".join(warnings), uses)
 
 
-def _same(row: Row, other: Row) -> bool:
-    """Return whether two rows of an episode agree up to rounding. Diverged episodes amplify
-    rounding without bound, so their scores are not compared."""
-    if row["diverged"] or other["diverged"]:
-        return row["diverged"] == other["diverged"]
-    return all(
-        math.isclose(row[name], other[name], rel_tol=TOLERANCE, abs_tol=1e-12) for name in SCORES
-    )
+def _differing(row: Row, other: Row) -> str:
+    """Return the first field in which two rows of an episode differ by more than rounding; an empty
+    string if they are the same. What depends on the machine and the time of the run is not
+    compared. Diverged episodes amplify rounding without bound, so the numbers that depend on their
+    estimates are not compared."""
+    if row == other:
+        return ""
+    for name in [n for n in (row | other) if n not in _ASIDE]:
+        one, two = row.get(name), other.get(name)
+        if name == "training":
+            one, two = ({n: v for n, v in t.items() if n != "seconds"} for t in (one, two))
+        rounding = math.inf if row["diverged"] and name in _ESTIMATES else TOLERANCE
+        if not _alike(one, two, rounding):
+            return name
+    return ""
+
+
+def _alike(value: Any, other: Any, rounding: float) -> bool:
+    """Return whether two values are equal, their numbers up to a relative rounding."""
+    if type(value) is dict and type(other) is dict:
+        return value.keys() == other.keys() and all(
+            _alike(part, other[name], rounding) for name, part in value.items()
+        )
+    if type(value) is list and type(other) is list:
+        return len(value) == len(other) and all(
+            _alike(*pair, rounding) for pair in zip(value, other, strict=True)
+        )
+    if type(value) in (int, float) and type(other) in (int, float):
+        return rounding == math.inf or math.isclose(value, other, rel_tol=rounding, abs_tol=1e-12)
+    return type(value) is type(other) and value == other
 
 
 def _line(row: Row) -> bytes:
@@ -339,139 +322,3 @@ def _parsed(line: bytes) -> Row | None:
     except (ValueError, RecursionError):  # not JSON, or not text, or nested without end
         return None
     return row if isinstance(row, dict) else None
-
-
-NEEDED = {
-    "score": frozenset(
-        (
-            *(*KEY, *SCORES, "diverged", "ranked", "nx", "estimator_code", "track", "knows"),
-            *("options", "training", "versions", "us_per_step", "date", "state_rmse"),
-        )
-    ),
-    "failure": frozenset((*JOB, "error", "date")),
-    "recovery": frozenset((*JOB, "date")),
-}
-"""The required fields of each kind of row."""
-
-
-_LONGEST_SHOWN = 60
-"""Largest number of characters that an error shows of a value."""
-
-
-def _is_text(value: object) -> bool:
-    return type(value) is str and len(value) <= 1000
-
-
-def _is_count(value: object) -> bool:
-    return type(value) is int and value >= 0
-
-
-def _is_seed(value: object) -> bool:
-    return value is None or _is_count(value)
-
-
-def _is_flag(value: object) -> bool:
-    return type(value) is bool
-
-
-def _is_object(value: object) -> bool:
-    return type(value) is dict
-
-
-def _is_episode(value: object) -> bool:
-    return type(value) is str and re.fullmatch(r"seed:(0|[1-9]\d{0,18})", value) is not None
-
-
-def _are_texts(value: object) -> bool:
-    return type(value) is list and all(map(_is_text, value))
-
-
-_TEXT = ("a text of at most 1000 characters", _is_text)
-_COUNT = ("a whole number of at least 0", _is_count)
-_FLAG = ("true or false", _is_flag)
-_OBJECT = ("an object", _is_object)
-_KINDS = {
-    **dict.fromkeys(("env_id", "setup", "condition", "estimator", "track", "date", "error"), _TEXT),
-    **dict.fromkeys(("game_hash", "estimator_code", "estimator_hash", "job"), _TEXT),
-    **dict.fromkeys(("episodes", "nx"), _COUNT),
-    "episode": ("seed: and a whole number of at least 0, such as seed:12", _is_episode),
-    **dict.fromkeys(("diverged", "ranked"), _FLAG),
-    **dict.fromkeys(("options", "training", "versions"), _OBJECT),
-    "training_seed": ("a whole number of at least 0, or null", _is_seed),
-    "state_rmse": ("an object of windows, each an object of states", _is_object),
-    "knows": ("a list of texts", _are_texts),
-}
-FIELDS = {
-    kind: [(name, *_KINDS[name]) for name in sorted(needed) if name in _KINDS]
-    for kind, needed in NEEDED.items()
-}
-"""The required fields of each kind of row that are no scores: what is expected, and whether a value
-fits."""
-
-
-def _checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
-    """Check that a row has this schema and restore its infinities."""
-    if row is None:
-        shown = line[:40].decode(errors="replace")
-        raise ValueError(
-            f"{path}, line {number}, is cut off or is not a row: {shown!r}...; delete that line "
-            f"and run again, and only what it held is run anew"
-        )
-    if row.get("schema") != SCHEMA:
-        raise ValueError(
-            f"{path}, line {number}: rows of schema {row.get('schema')!r}; expected {SCHEMA}: move "
-            f"the file away and run again"
-        )
-    kind = row.get("kind")
-    if kind not in NEEDED:
-        raise ValueError(
-            f"{path}, line {number}: a row of kind {kind!r}; expected {', '.join(NEEDED)}"
-        )
-    if not NEEDED[kind] <= row.keys():
-        missing = ", ".join(sorted(NEEDED[kind] - row.keys()))
-        raise ValueError(f"{path}, line {number}: a row without {missing}")
-    for name, expected, fits in FIELDS[kind]:
-        if not fits(row[name]):
-            raise ValueError(
-                f"{path}, line {number}: {name}={_shown(row[name])}; expected {expected}"
-            )
-    if kind == "score":
-        for name in (*SCORES, "us_per_step"):
-            row[name] = _score(path, number, name, row[name])
-        for name in OPTIONAL:
-            row[name] = _score(path, number, name, row[name]) if name in row else None
-        row["state_rmse"] = {
-            window: _states(path, number, window, states)
-            for window, states in row["state_rmse"].items()
-        }
-    return row
-
-
-def _states(path: Path, number: int, window: str, states: object) -> dict[str, float]:
-    """Return the errors of each state over a window."""
-    if type(states) is not dict:
-        raise ValueError(
-            f"{path}, line {number}: state_rmse.{window}={_shown(states)}; expected an object of "
-            "states"
-        )
-    return {n: _score(path, number, f"state_rmse.{window}.{n}", v) for n, v in states.items()}
-
-
-def _score(path: Path, number: int, name: str, value: object) -> float:
-    """Return a score, of which null stands for infinity."""
-    if value is None:
-        return math.inf
-    signed = name == "innovation_correlation"
-    if type(value) in (float, int) and (value >= 0 or (signed and value >= -1)):  # pyright: ignore
-        return float(value)  # pyright: ignore[reportArgumentType]
-    least = "-1" if signed else "0"
-    raise ValueError(
-        f"{path}, line {number}: {name}={_shown(value)}; expected a number of at least {least}, or "
-        "null for infinity"
-    )
-
-
-def _shown(value: object) -> str:
-    """Return the beginning of what JSON shows of a value."""
-    text = json.dumps(value)
-    return text if len(text) <= _LONGEST_SHOWN else text[: _LONGEST_SHOWN - 3] + "..."

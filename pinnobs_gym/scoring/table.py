@@ -13,15 +13,15 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class Rows(list[Row]):
-    """Scored episodes, each a dict; see `pinnobs_gym.scoring.rows.Row` for its keys."""
+    """Scored episodes, each a dict; see `pinnobs_gym.scoring.row_format.Row` for its keys."""
 
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with a line per episode and a column per key.
 
         An episode that is in the list twice counts once. Infinite scores are ``inf``, and scores
         that do not apply NaN. ``state_rmse`` has a column for each window and state, such as
-        ``state_rmse.steady.x1``. ``options``, ``training``, ``versions`` and ``knows`` are columns
-        of Python objects.
+        ``state_rmse.steady.x1``. ``options``, ``settings``, ``training``, ``versions`` and
+        ``knows`` are columns of Python objects.
 
         Raises:
             ImportError: in one line, if pandas is not installed.

@@ -81,6 +81,7 @@ def _rows(
         "track": "offline" if number % 5 == 4 else "online",
         "knows": ["model", "prior", "noise"],
         "options": {"process_noise": 1e-4, "gate": None},
+        "settings": {},
         "game_hash": "0" * 12,
         "estimator_code": f"{number:012x}",
         "estimator_hash": f"{number:012x}",

@@ -24,7 +24,7 @@ from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.scoring import rows
-from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.scoring.metrics import DIVERGED, OPTIONAL_SCORES, SCORES
 from pinnobs_gym.systems import SYSTEMS
 
 JOBS = 2000
@@ -69,6 +69,7 @@ def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
             "track": estimator.track,
             "knows": list(estimator.knows),
             "options": {},
+            "settings": {},
             "game_hash": "0" * 12,
             "estimator_code": name,
             "estimator_hash": f"{abs(hash((name, cls.__name__))):012x}"[:12],
@@ -83,11 +84,16 @@ def synthetic_rows(count: int, seed: int = 0) -> list[rows.Row]:
             score = float(level * rng.lognormal(0, 0.4))
             row = base | dict.fromkeys(SCORES, score) | dict.fromkeys(OPTIONAL_SCORES)
             row |= {"nrmse_steady": score / 10, "nrmse_steady_modulo": score / 10, "settling": 1.0}
+            row |= {"nrmse_tail": score / 10}
             row |= {"state_rmse": {}, "free_over_known": None, "nominal_over_free": None}
             row |= {"anees": 1.0, "coverage": 0.9, "reference_steady": 0.03}
             made.append(
                 row
-                | {"diverged": score > 2, "episode": f"seed:{episode}", "us_per_step": float(level)}
+                | {
+                    "diverged": score / 10 > DIVERGED,
+                    "episode": f"seed:{episode}",
+                    "us_per_step": float(level),
+                }
             )
         if len(made) == count:
             return made

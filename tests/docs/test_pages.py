@@ -16,7 +16,7 @@ from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
-from pinnobs_gym.scoring.rows import JOB, KEY
+from pinnobs_gym.scoring.row_format import JOB, KEY
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems import SYSTEMS

@@ -12,6 +12,7 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
             "ranked": True,
             "nx": 2,
             "options": {},
+            "settings": {},
             "training_seed": None,
             "env_id": "pinnobs/X-v0",
             "setup": "benchmark",

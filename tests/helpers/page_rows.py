@@ -10,7 +10,7 @@ def row(seed=0, **changes):
     base = dict.fromkeys(SCORES, 0.1) | dict.fromkeys(OPTIONAL_SCORES)
     facts = {"env_id": "pinnobs/A-v0", "setup": "benchmark", "condition": "nominal"}
     facts |= {"ranked": True, "nx": 2, "estimator": "ekf", "track": "online", "knows": ["model"]}
-    facts |= {"options": {}, "training": {}, "training_seed": None}
+    facts |= {"options": {}, "settings": {}, "training": {}, "training_seed": None}
     facts |= {"game_hash": "g", "estimator_code": "c", "estimator_hash": "h"}
     facts |= {"us_per_step": 1.0, "date": "2030-01-02T00:00:00", "versions": {"numpy": "2"}}
     return (

@@ -2,11 +2,13 @@
 
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.metrics import SCORES
+from pinnobs_gym.scoring.row_format import KEY, SCHEMA
 
 
 def row(seed=0, **changes):
-    scores = dict.fromkeys(SCORES, 0.5)
-    names = dict.fromkeys(rows.KEY, "x")
+    tail = float("inf") if changes.get("diverged") else 0.1
+    scores = {**dict.fromkeys(SCORES, 0.5), "nrmse_tail": tail}
+    names = dict.fromkeys(KEY, "x")
     facts = {
         "diverged": False,
         "episode": f"seed:{seed}",
@@ -15,8 +17,9 @@ def row(seed=0, **changes):
         "nx": 2,
     }
     facts |= {"estimator_code": "x", "date": "2030-01-02", "training_seed": None, "track": "online"}
-    facts |= {"knows": ["model"], "options": {}, "training": {}, "versions": {}, "us_per_step": 1.0}
-    base = {"schema": rows.SCHEMA, "kind": "score", **names, **scores, **facts}
+    facts |= {"knows": ["model"], "options": {}, "settings": {}, "training": {}, "versions": {}}
+    facts |= {"us_per_step": 1.0}
+    base = {"schema": SCHEMA, "kind": "score", **names, **scores, **facts}
     return {**base, **changes}
 
 

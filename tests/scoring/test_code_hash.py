@@ -47,13 +47,13 @@ def hash_of(tmp_path, monkeypatch):
     def write(files):
         for name, text in files.items():
             path = tmp_path / f"{name}.py"
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
             os.utime(path, (next(times),) * 2)  # as if some time after the last
         for name in set(sys.modules) - before:
             del sys.modules[name]
         importlib.invalidate_caches()
-        first = next(iter(files))
+        first = next(iter(files)).replace("/", ".")
         return code_hash(importlib.import_module(first).Thing)
 
     yield write
@@ -104,6 +104,73 @@ def test_what_is_imported_counts_too(hash_of, imports, helper):
     assert hash_of(files) == before
     assert hash_of({**files, "unrelated": "K = 2"}) == before
     assert hash_of({**files, helper: "K = 2"}) != before
+
+
+PACKAGE = {
+    "my_pkg/est": text(imports="my_pkg.sub.util", inner="return my_pkg.GAIN"),
+    "my_pkg/__init__": "from my_pkg.names import GAIN",
+    "my_pkg/names": "GAIN = 1",
+    "my_pkg/sub/__init__": "K = 1",
+    "my_pkg/sub/util": "K = 1",
+    "my_pkg/other": "K = 1",
+    "my_pkg/elsewhere/__init__": "K = 1",
+}
+
+
+@pytest.mark.parametrize(
+    ("file", "counts"),
+    [
+        ("my_pkg/names", True),
+        ("my_pkg/__init__", True),
+        ("my_pkg/sub/__init__", True),
+        ("my_pkg/other", False),
+        ("my_pkg/elsewhere/__init__", False),
+    ],
+)
+def test_packages_around_a_module_count_as_python_runs_them(hash_of, file, counts):
+    before = hash_of(PACKAGE)
+    assert (hash_of({**PACKAGE, file: PACKAGE[file] + "\nMORE = 2"}) != before) == counts
+
+
+def test_the_packages_of_the_class_itself_count(hash_of):
+    """Its module imports nothing of them."""
+    files = {"my_pkg/sub/est": text(), "my_pkg/__init__": "", "my_pkg/sub/__init__": ""}
+    hashes = {hash_of(files)}
+    for package in ("my_pkg/__init__", "my_pkg/sub/__init__"):
+        hashes.add(hash_of({**files, package: "import numpy\n\nnumpy.seterr(all='raise')"}))
+    assert len(hashes) == 3
+
+
+def test_packages_without_a_file_of_their_own_have_no_code(hash_of):
+    files = {"my_space/est": text(imports="my_space.part"), "my_space/part": "K = 1"}
+    before = hash_of(files)
+    assert hash_of({**files, "my_space/part": "K = 2"}) != before
+
+
+@pytest.mark.parametrize(
+    ("call", "counts"),
+    [
+        ("importlib.import_module('a_helper')", True),
+        ("K = [import_module('a_helper').K for _ in range(3)]", True),
+        ("return __import__('a_helper').K", True),
+        ("importlib.import_module(name='a_helper')", True),
+        ("importlib.import_module('.a_helper', __package__)", False),  # it is in no package
+        ("importlib.import_module('a_' + 'helper')", False),
+        ("importlib.reload('a_helper')", False),
+        ("if TYPE_CHECKING:\n            __import__('a_helper')", False),
+    ],
+)
+def test_imports_by_a_constant_name_count(hash_of, call, counts):
+    files = {"first_thing": text(inner=call), "a_helper": "K = 1"}
+    before = hash_of(files)
+    assert (hash_of({**files, "a_helper": "K = 2"}) != before) == counts
+
+
+def test_imports_by_a_relative_name_count(hash_of):
+    call = "importlib.import_module('.part', __package__)"
+    files = {"my_pkg/est": text(inner=call), "my_pkg/__init__": "", "my_pkg/part": "K = 1"}
+    before = hash_of(files)
+    assert hash_of({**files, "my_pkg/part": "K = 2"}) != before
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
 import json
 import multiprocessing
+import re
 import resource
 import signal
 
 import pytest
 from stored_rows import row, write_fifty
 
-from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring import row_format, rows
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
 
@@ -38,7 +39,7 @@ def test_the_game_of_a_row_and_of_a_failure():
     game = rows.game_of(row(0) | {"env_id": "pinnobs/X-v0", "setup": "paper", "condition": "delay"})
     assert game == ("pinnobs/X-v0", "paper", "delay")
     assert (game.env_id, game.system) == ("pinnobs/X-v0", "X-v0")
-    assert rows.game_of(dict(zip(rows.JOB, "abcdefg", strict=True))) == ("a", "b", "c")
+    assert rows.game_of(dict(zip(row_format.JOB, "abcdefg", strict=True))) == ("a", "b", "c")
 
 
 def test_optional_scores_are_absent_infinite_or_a_number(tmp_path):
@@ -82,7 +83,7 @@ def test_every_beginning_of_a_line_is_a_half_line(tmp_path):
     line = path.read_bytes()[:-1]
     for length in (*range(1, 16), *range(16, len(line), 25), len(line) - 1):
         path.write_bytes(line[:length])
-        assert rows.load(path) == ([], [], rows.load(path).warning)
+        assert rows.load(path) == ([], [], rows.load(path).warning, [])
         rows.append(path, [row(1)])
         assert [rows.seed_of(r) for r in rows.read(path)] == [1]
 
@@ -110,10 +111,10 @@ def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
 
 
 def event(kind="failure", day=1, job="a", **changes):
-    names = dict.fromkeys(rows.JOB, "x") | {"episode": "seed:0", "episodes": 1}
+    names = dict.fromkeys(row_format.JOB, "x") | {"episode": "seed:0", "episodes": 1}
     names |= {"job": job, "date": f"2026-01-{day:02d}"}
     error = {"error": "out of luck"} if kind == "failure" else {}
-    return {"schema": rows.SCHEMA, "kind": kind, **names, **error, **changes}
+    return {"schema": row_format.SCHEMA, "kind": kind, **names, **error, **changes}
 
 
 def test_failures_are_kept_apart_until_the_job_goes_well(tmp_path):
@@ -127,7 +128,7 @@ def test_failures_are_kept_apart_until_the_job_goes_well(tmp_path):
     rows.append(path, [event(day=3)])
     assert [r["job"] for r in rows.load(path).failures] == ["a", "b"]
     rows.append(path, [event("dance")])
-    with pytest.raises(ValueError, match="line 7: a row of kind 'dance'; expected score"):
+    with pytest.raises(ValueError, match='line 7: a row of kind "dance"; expected score'):
         rows.load(path)
 
 
@@ -157,7 +158,7 @@ def test_another_schema_and_missing_fields_are_refused(tmp_path):
 
 def test_equal_duplicates_count_once_and_contradictory_ones_are_an_error(tmp_path):
     path = tmp_path / "rows.jsonl"
-    concatenate(path, [row(0), row(0), row(0, nrmse=0.5 * (1 + 1e-9), date="later")])
+    concatenate(path, [row(0), row(0), row(0, nrmse=0.5 * (1 + 1e-9), date="2031-01-02")])
     assert len(rows.read(path)) == 1
     lost = {"diverged": True}
     concatenate(path, [row(1, **lost, nrmse=1e30), row(1, **lost, nrmse=float("inf"))])
@@ -165,6 +166,112 @@ def test_equal_duplicates_count_once_and_contradictory_ones_are_an_error(tmp_pat
     concatenate(path, [row(0, nrmse=0.5001)])
     with pytest.raises(ValueError, match="lines 1 and 6, give different scores"):
         rows.read(path)
+
+
+SAME = {
+    "another cost": {"us_per_step": 2.0, "batch": 7},
+    "another machine": {"versions": {"python": "4"}, "date": "2031-01-02T03:04:05.678+00:00"},
+    "another time of training": {"training": {"seconds": 9.0, "config": {"width": 8}}},
+    "rounding": {"anees": 1.5 + 1e-9, "state_rmse": {"steady": {"x1": 0.25 + 1e-9}}},
+}
+OTHER = {
+    "state_rmse": {"steady": {"x1": 0.26}},
+    "anees": 1.6,
+    "coverage": 0.5,
+    "reference_steady": 0.1,
+    "knows": ["model", "noise"],
+    "ranked": False,
+    "nx": 3,
+    "track": "offline",
+    "estimator_code": "y",
+    "options": {"window": 6},
+    "settings": {"window": 6},
+    "training": {"seconds": 1.0, "config": {"width": 9}},
+    "free_over_known": 2.0,
+    "a field of later": 1,
+}
+WHOLE = {
+    "anees": 1.5,
+    "state_rmse": {"steady": {"x1": 0.25}},
+    "training": {"seconds": 1.0, "config": {"width": 8}},
+    "options": {"window": 5},
+}
+
+
+@pytest.mark.parametrize("changes", SAME.values(), ids=SAME)
+def test_what_depends_on_machine_and_time_is_no_contradiction(tmp_path, changes):
+    path = tmp_path / "rows.jsonl"
+    concatenate(path, [row(0, **WHOLE), row(0, **WHOLE | changes)])
+    assert len(rows.read(path)) == 1
+
+
+@pytest.mark.parametrize("name", OTHER)
+@pytest.mark.parametrize("turned", [False, True])
+def test_rows_of_one_episode_that_differ_in_any_other_field_are_an_error(tmp_path, name, turned):
+    both = [row(0, **WHOLE), row(0, **WHOLE | {name: OTHER[name]})]
+    files = [tmp_path / "a.jsonl", tmp_path / "b.jsonl"]
+    for path, one in zip(files, both[::-1] if turned else both, strict=True):
+        concatenate(path, [one])
+    with pytest.raises(ValueError, match=f"different scores of the same .* differs in {name};"):
+        rows.load_all(files)
+    files[0].write_bytes(b"".join(path.read_bytes() for path in files))
+    with pytest.raises(ValueError, match=f"lines 1 and 2, give .* differs in {name}; delete"):
+        rows.load(files[0])
+
+
+def test_numbers_of_the_estimates_of_diverged_episodes_are_not_compared(tmp_path):
+    lost = {"diverged": True, "anees": 1.0, "state_rmse": {"steady": {"x1": 1e9}}, "nx": 2}
+    changes = {"anees": 2.0, "state_rmse": {"steady": {"x1": None}}, "nrmse": 3.0}
+    path = tmp_path / "rows.jsonl"
+    concatenate(path, [row(0, **lost), row(0, **lost | changes)])
+    assert len(rows.read(path)) == 1
+    for name, value in {"nx": 3, "knows": [], "state_rmse": {}, "track": "offline"}.items():
+        path.unlink()
+        concatenate(path, [row(0, **lost), row(0, **lost | {name: value})])
+        with pytest.raises(ValueError, match=f"differs in {name};"):
+            rows.load(path)
+
+
+@pytest.mark.parametrize("blank", [b"", b"   ", b"\t", b"\r"])
+def test_blank_lines_are_skipped(tmp_path, blank):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0), row(1)])
+    first, second = path.read_bytes().splitlines()
+    path.write_bytes(b"\n".join([blank, first, blank, blank, second, blank, blank]))
+    stored = rows.load(path)
+    assert [rows.seed_of(r) for r in stored.rows] == [0, 1]
+    assert stored.warning == ""
+    rows.append(path, [row(1), row(2)])
+    assert [rows.seed_of(r) for r in rows.read(path)] == [0, 1, 2]
+    path.write_bytes(path.read_bytes().replace(b'"nx": 2', b'"nx": 0', 1))
+    with pytest.raises(ValueError, match="line 2: nx=0; expected"):  # blank lines are counted
+        rows.load(path)
+
+
+def use(day=1, **changes):
+    names = ("env_id", "setup", "condition", "game_hash", "estimator", "estimator_hash")
+    known = {"schema": row_format.SCHEMA, "kind": "use", **dict.fromkeys(names, "x")}
+    return {**known, "date": f"2026-01-{day:02d}", **changes}
+
+
+def test_uses_are_kept_apart_from_scores_and_failures(tmp_path):
+    here, there = tmp_path / "here.jsonl", tmp_path / "there.jsonl"
+    rows.append(here, [use(1), row(0), event()])
+    rows.append(here, [row(0), use(1)])
+    rows.append(there, [use(2), row(1)])
+    stored = rows.load(here)
+    assert stored.uses == [use(1), use(1)]
+    assert (len(stored.rows), len(stored.failures)) == (1, 1)
+    both = rows.load_all([here, there])
+    assert both.uses == [use(1), use(1), use(2)]
+    assert len(both.rows) == 2
+    rows.append(here, [row(0, nrmse=0.7), use(3)], replace=True)
+    assert [r["date"] for r in rows.load(here).uses] == ["2026-01-01", "2026-01-01", "2026-01-03"]
+    incomplete = use()
+    del incomplete["estimator_hash"]
+    rows.append(there, [incomplete])
+    with pytest.raises(ValueError, match="line 3: a row without estimator_hash"):
+        rows.load(there)
 
 
 def seeds_in(path):
@@ -274,16 +381,26 @@ WRONG = {
     "anees": ("-0.5", "[]"),
     "innovation_correlation": ("-1.5", '"a"'),
     "episode": ("-1", "1", "true", "null", '"1"', '"seed:-1"', '"seed:01"', '"seed:1.5"'),
-    "nx": ("-1", '"2"'),
+    "nx": ("-1", '"2"', "0", f"1{'0' * 30}", "2.0"),
+    "nrmse_tail": ("9", "null", "NaN", "0.2001"),
+    "mse": ("Infinity", "-Infinity", "1e999", f"1{'0' * 400}"),
+    "coverage": ("1.01", "null", "-0.1"),
     "training_seed": ("-1", "1.5", '"a"'),
     "diverged": ("1", "null", '"no"'),
     "ranked": ("0",),
-    "estimator": ("1", "null", "[]", json.dumps("a" * 1001)),
-    "env_id": ("null", "{}"),
+    "estimator": ("1", "null", "[]", json.dumps("a" * 1001), '""', '" ekf"', '"ekf\\n"'),
+    "env_id": ("null", "{}", '""'),
+    "setup": ('" "',),
+    "condition": ('"nominal "',),
+    "track": ('""', '"\\tonline"'),
     "game_hash": ("null",),
-    "date": ("3",),
+    "date": (
+        *("3", '""', '"later"', '"2030-13-02"', '"2030-02-30"', '"2030-1-2"', '"20300102"'),
+        *('"2030-01-02 03:04"', '"2030-01-02T25:00:00"', '"2030-01-02T03:04:05+02:00"'),
+    ),
     "knows": ('"model"', "[1]"),
     "options": ("[]", "null"),
+    "settings": ("[]", "null", "1"),
     "training": ("[]",),
     "versions": ("1",),
     "nominal_over_free": ("-1",),
@@ -303,6 +420,83 @@ def test_a_wrong_value_is_named_with_its_file_line_and_field(tmp_path, name, val
     assert len(str(caught.value)) < 300
 
 
+NESTED = {
+    "training.config": ({"training": {"config": 3}}, {"training": {"config": None}}),
+    "training.config.budget": tuple(
+        {"training": {"config": {"budget": budget}}} for budget in (0, -1, "9", True, [], 10**400)
+    ),
+    "training.seconds": tuple({"training": {"seconds": s}} for s in (-1, None, "1", True, {})),
+    "training.iterations": ({"training": {"iterations": -1}}, {"training": {"iterations": "3"}}),
+    "training.loss": ({"training": {"loss": float("nan")}},),
+    "options.gate": tuple({"options": {"gate": [1, g]}} for g in (float("inf"), -float("inf"))),
+    "settings.a.b": ({"settings": {"a": {"b": float("nan")}}},),
+    "state_rmse.steady": ({"state_rmse": {"steady": 1}},),
+    "state_rmse.steady.x1": tuple({"state_rmse": {"steady": {"x1": v}}} for v in (-1, "a")),
+}
+
+
+@pytest.mark.parametrize(("place", "changes"), [(n, v) for n, vs in NESTED.items() for v in vs])
+def test_a_wrong_value_in_an_object_is_named_with_its_place(tmp_path, place, changes):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(f"{json.dumps(row(0))}\n{json.dumps(row(1) | changes)}\n")
+    with pytest.raises(ValueError, match=rf"line 2: {re.escape(place)}=.*; expected ") as caught:
+        rows.load(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_trainings_that_can_be_are_read(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    trainings = [
+        {"config": {"budget": 45.0}, "seconds": 0, "iterations": 12},
+        {"config": {"budget": None}, "seconds": 1.5},
+        {"config": {}, "knows": ["inputs"]},
+    ]
+    rows.append(path, [row(i, training=one) for i, one in enumerate(trainings)])
+    assert [r["training"] for r in rows.read(path)] == trainings
+
+
+@pytest.mark.parametrize("tail", [0.2, 0.2001])
+@pytest.mark.parametrize("diverged", [False, True])
+def test_what_diverged_is_what_its_last_quarter_says(tmp_path, tail, diverged):
+    """The limit itself does not count as diverged (`metrics.DIVERGED`)."""
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0, diverged=diverged, nrmse_tail=tail)])
+    if diverged == (tail > 0.2):
+        assert rows.read(path)[0]["nrmse_tail"] == tail
+    else:
+        with pytest.raises(ValueError, match=rf"nrmse_tail={tail}; expected .*{str(diverged)[1:]}"):
+            rows.read(path)
+
+
+@pytest.mark.parametrize("name", ["schema", "kind"])
+@pytest.mark.parametrize("value", [[], {}, None, True, "a" * 2000, ["a" * 2000], float("nan")])
+def test_a_wrong_schema_or_kind_is_one_short_line(tmp_path, name, value):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(json.dumps(row(0) | {name: value}) + "\n")
+    with pytest.raises(ValueError, match=rf"rows.jsonl, line 1: .*{name} .*; expected ") as caught:
+        rows.load(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_names_of_fields_are_shown_on_one_line_and_shortened(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    states = {"steady": {"x\n" * 1000: -1}}
+    path.write_text(json.dumps(row(0, state_rmse=states)) + "\n")
+    with pytest.raises(ValueError, match=r"line 1: state_rmse\.steady\..*=-1; expected") as caught:
+        rows.load(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_infinite_errors_of_states_are_written_as_null(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0, diverged=True, state_rmse={"steady": {"x1": float("inf")}})])
+    assert "Infinity" not in path.read_text()
+    assert rows.read(path)[0]["state_rmse"] == {"steady": {"x1": float("inf")}}
+
+
 def test_endless_nesting_is_no_row(tmp_path):
     path = tmp_path / "rows.jsonl"
     path.write_text(f"{json.dumps(row(0))}\n{'[' * 10**5}\n{json.dumps(row(1))}\n")
@@ -312,6 +506,6 @@ def test_endless_nesting_is_no_row(tmp_path):
 
 def test_every_required_field_is_checked():
     scores = {*SCORES, "us_per_step"}
-    for kind, needed in rows.NEEDED.items():
-        checked = {name for name, *_ in rows.FIELDS[kind]}
+    for kind, needed in row_format.NEEDED.items():
+        checked = {name for name, *_ in row_format.FIELDS[kind]}
         assert needed - checked - scores == set(), kind
