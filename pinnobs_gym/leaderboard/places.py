@@ -17,7 +17,8 @@ from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 PEER = "ukf"
 """The estimator with which all others are compared, if it played."""
 FEWEST = 50
-"""Fewest episodes of a game that are ranked under a condition other than nominal."""
+"""Fewest episodes of a game that are ranked under a condition other than nominal and that which
+the system is ranked under."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,8 @@ def places(contenders: Iterable[Contender]) -> Places:
     """Compare contenders over all of their games whose states are identifiable.
 
     Ranks are those of `tie_groups` within a track. Ranked are those that played every episode that
-    the peer played, in every training; under conditions other than nominal there must be `FEWEST`
-    episodes.
+    the peer played, in every training; under conditions other than nominal and that which the
+    system is ranked under there must be `FEWEST` episodes.
     """
     players = list(contenders)
     games = dict.fromkeys(game for player in players for game in player.games)
@@ -88,7 +89,9 @@ def places(contenders: Iterable[Contender]) -> Places:
         ranks: dict[str, int] = {}
         for track in dict.fromkeys(contender.track for contender in found):
             whole = [c.name for c in found if c.track == track and _complete(c, peer)]
-            ranks |= ranks_of(tie_groups({name: results[name] for name in whole}))
+            # Without an episode that all trainings of the peer played there are no results.
+            ranked = {name: results[name] for name in whole if results[name]}
+            ranks |= ranks_of(tie_groups(ranked))
         windows[window] = {
             name: Place(_interval(score(own)).exp, ranks.get(name))
             for name, own in results.items()
@@ -135,18 +138,22 @@ def _complete(contender: Contender, peer: Contender) -> bool:
 
 
 def _too_few(peer: Contender) -> bool:
-    """Return whether a game under a condition other than nominal has too few episodes."""
+    """Return whether a game under another condition than nominal and that which its system is
+    ranked under has too few episodes."""
     return any(
-        game.condition != "nominal" and len(peer.errors[game].episodes) < FEWEST
+        len(peer.errors[game].episodes) < FEWEST
         for game in _comparable(peer)
+        if game.condition != "nominal" and not peer.games[game][0].ranked
     )
 
 
 def _interval(estimate: Estimate) -> Interval:
-    """Return an estimate with its 95 % interval."""
-    if estimate.standard_error == 0:
-        return Interval(estimate.value, estimate.value, estimate.value)
-    if not np.isfinite(estimate.standard_error):
+    """Return an estimate with its 95 % interval, which is unbounded where no test could tell the
+    value from another at this level, and the value alone if it is zero and never varies, as that
+    of the peer."""
+    if estimate.standard_error == 0 and estimate.value == 0:
+        return Interval(0.0, 0.0, 0.0)
+    if not np.isfinite(estimate.standard_error) or estimate.least_p > 1 - CONFIDENCE:
         return Interval(estimate.value, -np.inf, np.inf)
     from scipy.special import stdtrit  # scipy.stats takes long to import
 
