@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.comparison import Estimate, score
+from pinnobs_gym.leaderboard.comparison import ROUNDING, Estimate, score
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender
 from pinnobs_gym.leaderboard.influence import Results
 from pinnobs_gym.leaderboard.intervals import CONFIDENCE, Interval
@@ -19,6 +19,9 @@ PEER = "ukf"
 FEWEST = 50
 """Fewest episodes of a game that are ranked under a condition other than nominal and that which
 the system is ranked under."""
+
+ITSELF = Interval(1.0, 1.0, 1.0)
+"""The factor of the peer."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ def places(contenders: Iterable[Contender]) -> Places:
             ranked = {name: results[name] for name in whole if results[name]}
             ranks |= ranks_of(tie_groups(ranked))
         windows[window] = {
-            name: Place(_interval(score(own)).exp, ranks.get(name))
+            name: Place(ITSELF if name == peer.name else _factor(own), ranks.get(name))
             for name, own in results.items()
             if own
         }
@@ -147,14 +150,23 @@ def _too_few(peer: Contender) -> bool:
     )
 
 
+def _factor(results: Mapping[str, Results]) -> Interval:
+    """Return the geometric mean over games of the errors over the peer's, with its 95 % interval:
+    from 0 to infinity where no difference could be significant at this level (`p_value`), so that
+    it does not contradict the ranks; none if all errors are the peer's."""
+    estimate = score(results)
+    if estimate.standard_error <= ROUNDING and abs(estimate.value) <= ROUNDING:
+        return ITSELF
+    return _interval(estimate).exp
+
+
 def _interval(estimate: Estimate) -> Interval:
-    """Return an estimate with its 95 % interval, which is unbounded where no test could tell the
-    value from another at this level, and the value alone if it is zero and never varies, as that
-    of the peer."""
-    if estimate.standard_error == 0 and estimate.value == 0:
-        return Interval(0.0, 0.0, 0.0)
+    """Return an estimate with its 95 % interval, which may be unbounded or, where nothing but
+    rounding varies, empty."""
     if not np.isfinite(estimate.standard_error) or estimate.least_p > 1 - CONFIDENCE:
         return Interval(estimate.value, -np.inf, np.inf)
+    if estimate.standard_error <= ROUNDING:
+        return Interval(estimate.value, estimate.value, estimate.value)
     from scipy.special import stdtrit  # scipy.stats takes long to import
 
     half = float(stdtrit(estimate.degrees, (1 + CONFIDENCE) / 2)) * estimate.standard_error
