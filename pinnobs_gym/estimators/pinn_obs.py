@@ -239,7 +239,10 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
         """
         known, given = (1, *self.trained.y.shape), record.y.shape
         if given != known:
-            raise ValueError(f"y has shape {given}; this PINN-Obs was trained on one of {known}")
+            raise ValueError(
+                f"y has shape {given}; expected {known}: this PINN-Obs serves only the record that "
+                "it was trained on"
+            )
         for name, known, given in (
             ("t", self.trained.t, record.t),
             ("y", self.trained.y, record.y),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pinnobs_gym.leaderboard import ranks
-from pinnobs_gym.leaderboard.contenders import Contender, contenders
+from pinnobs_gym.leaderboard.contenders import Contender, among, contenders
 from pinnobs_gym.leaderboard.distinct import distinct
 from pinnobs_gym.leaderboard.places import Places
 from pinnobs_gym.leaderboard.ranks import Line
@@ -20,6 +21,10 @@ class Part:
     """Tables of estimators that can be compared with each other."""
 
     contenders: tuple[Contender, ...]
+    setup: str
+    """The setup of all that is across systems; empty without scores."""
+    compared: tuple[Contender, ...]
+    """The contenders restricted to the games of this setup."""
     tables: tuple[Table, ...]
     """One table per game, with failed jobs in its note."""
     lines: tuple[Line, ...]
@@ -27,7 +32,7 @@ class Part:
     places: Places
     """The places of the overview."""
     conditions: Mapping[str, Places]
-    """Places of online estimators under each condition, over all systems."""
+    """Places of online estimators under each condition, over all systems of the setup."""
 
     @property
     def knows(self) -> dict[str, tuple[str, ...]]:
@@ -36,6 +41,18 @@ class Part:
             each.name: max((tuple(run.rows[0]["knows"]) for run in each.runs), key=len)
             for each in self.contenders
         }
+
+    @property
+    def note(self) -> str:
+        """A sentence about the setups that are in the tables of their games only; possibly
+        empty."""
+        others = sorted({table.game.setup for table in self.tables if table.entries} - {self.setup})
+        if not others:
+            return ""
+        return (
+            f"The overview and the ranks are of the setup {self.setup}; in the tables of their "
+            f"games only: {', '.join(others)}."
+        )
 
 
 @dataclass(frozen=True)
@@ -61,17 +78,35 @@ def board(stored: Stored) -> Board:
     kept, notes = distinct(stored.rows, stored.uses)
     made_before, on_record = apart(runs_of(kept))
     main = _part(made_before, stored.failures)
-    return Board(main, _part(on_record, ()) if on_record else None, notes)
+    second = _part(on_record, ()) if on_record else None
+    own = [main.note] if main.note else []
+    if second is not None and second.note:
+        own.append(f"Trained on each record: {second.note}")
+    return Board(main, second, (*notes, *own))
 
 
 def _part(runs: Sequence[ScoredRun], failures: Sequence[Row]) -> Part:
     """Compute the tables of runs that can be compared."""
-    compared = contenders(runs)
+    found, setup = contenders(runs), _setup(runs)
+    compared = among(found, lambda run: run.game.setup == setup)
     lines, places = ranks.lines(compared)
     return Part(
-        contenders=tuple(compared),
-        tables=tuple(tables(compared, failures)),
+        contenders=tuple(found),
+        setup=setup,
+        compared=tuple(compared),
+        tables=tuple(tables(found, failures)),
         lines=tuple(lines),
         places=places,
         conditions=ranks.by_condition(compared),
     )
+
+
+def _setup(runs: Sequence[ScoredRun]) -> str:
+    """Return the setup over which systems are compared: ``benchmark`` if it was played, or else
+    that with the most rows; the games of several setups of one system are not as many systems."""
+    played: Counter[str] = Counter()
+    for run in runs:
+        played[run.game.setup] += len(run.rows)
+    if "benchmark" in played:
+        return "benchmark"
+    return max(played, key=lambda setup: played[setup], default="")

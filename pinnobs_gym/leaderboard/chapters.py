@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 from pinnobs_gym.leaderboard import ranks_table, standings_table
 from pinnobs_gym.leaderboard.board import Board, Part
+from pinnobs_gym.leaderboard.display import filled
 from pinnobs_gym.leaderboard.escapes import markdown_text
-from pinnobs_gym.leaderboard.grid import Layouts
+from pinnobs_gym.leaderboard.grid import PROSE, Layouts, fitting
 from pinnobs_gym.leaderboard.tables import Table
 
 ON_RECORD = (
     "Estimators that are trained on each record by itself, and all others on the same episodes. A "
-    "training serves one record only, so that these are not ranked with the others above."
+    "training serves one record only, so that these have tables and ranks of their own."
 )
 """Explanation of the second part."""
 
@@ -25,9 +26,22 @@ class Chapter:
     """``overview``, ``ranks`` or ``games``; of the second part with ``on-record `` before it."""
     title: str
     note: str
+    """The explanation, in Markdown."""
     tables: tuple[Layouts, ...]
     games: tuple[Table, ...] = ()
     """The games of the tables, if each is of one game."""
+
+    def text(self, width: int | None = None, hint: str = "") -> str:
+        """Return the tables as plain text, with the explanation below them; see `Grid.text`."""
+        parts = [grid.text(width, hint) for each in self.tables for grid in fitting(each, width)]
+        parts.append(filled(self.note.split(), PROSE if width is None else width))
+        return "\n\n".join(filter(None, parts))
+
+    def markdown(self) -> str:
+        """Return title, explanation and tables in Markdown."""
+        title = f"# {self.title}" if self.title else ""
+        parts = [title, self.note, *(layouts[0][0].markdown() for layouts in self.tables)]
+        return "\n\n".join(filter(None, parts))
 
 
 def chapters(board: Board) -> list[Chapter]:
@@ -42,10 +56,7 @@ def chapters(board: Board) -> list[Chapter]:
 
 def markdown(board: Board) -> str:
     """Return all tables of a leaderboard in Markdown."""
-    parts = []
-    for chapter in chapters(board):
-        parts += [f"# {chapter.title}", markdown_text(chapter.note)]
-        parts += [layouts[0][0].markdown() for layouts in chapter.tables]
+    parts = [chapter.markdown() for chapter in chapters(board)]
     return "\n\n".join([*parts, *map(markdown_text, board.notes)]) + "\n"
 
 
@@ -70,8 +81,8 @@ def _chapters(part: Part, key: str, title: str, note: str) -> list[Chapter]:
         found.append(
             Chapter(f"{key}ranks", f"Conditions{title}", noted(ranks_table.RANK_NOTE), (ranks,))
         )
-    tables = tuple(titled(standings_table.layouts(table)) for table in part.tables)
-    games = Chapter(
-        f"{key}games", f"Each game{title}", noted(standings_table.NOTE), tables, part.tables
-    )
-    return [*found, games]
+    if part.tables:
+        tables = tuple(titled(standings_table.layouts(table)) for table in part.tables)
+        note = noted(standings_table.NOTE)
+        found.append(Chapter(f"{key}games", f"Each game{title}", note, tables, part.tables))
+    return found

@@ -16,8 +16,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-def interval_text(interval: Interval) -> str:
-    """Format a number with its interval."""
+def interval_text(interval: Interval, digits: int = 3) -> str:
+    """Format a number to this number of significant digits with its interval, unless they are
+    equal."""
     if interval.low == interval.high:
-        return number(interval.value)
-    return f"{number(interval.value)} ({number(interval.low, 2)}–{number(interval.high, 2)})"
+        return number(interval.value, digits)
+    return (
+        f"{number(interval.value, digits)} ({number(interval.low, 2)}–{number(interval.high, 2)})"
+    )

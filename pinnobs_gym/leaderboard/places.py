@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.comparison import Estimate, score
+from pinnobs_gym.leaderboard.comparison import ROUNDING, Estimate, score
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender
 from pinnobs_gym.leaderboard.influence import Results
 from pinnobs_gym.leaderboard.intervals import CONFIDENCE, Interval
@@ -17,7 +17,11 @@ from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 PEER = "ukf"
 """The estimator with which all others are compared, if it played."""
 FEWEST = 50
-"""Fewest episodes of a game that are ranked under a condition other than nominal."""
+"""Fewest episodes of a game that are ranked under a condition other than nominal and that which
+the system is ranked under."""
+
+ITSELF = Interval(1.0, 1.0, 1.0)
+"""The factor of the peer."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,8 @@ def places(contenders: Iterable[Contender]) -> Places:
     """Compare contenders over all of their games whose states are identifiable.
 
     Ranks are those of `tie_groups` within a track. Ranked are those that played every episode that
-    the peer played, in every training; under conditions other than nominal there must be `FEWEST`
-    episodes.
+    the peer played, in every training; under conditions other than nominal and that which the
+    system is ranked under there must be `FEWEST` episodes.
     """
     players = list(contenders)
     games = dict.fromkeys(game for player in players for game in player.games)
@@ -88,9 +92,11 @@ def places(contenders: Iterable[Contender]) -> Places:
         ranks: dict[str, int] = {}
         for track in dict.fromkeys(contender.track for contender in found):
             whole = [c.name for c in found if c.track == track and _complete(c, peer)]
-            ranks |= ranks_of(tie_groups({name: results[name] for name in whole}))
+            # Without an episode that all trainings of the peer played there are no results.
+            ranked = {name: results[name] for name in whole if results[name]}
+            ranks |= ranks_of(tie_groups(ranked))
         windows[window] = {
-            name: Place(_interval(score(own)).exp, ranks.get(name))
+            name: Place(ITSELF if name == peer.name else _factor(own), ranks.get(name))
             for name, own in results.items()
             if own
         }
@@ -135,19 +141,32 @@ def _complete(contender: Contender, peer: Contender) -> bool:
 
 
 def _too_few(peer: Contender) -> bool:
-    """Return whether a game under a condition other than nominal has too few episodes."""
+    """Return whether a game under another condition than nominal and that which its system is
+    ranked under has too few episodes."""
     return any(
-        game.condition != "nominal" and len(peer.errors[game].episodes) < FEWEST
+        len(peer.errors[game].episodes) < FEWEST
         for game in _comparable(peer)
+        if game.condition != "nominal" and not peer.games[game][0].ranked
     )
 
 
+def _factor(results: Mapping[str, Results]) -> Interval:
+    """Return the geometric mean over games of the errors over the peer's, with its 95 % interval:
+    from 0 to infinity where no difference could be significant at this level (`p_value`), so that
+    it does not contradict the ranks; none if all errors are the peer's."""
+    estimate = score(results)
+    if estimate.standard_error <= ROUNDING and abs(estimate.value) <= ROUNDING:
+        return ITSELF
+    return _interval(estimate).exp
+
+
 def _interval(estimate: Estimate) -> Interval:
-    """Return an estimate with its 95 % interval."""
-    if estimate.standard_error == 0:
-        return Interval(estimate.value, estimate.value, estimate.value)
-    if not np.isfinite(estimate.standard_error):
+    """Return an estimate with its 95 % interval, which may be unbounded or, where nothing but
+    rounding varies, empty."""
+    if not np.isfinite(estimate.standard_error) or estimate.least_p > 1 - CONFIDENCE:
         return Interval(estimate.value, -np.inf, np.inf)
+    if estimate.standard_error <= ROUNDING:
+        return Interval(estimate.value, estimate.value, estimate.value)
     from scipy.special import stdtrit  # scipy.stats takes long to import
 
     half = float(stdtrit(estimate.degrees, (1 + CONFIDENCE) / 2)) * estimate.standard_error

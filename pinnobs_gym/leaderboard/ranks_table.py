@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import label
 from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
-from pinnobs_gym.leaderboard.numerals import number
+from pinnobs_gym.leaderboard.numerals import interval_text, number
 from pinnobs_gym.leaderboard.places import FEWEST, Place, Places
 from pinnobs_gym.leaderboard.ranks import Line, worst_ranks
 from pinnobs_gym.leaderboard.standings import Standing
@@ -22,8 +22,9 @@ NOTE = (
     "them (5 % for each group). Diverging significantly more often outranks a smaller error; in "
     "the factors a diverged episode counts as an error of the whole scale or more. Columns of "
     "systems have the median steady NRMSE and, as `div`, how many episodes diverged; `diverged %` "
-    "is the mean over systems. Without a rank are those that did not play every episode that the "
-    "peer played. A rule stands between tracks."
+    "is the mean over systems. (0–∞): too few episodes for an interval. Without a rank are those "
+    "that did not play every episode that the peer played or, under another condition than nominal "
+    f"and that which the system is ranked under, fewer than {FEWEST}. A rule stands between tracks."
 )
 """Explanation of the overview."""
 RANK_NOTE = (
@@ -60,12 +61,13 @@ def layouts(found: Sequence[Line], peer: str) -> Layouts:
 
 def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Grid:
     """Return the overview with columns of these games."""
+    over = f" / {peer}" if peer else ""
     columns: list[tuple[Column, Callable[[Line], str]]] = [
         (Column("rank"), lambda line: _rank(line.places.get("steady"))),
         (Column("estimator", numeric=False), lambda line: line.estimator),
-        (Column(f"steady / {peer}"), lambda line: _factor(line.places.get("steady"))),
+        (Column(f"steady{over}"), lambda line: _factor(line.places.get("steady"))),
         (Column("transient rank", 4), lambda line: _rank(line.places.get("transient"))),
-        (Column(f"transient / {peer}", 2), lambda line: _factor(line.places.get("transient"))),
+        (Column(f"transient{over}", 2), lambda line: _factor(line.places.get("transient"))),
         (Column("diverged %", 1), lambda line: number(100 * line.diverged, 2)),
         *(
             (Column(label(game)), lambda line, game=game: _of_game(line.games.get(game)))
@@ -191,7 +193,4 @@ def _rank(place: Place | None) -> str:
 
 
 def _factor(place: Place | None) -> str:
-    if place is None:
-        return ""
-    factor = place.factor
-    return f"{number(factor.value, 2)} ({number(factor.low, 2)}–{number(factor.high, 2)})"
+    return "" if place is None else interval_text(place.factor, 2)

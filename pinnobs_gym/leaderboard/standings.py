@@ -25,6 +25,8 @@ class Standing:
     """Number of different episodes."""
     trainings: int
     """Number of training seeds; 1 without training."""
+    scored: int
+    """Number of scored episodes of all training seeds."""
     diverged: Interval
     """Rate of diverged episodes, with Wilson's interval."""
     settling: Interval
@@ -82,6 +84,7 @@ def standing(rows: Sequence[Row]) -> Standing:
         track=first["track"],
         episodes=len({row["episode"] for row in rows}),
         trainings=len({row["training_seed"] for row in rows}),
+        scored=len({(row["training_seed"], row["episode"]) for row in rows}),
         diverged=rate(int(diverged.sum()), len(rows)),
         settling=median(values("settling")),
         transient=median(values("nrmse_transient")),
@@ -149,10 +152,11 @@ def training_of(rows: Sequence[Row]) -> str:
         return ""
     budget = facts[0].get("config", {}).get("budget")
     parts = [] if budget is None else [f"budget {budget:g} s"]
-    for name, unit in (("iterations", "iterations"), ("seconds", "CPU s")):
+    for name, unit, plural in (("iterations", "iteration", "s"), ("seconds", "CPU s", "")):
         known = [fact[name] for fact in facts if fact.get(name) is not None]
         if known:
-            parts.append(f"{np.median(known):.4g} {unit}")
+            middle = float(np.median(known))
+            parts.append(f"{middle:.4g} {unit}{'' if middle == 1 else plural}")
     if facts[0].get("per_record"):
         parts.append("on each record")
     return ", ".join(parts)

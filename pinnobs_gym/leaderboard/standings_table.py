@@ -100,27 +100,28 @@ def track_blocks(tracks: Sequence[str]) -> tuple[int, ...]:
 
 
 NOTE = (
-    "Medians over episodes with 95 % intervals. NRMSE is the root mean squared error over the "
-    "system's fixed scale: transient from the second sample to a time that is fixed for each "
-    "system, steady over all later ones, and also of the first sample, the whole episode, its "
-    "last 75 % and its last 25 %. Lines stand in the order of the steady rank. Estimators of one "
-    "rank cannot be told apart: none is significantly worse than the best of them (5 % for each "
-    "group). Diverging significantly more often outranks a smaller error. An episode diverged if "
-    "the NRMSE of its last 25 % is above 0.2 or anything is not finite; its medians count it as "
-    "infinite, comparisons as an error of the whole scale or more. 5 × 100 are 100 episodes of "
-    "each of five trainings; a single training says nothing about how much trainings differ. "
-    "Online estimators are causal; offline ones see the whole record first and are ranked apart, "
-    "as are those that were trained under the very condition that is scored; a rule stands between "
-    "tracks. `initial set`: the "
-    "estimator knows the set that initial states are drawn from, beyond its mean and covariance, "
-    "which all are given. In brackets: modulo states that no output tells apart. Seconds behind a "
-    "name are the CPU time that each training was given. / CRR: root mean square over episodes of "
-    "the steady NRMSE, over that of the Cramér-Rao reference of the same episodes; empty where "
-    "there is none (the condition is not in the model, there is no noise, or the reference is "
-    "below the error of a single step of the model). For those that give covariances, means over "
-    "episodes: ANEES, which should be 1 (▲ above its 95 % band: errors are larger than P says, ▼ "
-    "below); how many errors the central 90 % interval covers; NIS, which should be 1; and the "
-    "correlation of successive innovations, 0 if white."
+    "Medians over episodes with 95 % intervals; of fewer than six episodes, the interval of a "
+    "median is their whole range. NRMSE is the root mean squared error over the system's fixed "
+    "scale: transient from the second sample to a time that is fixed for each system, steady over "
+    "all later ones, and also of the first sample, the whole episode, its last 75 % and its last "
+    "25 %. Lines stand in the order of the steady rank. Estimators of one rank cannot be told "
+    "apart: none is significantly worse than the best of them (5 % for each group). Diverging "
+    "significantly more often outranks a smaller error. An episode diverged if the NRMSE of its "
+    "last 25 % is above 0.2 or anything is not finite; its medians count it as infinite, "
+    "comparisons as an error of the whole scale or more. 5 × 100 are 100 episodes of each of five "
+    "trainings, and the total is given where trainings played different ones; a single training "
+    "says nothing about how much trainings differ. Online estimators are causal; offline ones see "
+    "the whole record first and are ranked apart, as are those that were trained under the very "
+    "condition that is scored; a rule stands between tracks. `initial set`: the estimator knows "
+    "the set that initial states are drawn from, beyond its mean and covariance, which all are "
+    "given. In brackets: modulo states that no output tells apart. Seconds behind a name are the "
+    "CPU time that each training was given. / CRR: root mean square over episodes of the steady "
+    "NRMSE, over that of the Cramér-Rao reference of the same episodes; empty where there is none "
+    "(the condition is not in the model, there is no noise, or the reference is below the error of "
+    "a single step of the model). For those that give covariances, means over episodes: ANEES, "
+    "which should be 1 (▲ above its 95 % band: errors are larger than P says, ▼ below); how many "
+    "errors the central 90 % interval covers; NIS, which should be 1; and the correlation of "
+    "successive innovations, 0 if white."
 )
 """Explanation of the tables."""
 
@@ -138,8 +139,12 @@ def _rank(rank: int | None) -> str:
 
 
 def _episodes(s: Standing) -> str:
-    """Format the number of episodes, times that of trainings."""
-    return str(s.episodes) if s.trainings == 1 else f"{s.trainings} × {s.episodes}"
+    """Format the number of episodes of each training; the total where they differ."""
+    if s.trainings == 1:
+        return str(s.episodes)
+    if s.scored == s.trainings * s.episodes:
+        return f"{s.trainings} × {s.episodes}"
+    return f"{s.scored}, {s.trainings} trainings"
 
 
 def _steady(s: Standing, show: Show) -> str:

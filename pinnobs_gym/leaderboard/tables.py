@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender, among
 from pinnobs_gym.leaderboard.numerals import number
-from pinnobs_gym.leaderboard.places import places
+from pinnobs_gym.leaderboard.places import FEWEST, Places, places
 from pinnobs_gym.leaderboard.standings import Standing, is_identifiable
 from pinnobs_gym.scoring.rows import Row, game_of
 
@@ -67,7 +67,7 @@ def table(game: GameName, contenders: Iterable[Contender], notes: Sequence[str] 
             e.standing.steady.value,
         )
     )
-    own = [_uneven(players), _unidentifiable(players), *notes]
+    own = [_uneven(players), _unranked(players, found), *notes]
     return Table(game, tuple(entries), " ".join(filter(None, own)))
 
 
@@ -90,14 +90,25 @@ def _uneven(players: Sequence[Contender]) -> str:
     return ""
 
 
-def _unidentifiable(players: Sequence[Contender]) -> str:
-    """Return a remark if the states cannot be told from the outputs."""
+def _unranked(players: Sequence[Contender], found: Places) -> str:
+    """Return why nothing is ranked; empty if something is or nobody played."""
     first = next((run.rows[0] for player in players for run in player.runs), None)
-    if first is None or is_identifiable(first):
+    if first is None:
         return ""
-    return (
-        "Not identifiable, so that nothing is ranked: the outputs do not tell the states from what "
-        "the condition changes. This enlarges the smallest error that can be reached "
-        f"{number(first['free_over_known'], 2)} times, and a filter that ignores it is within "
-        f"{number(first['nominal_over_free'], 2)} times of that."
-    )
+    if not is_identifiable(first):
+        return (
+            "Not identifiable, so that nothing is ranked: the outputs do not tell the states from "
+            "what the condition changes. Not knowing it makes the smallest error that can be "
+            f"reached {number(first['free_over_known'], 2)} times as large, and a filter that "
+            f"ignores the change has {first['nominal_over_free']:.1f} times this error."
+        )
+    if not found.peer:
+        return "Nothing is ranked: no online estimator was played, with which others are compared."
+    if found.too_few:
+        return (
+            f"Nothing is ranked: fewer than {FEWEST} episodes under a condition other than nominal "
+            "and that which the system is ranked under."
+        )
+    if not found.windows["steady"]:
+        return f"Nothing is ranked: the trainings of {found.peer} have no episode in common."
+    return ""

@@ -35,8 +35,8 @@ def cramer_rao(
     With Φ the product of the Jacobians F of the steps from t₀ to t_k at the true states, and no
     process noise, it is Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ. It is computed by the recursion P⁻ = FPFᵀ + Q, P
     = P⁻ − P⁻Hᵀ(HP⁻Hᵀ + R)⁻¹HP⁻ (Taylor 1979; Tichavský, Muravchik & Nehorai 1998 for Q > 0).
-    Estimates that use the prior are not unbiased and may be below it: compare medians over many
-    episodes, not single ones.
+    Estimates that use the prior are not unbiased and may be below it: compare root mean squares
+    over many episodes, not single ones.
 
     Args:
         system: the plant.

@@ -8,6 +8,8 @@ from made_rows import rows_of
 from rich.console import Console
 
 from pinnobs_gym.cli import console, main
+from pinnobs_gym.leaderboard import chapters, ranks_table, standings_table
+from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.rows import SCHEMA
@@ -112,7 +114,9 @@ def test_no_name_steers_the_terminal(printed, path):
     ("arguments", "message"),
     [
         (["--table", "Y"], "unknown table 'Y'; known are overview, ranks, Motor-v0, X-v0"),
-        (["--table", "X,noise5"], "no table 'X,noise5'; X was played under nominal"),
+        (["--table", "X,noise5"], "no table 'X,noise5'; known are 'X,benchmark,nominal'\n"),
+        (["--table", "X,paper"], "no table 'X,paper'; known are 'X,benchmark,nominal'\n"),
+        (["--table", "on-record X"], "unknown table 'on-record X'; known are overview, ranks, "),
         (["--format", "csv"], "csv holds one table, not 6 (Across systems; Ranks; pinnobs/Mot"),
         (["--format", "html"], "invalid choice 'html' for argument '--format'"),
         (["--table", "X", "--columns", "RMSE"], "unknown column 'RMSE' of 'pinnobs/X-v0, benchma"),
@@ -143,11 +147,62 @@ def test_estimators_trained_on_each_record_have_tables_of_their_own(path, printe
     rows.append(path, rows_of("pinn", [0.1, 0.1], **FACTS, **own))
     apart = [f"{ALL[0]}, trained on each record", f"{ALL[5]}, trained on each record"]
     assert titles(printed()) == [*ALL, *apart]
-    assert titles(printed("--table", "X")) == [ALL[5], apart[1]]
+    assert titles(printed("--table", "X")) == [ALL[5]]
+    assert titles(printed("--table", "on-record X")) == apart[1:]
     chosen = printed("--table", "on-record overview")
     assert titles(chosen) == apart[:1]
     assert "pinn" in chosen
     assert "pinn" not in printed("--table", "overview")
+
+
+def test_setup_condition_and_part_choose_one_table(path, printed, capsys):
+    facts = {**FACTS, "condition": "mismatch10", "ranked": False}
+    paper = {**FACTS, "setup": "paper", "game_hash": "paper"}
+    own = {"training": {"per_record": True}, "track": "offline", "estimator_hash": "pinn"}
+    for name, more in (("ekf", {}), ("pinn", own)):
+        rows.append(path, rows_of(name, [0.1, 0.1], **facts, **more))
+        rows.append(path, rows_of(name, [0.1], **paper, **more))
+    apart = ", trained on each record"
+    on_paper, mismatched = "pinnobs/X-v0, paper, nominal", "pinnobs/X-v0, benchmark, mismatch10"
+    assert titles(printed("--table", "X")) == [mismatched, ALL[5], on_paper]
+    for name, title in (
+        ("X,paper", on_paper),
+        ("X, nominal, paper", on_paper),
+        ("X-v0,paper,nominal", on_paper),
+        ("on-record X,paper", on_paper + apart),
+        ("on-record pinnobs/X-v0,mismatch10", mismatched + apart),
+        ("on-record X,mismatch10,benchmark", mismatched + apart),
+    ):
+        assert titles(printed("--table", name)) == [title]
+        lines = list(csv.reader(io.StringIO(printed("--table", name, "--format", "csv"))))
+        assert ("pinn" in [line[1] for line in lines]) == title.endswith(apart)
+    assert main(["tables", str(path), "--table", "on-record X,gap"]) == 2
+    known = "known are 'on-record X,benchmark,mismatch10', 'on-record X,paper,nominal'"
+    assert known in capsys.readouterr().err
+    assert main(["tables", str(path), "--table", "Y"]) == 2
+    known = "known are overview, ranks, Motor-v0, X-v0, on-record X-v0\n"
+    assert capsys.readouterr().err.endswith(known)
+
+
+def test_all_tables_have_their_explanations(path, printed, tmp_path):
+    failure = {"schema": SCHEMA, "kind": "failure", "env_id": "pinnobs/X-v0", "setup": "benchmark"}
+    failure |= {"condition": "nominal", "estimator": "`mine`", "episode": "seed:0", "episodes": 1}
+    rows.append(path, [failure | {"job": "x", "error": "no *luck*", "date": "2030-01-01"}])
+    notes = ranks_table.NOTE, ranks_table.RANK_NOTE, standings_table.NOTE
+    text = " ".join(printed().split())
+    assert [text.count(note) for note in notes] == [1, 1, 1]
+    assert text.index(notes[0]) < text.index("Ranks") < text.index(notes[1]) < text.index(notes[2])
+    markdown = printed("--format", "markdown")
+    assert all(f"\n\n{note}\n\n" in markdown for note in notes)  # with their own markup
+    assert "Failed: \\`mine\\`, seed:0: no \\*luck\\*." in markdown  # names are no markup
+    assert chapters.markdown(board(rows.load(path))) == markdown
+    for form in ("text", "markdown"):
+        assert not any(note in printed("--table", "X", "--format", form) for note in notes)
+
+
+def test_explanations_are_as_wide_as_the_tables(printed, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert 70 < max(map(len, printed().splitlines())) <= 80
 
 
 def test_what_is_left_out_is_told_beside_the_tables(path, capsys):

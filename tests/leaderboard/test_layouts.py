@@ -71,40 +71,40 @@ rts_smoother    0.0118      0.118           0        1  offline  a
 knows: a model, b true states."""
 OVERVIEW_80 = """\
 Across systems
-rank  estimator           steady / ekf   transient / ekf  diverged %  knows
-----  --------------  ----------------  ----------------  ----------  -----
-   1  kkl_pinn, 45 s     0.5 (0.5–0.5)     0.5 (0.5–0.5)           0  ab
-   2  ekf                      1 (1–1)           1 (1–1)         2.5  a
-----  --------------  ----------------  ----------------  ----------  -----
-      rts_smoother    0.29 (0.29–0.29)  0.29 (0.29–0.29)           0  a
+rank  estimator       steady / ekf  transient / ekf  diverged %  track    knows
+----  --------------  ------------  ---------------  ----------  -------  -----
+   1  kkl_pinn, 45 s           0.5              0.5           0  online   ab
+   2  ekf                        1                1         2.5  online   a
+----  --------------  ------------  ---------------  ----------  -------  -----
+      rts_smoother            0.29             0.29           0  offline  a
 knows: a model, b true states.
-not shown at this width: transient rank, track, µs/step (leaderboard.md has all)"""
+not shown at this width: transient rank, µs/step (leaderboard.md has all)"""
 OVERVIEW_120 = """\
 Across systems
-rank  estimator           steady / ekf  transient rank   transient / ekf  diverged %  track    µs/step  knows
-----  --------------  ----------------  --------------  ----------------  ----------  -------  -------  -----
-   1  kkl_pinn, 45 s     0.5 (0.5–0.5)               1     0.5 (0.5–0.5)           0  online         1  ab
-   2  ekf                      1 (1–1)               2           1 (1–1)         2.5  online         1  a
-----  --------------  ----------------  --------------  ----------------  ----------  -------  -------  -----
-      rts_smoother    0.29 (0.29–0.29)                  0.29 (0.29–0.29)           0  offline        1  a
+rank  estimator       steady / ekf  transient rank  transient / ekf  diverged %  track    µs/step  knows
+----  --------------  ------------  --------------  ---------------  ----------  -------  -------  -----
+   1  kkl_pinn, 45 s           0.5               1              0.5           0  online         1  ab
+   2  ekf                        1               2                1         2.5  online         1  a
+----  --------------  ------------  --------------  ---------------  ----------  -------  -------  -----
+      rts_smoother            0.29                             0.29           0  offline        1  a
 knows: a model, b true states."""  # noqa: E501
 OVERVIEW_200 = """\
 Across systems
-rank  estimator           steady / ekf  transient rank   transient / ekf  diverged %  Academic-v0  HarmonicOscillator-v0  InductionMotor-v0 (load_step)  ReverseDuffing-v0  track    knows
-----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  ------------------
-   1  kkl_pinn, 45 s     0.5 (0.5–0.5)               1     0.5 (0.5–0.5)           0       0.0206                 0.0206                         0.0206             0.0206  online   model, true states
-   2  ekf                      1 (1–1)               2           1 (1–1)         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online   model
-----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  ------------------
-      rts_smoother    0.29 (0.29–0.29)                  0.29 (0.29–0.29)           0                                                                                0.0118  offline  model
+rank  estimator       steady / ekf  transient rank  transient / ekf  diverged %  Academic-v0  HarmonicOscillator-v0  InductionMotor-v0 (load_step)  ReverseDuffing-v0  track    knows
+----  --------------  ------------  --------------  ---------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  ------------------
+   1  kkl_pinn, 45 s           0.5               1              0.5           0       0.0206                 0.0206                         0.0206             0.0206  online   model, true states
+   2  ekf                        1               2                1         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online   model
+----  --------------  ------------  --------------  ---------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  ------------------
+      rts_smoother            0.29                             0.29           0                                                                                0.0118  offline  model
 not shown at this width: µs/step (leaderboard.md has all)"""  # noqa: E501
 OVERVIEW = """\
 Across systems
-rank  estimator           steady / ekf  transient rank   transient / ekf  diverged %  Academic-v0  HarmonicOscillator-v0  InductionMotor-v0 (load_step)  ReverseDuffing-v0  track    µs/step  knows
-----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  -------  ------------------
-   1  kkl_pinn, 45 s     0.5 (0.5–0.5)               1     0.5 (0.5–0.5)           0       0.0206                 0.0206                         0.0206             0.0206  online         1  model, true states
-   2  ekf                      1 (1–1)               2           1 (1–1)         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online         1  model
-----  --------------  ----------------  --------------  ----------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  -------  ------------------
-      rts_smoother    0.29 (0.29–0.29)                  0.29 (0.29–0.29)           0                                                                                0.0118  offline        1  model"""  # noqa: E501
+rank  estimator       steady / ekf  transient rank  transient / ekf  diverged %  Academic-v0  HarmonicOscillator-v0  InductionMotor-v0 (load_step)  ReverseDuffing-v0  track    µs/step  knows
+----  --------------  ------------  --------------  ---------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  -------  ------------------
+   1  kkl_pinn, 45 s           0.5               1              0.5           0       0.0206                 0.0206                         0.0206             0.0206  online         1  model, true states
+   2  ekf                        1               2                1         2.5       0.0412                 0.0412               0.0412, div 10 %             0.0412  online         1  model
+----  --------------  ------------  --------------  ---------------  ----------  -----------  ---------------------  -----------------------------  -----------------  -------  -------  ------------------
+      rts_smoother            0.29                             0.29           0                                                                                0.0118  offline        1  model"""  # noqa: E501
 GAME_80 = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
 rank  estimator       steady  transient  diverged %  track    knows

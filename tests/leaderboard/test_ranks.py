@@ -6,7 +6,8 @@ from made_rows import rows_of
 
 from pinnobs_gym.leaderboard import ranks_table
 from pinnobs_gym.leaderboard.board import board
-from pinnobs_gym.leaderboard.chapters import markdown
+from pinnobs_gym.leaderboard.chapters import ON_RECORD, markdown
+from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.scoring.rows import Stored
 
 MOTOR = {"env_id": "pinnobs/Motor-v0", "condition": "load_step"}
@@ -146,8 +147,11 @@ def test_a_system_whose_states_are_not_identifiable_is_left_out_of_a_condition()
     assert "delay1: without Y-v0" in ranks_table.rank_grid(part.conditions, part.knows).note
     table = next(t for t in part.tables if t.game.system == "Y-v0")
     assert {entry.ranks["steady"] for entry in table.entries} == {None}
-    assert "Not identifiable" in table.note
-    assert "6 times" in table.note
+    assert table.note == (
+        "Not identifiable, so that nothing is ranked: the outputs do not tell the states from what "
+        "the condition changes. Not knowing it makes the smallest error that can be reached 6 "
+        "times as large, and a filter that ignores the change has 1.2 times this error."
+    )
 
 
 def test_estimators_trained_on_each_record_are_compared_apart_on_their_episodes():
@@ -165,6 +169,8 @@ def test_estimators_trained_on_each_record_are_compared_apart_on_their_episodes(
     assert next(iter(found.main.tables[0].entries)).standing.episodes == 60
     text = markdown(found)
     assert "# Leaderboard, trained on each record" in text
+    assert "above" not in ON_RECORD  # a terminal prints this part before the other
+    assert "below" not in ON_RECORD
     assert board(Stored(rows[:-5], [])).on_record is None
 
 
@@ -174,3 +180,68 @@ def test_markdown_has_who_knew_what_in_every_table():
     headers = [line for line in text.splitlines() if line.startswith("| ") and "estimator" in line]
     assert len(headers) == 2 + 3  # the overview, the ranks and three games
     assert all("| knows |" in line for line in headers)
+
+
+def test_one_episode_in_another_setup_does_not_touch_ranks():
+    """It counted as one more system, which hardly anyone had played."""
+    paper = {"setup": "paper", "game_hash": "paper"}
+    alone = board(Stored(played(), []))
+    both = board(Stored([*rows_of("half", [0.1], **paper), *played()], []))
+    assert (both.main.setup, alone.notes) == ("benchmark", ())
+    assert both.main.lines == alone.main.lines
+    assert both.main.places == alone.main.places
+    assert both.main.conditions == alone.main.conditions
+    assert both.notes == (
+        "The overview and the ranks are of the setup benchmark; in the tables of their games "
+        "only: paper.",
+    )
+    assert {table.game.setup for table in both.main.tables} == {"benchmark", "paper"}
+    assert both.notes[0] in markdown(both)
+
+
+def test_without_the_benchmark_the_setup_with_the_most_rows_is_compared():
+    some = [*rows_of("ukf", NOISY[0][:9], setup="wide"), *rows_of("ukf", [0.1], setup="paper")]
+    found = board(Stored(some, []))
+    assert found.main.setup == "wide"
+    assert [game.setup for game in found.main.lines[0].games] == ["wide"]
+    assert found.notes[0].endswith("only: paper.")
+    own = {"training": {"per_record": True}, "track": "offline", "setup": "paper"}
+    found = board(Stored([*some, *rows_of("pinn", [0.1], **own)], []))
+    assert found.on_record.setup == "paper"
+    assert len(found.notes) == 1  # the second part has this setup only
+
+
+def test_a_system_is_ranked_under_its_own_condition_with_any_number_of_episodes():
+    few = [*rows_of("ukf", 0.1 * NOISY[0][:20], **MOTOR), *rows_of("half", NOISY[0][:20], **MOTOR)]
+    part = main_part(few)
+    assert [line.places["steady"].rank for line in part.lines] == [1, 2]
+    assert not part.conditions["load_step"].too_few
+    part = main_part([row | {"ranked": False} for row in few])
+    assert part.conditions["load_step"].too_few
+    assert part.conditions["load_step"].rank("steady", "ukf") is None
+
+
+@pytest.mark.parametrize(
+    ("episodes", "bounded", "rank"), [(1, False, 1), (5, False, 1), (6, True, 1), (7, True, 2)]
+)
+def test_there_is_no_interval_where_no_difference_could_be_significant(episodes, bounded, rank):
+    """The sign test of k episodes gives at least 2 / 2^k: 0.062, 0.031 and 0.016 for five to seven.
+    The interval is of 5 %, and either test behind a rank of 2.5 %."""
+    worse = 2 * (1 + 0.01 * np.arange(episodes))  # about twice as bad on every episode
+    part = main_part([*rows_of("ukf", np.ones(episodes)), *rows_of("worse", worse)])
+    factor = part.places.place("steady", "worse").factor
+    assert part.places.rank("steady", "worse") == rank
+    assert (factor.low > 1 and factor.high < 3) == bounded
+    cells = {line[1]: line[2] for line in ranks_table.grid(part.lines, part.places.peer).lines}
+    assert cells["ukf"] == "1"
+    assert cells["worse"].startswith(("2 (", "2.1 ("))
+    assert cells["worse"].endswith("(0–∞)") != bounded
+    same = main_part([*rows_of("ukf", np.ones(episodes)), *rows_of("same", np.ones(episodes))])
+    known = Interval(1.0, 1.0, 1.0) if episodes > 1 else Interval(1.0, 0.0, np.inf)
+    assert same.places.place("steady", "same").factor == known
+
+
+def test_without_a_peer_the_headings_name_none():
+    part = main_part(rows_of("smooth", NOISY[0], track="offline"))
+    header = ranks_table.grid(part.lines, part.places.peer).header
+    assert header[2:5] == ("steady", "transient rank", "transient")

@@ -54,6 +54,41 @@ def test_training_is_told_in_the_row():
     facts = {"config": {"budget": 25.0}, "iterations": 1000, "seconds": 25.0}
     standing = standings.standing(rows_of("pinn", [0.1], training=facts))
     assert standing.training == "budget 25 s, 1000 iterations, 25 CPU s"
+    once = standings.standing(rows_of("pinn", [0.1], training={"iterations": 1, "seconds": 1.0}))
+    assert once.training == "1 iteration, 1 CPU s"
+
+
+@pytest.mark.parametrize(
+    ("played", "shown"), [((50, 50, 50), "3 × 50"), ((50, 50, 10), "110, 3 trainings"), ((9,), "9")]
+)
+def test_trainings_that_played_different_numbers_of_episodes_have_the_total(played, shown):
+    rows = []
+    for seed, episodes in enumerate(played):
+        facts = {"training_seed": seed, "estimator_hash": str(seed), "training": {"seconds": 1.0}}
+        rows += rows_of("gain", [0.1] * episodes, **facts)
+    (table,) = tables_of(rows)
+    grid = standings_table.grid(table)
+    assert grid.only(["episodes"]).lines == ((shown,),)
+
+
+def test_a_table_without_ranks_says_why():
+    few = {"condition": "gap", "ranked": False}
+    (table,) = tables_of(rows_of("ekf", [0.1] * 49, **few))
+    assert table.note == (
+        "Nothing is ranked: fewer than 50 episodes under a condition other than nominal and that "
+        "which the system is ranked under."
+    )
+    (table,) = tables_of(rows_of("smooth", [0.1] * 60, track="offline"))
+    assert table.note == (
+        "Nothing is ranked: no online estimator was played, with which others are compared."
+    )
+    rows = rows_of("gain", [0.1] * 4)
+    for i, row in enumerate(rows):  # two trainings, each on other episodes
+        row |= {"training_seed": i // 2, "estimator_hash": str(i // 2), "training": {"seconds": 1}}
+    (table,) = tables_of(rows)
+    assert table.note == "Nothing is ranked: the trainings of gain have no episode in common."
+    ranked = [rows_of("ekf", [0.1] * 50, **few), rows_of("ekf", [0.1], condition="load_step")]
+    assert [table.note for rows in ranked for table in tables_of(rows)] == ["", ""]
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,10 +13,10 @@ import tyro
 from pinnobs_gym.cli.console import console, table_width
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import replacing
-from pinnobs_gym.leaderboard.board import Board, board
-from pinnobs_gym.leaderboard.chapters import chapters
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.chapters import Chapter, chapters
 from pinnobs_gym.leaderboard.display import printable
-from pinnobs_gym.leaderboard.grid import Grid, Layouts, fitting
+from pinnobs_gym.leaderboard.grid import Grid, Layouts
 from pinnobs_gym.leaderboard.tables import Table
 from pinnobs_gym.scoring import rows
 
@@ -31,9 +31,10 @@ class Tables:
     format: Literal["text", "markdown", "latex", "csv"] = "text"
     """Format; csv holds one table, and latex needs the packages that it names."""
     table: tuple[str, ...] = ()
-    """Tables: overview, ranks, or a system with or without a condition, such as
-    InductionMotor,load_step; all if none is named. On-record overview is that of estimators which
-    are trained on each record."""
+    """Tables: overview, ranks, or a system, where wanted with a setup and a condition in any order,
+    such as InductionMotor,load_step or ReverseDuffing,paper; all with their explanations if none is
+    named. With "on-record " before it, overview or a system is that of estimators which are trained
+    on each record."""
     columns: tuple[str, ...] = ()
     """Headings of the columns, in their order; all if none is named."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -47,7 +48,8 @@ class Tables:
         if not stored.rows and not stored.failures:
             raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
         results = board(stored)
-        text = self._text(chosen(results, self.table))
+        found = chapters(results)
+        text = self._text(chosen(found, self.table) if self.table else found)
         for note in filter(None, (stored.warning, *results.notes)):
             print(printable(note), file=sys.stderr)
         if self.out is None:
@@ -59,61 +61,72 @@ class Tables:
         console.print(f"tables: {self.out}", soft_wrap=True)
         return 0
 
-    def _text(self, tables: Sequence[Layouts]) -> str:
+    def _text(self, found: Sequence[Chapter]) -> str:
         """Return the tables in the format, without a line break at the end."""
-        if self.format == "csv" and len(tables) > 1:
-            titles = "; ".join(layouts[0][0].title for layouts in tables)
-            raise ValueError(
-                f"csv holds one table, not {len(tables)} ({titles}); choose by --table"
-            )
         if self.columns:
-            tables = [[[layouts[0][0].only(self.columns)]] for layouts in tables]
+            found = [replace(chapter, tables=self._narrowed(chapter)) for chapter in found]
         if self.format == "text":
             width = table_width() if self.out is None else None
-            shown = [grid for layouts in tables for grid in fitting(layouts, width)]
-            return "\n\n".join(grid.text(width, "-o FILE writes all") for grid in shown)
-        whole = [layouts[0][0] for layouts in tables]
-        write = {"markdown": Grid.markdown, "latex": Grid.latex, "csv": Grid.csv}[self.format]
-        return "\n\n".join(map(write, whole)).removesuffix("\n")
+            return "\n\n".join(chapter.text(width, "-o FILE writes all") for chapter in found)
+        if self.format == "markdown":
+            return "\n\n".join(map(Chapter.markdown, found))
+        whole = [layouts[0][0] for chapter in found for layouts in chapter.tables]
+        if self.format == "latex":
+            return "\n\n".join(map(Grid.latex, whole))
+        if len(whole) > 1:
+            titles = "; ".join(grid.title for grid in whole)
+            raise ValueError(f"csv holds one table, not {len(whole)} ({titles}); choose by --table")
+        return whole[0].csv().removesuffix("\n")
+
+    def _narrowed(self, chapter: Chapter) -> tuple[Layouts, ...]:
+        """Return the tables of a chapter with the chosen columns."""
+        return tuple([[layouts[0][0].only(self.columns)]] for layouts in chapter.tables)
 
 
-def chosen(results: Board, names: Sequence[str]) -> list[Layouts]:
-    """Return the tables of these names, or all of them: the overview, the ranks if there are
-    several conditions, and those of all games; then the same on the records of estimators that are
-    trained on each.
+ON_RECORD = "on-record "
+"""What stands before the names of tables of estimators that are trained on each record."""
+
+
+def chosen(found: Sequence[Chapter], names: Sequence[str]) -> list[Chapter]:
+    """Return the tables of these names, each in a chapter without title and explanation.
 
     Raises:
         ValueError: in one line, if there is no such table.
     """
-    found = chapters(results)
-    if not names:
-        return [layouts for chapter in found for layouts in chapter.tables]
-    across = {c.key: c.tables for c in found if not c.games}
-    games = [pair for c in found if c.games for pair in zip(c.games, c.tables, strict=True)]
-    shown: list[Layouts] = []
-    for name in names:
-        if name in across:
-            shown += across[name]
-        else:
-            wanted = _of_game([table for table, _ in games], name, known=across)
-            shown += [layouts for table, layouts in games if any(table is each for each in wanted)]
-    return shown
+    across = {chapter.key: chapter for chapter in found if not chapter.games}
+    return [
+        replace(across[name] if name in across else _of_game(found, name), title="", note="")
+        for name in names
+    ]
 
 
-def _of_game(tables: Sequence[Table], name: str, known: Iterable[str]) -> list[Table]:
-    """Return the tables of a ``system`` or a ``system,condition`` in any setup."""
-    system, comma, condition = (part.strip() for part in name.partition(","))
-    own = [table for table in tables if system in _names(table)]
-    if not own:
-        systems = dict.fromkeys(table.game.system for table in tables)
-        raise ValueError(f"unknown table {name!r}; known are {', '.join([*known, *systems])}")
-    if not comma:
-        return own
-    found = [t for t in own if _parts(t.game.condition) == _parts(condition)]
-    if not found:
-        played = ", ".join(dict.fromkeys(table.game.condition for table in own))
-        raise ValueError(f"no table {name!r}; {system} was played under {played}")
-    return found
+def _of_game(found: Sequence[Chapter], name: str) -> Chapter:
+    """Return the tables of a system or, with commas between, of the system in a setup, under a
+    condition, or both; of the estimators that are trained on each record if the name says so."""
+    prefix = ON_RECORD if name.startswith(ON_RECORD) else ""
+    system, *wanted = (part.strip() for part in name.removeprefix(prefix).split(","))
+    games = next((chapter for chapter in found if chapter.key == f"{prefix}games"), None)
+    own = [] if games is None else [table for table in games.games if system in _names(table)]
+    if games is None or not own:
+        raise ValueError(f"unknown table {name!r}; known are {', '.join(_known(found))}")
+    kept = [table for table in own if all(_is_of(table, part) for part in wanted)]
+    if not kept:
+        played = (f"{system},{table.game.setup},{table.game.condition}" for table in own)
+        known = ", ".join(repr(f"{prefix}{each}") for each in played)
+        raise ValueError(f"no table {name!r}; known are {known}")
+    pairs = zip(games.games, games.tables, strict=True)
+    layouts = tuple(own for table, own in pairs if any(table is each for each in kept))
+    return replace(games, tables=layouts, games=tuple(kept))
+
+
+def _known(found: Sequence[Chapter]) -> list[str]:
+    """Return the names of all tables, those of games without setups and conditions."""
+    names: dict[str, None] = {}
+    for chapter in found:
+        prefix = ON_RECORD if chapter.key.startswith(ON_RECORD) else ""
+        systems = [f"{prefix}{table.game.system}" for table in chapter.games]
+        names |= dict.fromkeys(systems or [chapter.key])
+    return sorted(names, key=lambda name: name.startswith(ON_RECORD))
 
 
 def _names(table: Table) -> tuple[str, str, str]:
@@ -122,9 +135,11 @@ def _names(table: Table) -> tuple[str, str, str]:
     return game.env_id, game.system, game.system.rpartition("-v")[0]
 
 
-def _parts(condition: str) -> list[str]:
-    """Return the parts of a condition, which may be joined in any order."""
-    return sorted(condition.split("+"))
+def _is_of(table: Table, part: str) -> bool:
+    """Return whether a part of a name is the setup or the condition of a table; the parts of a
+    condition may be joined in any order."""
+    condition = sorted(table.game.condition.split("+"))
+    return part == table.game.setup or sorted(part.split("+")) == condition
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -28,6 +28,9 @@ class Factors:
     values: Mapping[str, Mapping[str, Place]]
     """Places by condition and estimator, of those with a rank; empty under a condition under which
     no states are identifiable or too few episodes were played."""
+    left_out: Mapping[str, tuple[str, ...]]
+    """By condition, the systems that are not compared since states are not identifiable; by name
+    and without repetition."""
 
 
 def factors(contenders: Sequence[Contender], over_all: Mapping[str, Places]) -> list[Factors]:
@@ -35,7 +38,7 @@ def factors(contenders: Sequence[Contender], over_all: Mapping[str, Places]) -> 
     those with several conditions.
 
     Args:
-        contenders: estimators of all tracks.
+        contenders: estimators of all tracks, in one setup.
         over_all: their places under each condition, over all systems.
     """
     online = [contender for contender in contenders if contender.track == "online"]
@@ -57,7 +60,11 @@ def _factors(of: str, found: Mapping[str, Places]) -> Factors:
         for condition, placed in found.items()
     }
     ranks = worst_ranks(found)
-    return Factors(of, tuple(ranks), tuple(ranks.values()), values)
+    left_out = {
+        condition: tuple(dict.fromkeys(game.system for game in placed.left_out))
+        for condition, placed in found.items()
+    }
+    return Factors(of, tuple(ranks), tuple(ranks.values()), values, left_out)
 
 
 def training_seconds(contender: Contender) -> float | None:

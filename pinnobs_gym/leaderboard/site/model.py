@@ -65,7 +65,7 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
     listed = _listed(main.contenders, main.lines)
     others = [] if on_record is None else _listed(on_record.contenders, on_record.lines)
     others = [each for each in others if each.name not in {c.name for c in listed}]
-    seconds = {contender.name: training_seconds(contender) for contender in listed}
+    seconds = {contender.name: training_seconds(contender) for contender in main.compared}
     drawn = [*listed, *others]
     tables = {table.game: table for part in results.parts[::-1] for table in part.tables}
     return Page(
@@ -75,7 +75,7 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
         on_record=on_record,
         costs=costs(main.lines, seconds),
         sections=tuple(_sections(games_of(drawn, tables.values(), folders))),
-        factors=tuple(factors(main.contenders, main.conditions)),
+        factors=tuple(factors(main.compared, main.conditions)),
         method=method_of(stored, drawn, results.notes),
     )
 

@@ -64,6 +64,8 @@ class HeatLine:
     """The factors of all estimators under one condition."""
 
     condition: str
+    remark: str
+    """Which systems are left out; possibly empty."""
     about: str
     """Description of the condition."""
     cells: tuple[HeatCell, ...]
@@ -93,7 +95,9 @@ def _line(factors: Factors, condition: str) -> HeatLine:
     values: Mapping[str, Place] = factors.values[condition]
     parts = [CONDITIONS[part].summary for part in condition.split("+") if part in CONDITIONS]
     cells = (_cell(values.get(name)) for name in factors.estimators)
-    return HeatLine(condition, "; ".join(parts), tuple(cells))
+    left_out = ", ".join(factors.left_out[condition])
+    remark = f"without {left_out}" if left_out else ""
+    return HeatLine(condition, remark, "; ".join(parts), tuple(cells))
 
 
 def _cell(place: Place | None) -> HeatCell:

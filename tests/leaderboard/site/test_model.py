@@ -60,6 +60,10 @@ CONDITIONS = 3 + 2 + 2
 """Online estimators under nominal, load_step and noise5, over all systems."""
 BY_SYSTEM = 3 + 3 * 2
 """The same on X and on the motor by themselves."""
+PEERS = 4 + 1 + 3
+"""Lines of the peer, whose factor is 1, in games, overview and conditions."""
+PEERS_BY_SYSTEM = 1 + 3
+"""The same under the conditions of X and of the motor."""
 # Both training seeds of the gain together are a line of its game and one of the overview; other
 # lines of the overview are those of a game.
 STANDINGS = {"median": 3 * (GAMES + 1), "rate": GAMES + 1}
@@ -75,14 +79,14 @@ def test_the_page_computes_an_interval_once_per_cell(counted):
     assert [len(table.entries) for table in tables] == [2, 2, 4]  # the motor's two, and X
     assert (lines(page.main), len(page.main.lines), page.on_record) == (GAMES, OVERVIEW, None)
     # A factor in each of two windows.
-    scores = 2 * (GAMES + OVERVIEW + CONDITIONS + BY_SYSTEM)
-    assert counted == {**STANDINGS, "score": scores}
+    scores = GAMES + OVERVIEW + CONDITIONS + BY_SYSTEM - PEERS - PEERS_BY_SYSTEM
+    assert counted == {**STANDINGS, "score": 2 * scores}
 
 
 def test_the_board_computes_an_interval_once_per_cell(counted):
     found = board(Stored(scored(), []))
     assert (lines(found.main), len(found.main.lines)) == (GAMES, OVERVIEW)
-    assert counted == {**STANDINGS, "score": 2 * (GAMES + OVERVIEW + CONDITIONS)}
+    assert counted == {**STANDINGS, "score": 2 * (GAMES + OVERVIEW + CONDITIONS - PEERS)}
 
 
 def test_drawing_needs_neither_rows_nor_curves(tmp_path, counted):

@@ -136,6 +136,28 @@ def test_every_table_says_what_each_estimator_knows():
         assert table.count("model") == 2
 
 
+def test_a_condition_names_the_systems_that_are_left_out_of_it():
+    facts = {"condition": "delay1", "ranked": False, **COMMON}
+    made = rows_of("ukf", [0.1] * 60, **facts)
+    other = {"env_id": "pinnobs/Y-v0", "free_over_known": 6.0, "nominal_over_free": 1.2}
+    text = drawn(*made, *rows_of("ukf", [0.1] * 60, **other, **facts))
+    heat = text[text.index('<section id="conditions">') :].partition("</section>")[0]
+    over_all = heat.partition("</table>")[0]
+    lines = re.findall(r'<tr><th scope="row"[^>]*>([^<]*)</th>', over_all)
+    conditions = {"nominal", "noise5", "load_step", "delay1, without Y-v0"}
+    assert {*lines} - {"worst rank", "knows"} == conditions
+
+
+def test_factors_are_over_one_setup():
+    """One episode of the paper's setup would leave only ranks of those that played it."""
+    paper = rows_of("ekf", [0.1], setup="paper", game_hash="paper", **COMMON)
+    text, alone = drawn(*paper), drawn()
+    conditions = r'<section id="conditions">.*?</section>'
+    found, expected = (re.findall(conditions, each, re.DOTALL) for each in (text, alone))
+    assert found == expected != []
+    assert "only: paper." in text
+
+
 def changed(scored, path, **changes):
     first = {**json.loads(scored.read_text().splitlines()[0]), **changes}
     path.write_text(json.dumps(first) + "\n")

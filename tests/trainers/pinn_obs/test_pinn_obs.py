@@ -336,7 +336,9 @@ def test_direct_estimates_belong_to_one_record(trained):
         direct.run(noisy)
     with pytest.raises(ValueError, match="record's t is not"):
         direct.run(replace(record, t=record.t + 1e-9))
-    with pytest.raises(ValueError, match=r"shape \(2, 201, 1\).*\(1, 201, 1\)"):
+    with pytest.raises(
+        ValueError, match=r"shape \(2, 201, 1\).*\(1, 201, 1\).*serves only the record"
+    ):
         direct.run(record.rows(np.array([0, 0])))
 
 
