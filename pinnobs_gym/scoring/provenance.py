@@ -39,16 +39,20 @@ def game_hash(source: EpisodeSource) -> str:
         code = code_hash(type(source.system), *_GAME)
         return digest([code, content(source.system), content(source.setup)])
     except Unreadable:
-        return _unique()
+        return unique()
+
+
+UNREADABLE = "unreadable"
+"""The hash of code that cannot be read."""
 
 
 def estimator_code(cls: type[BaseEstimator]) -> str:
     """Return the hash of the code of an estimator and, if it trains on each record, of its trainer;
-    ``unreadable`` if the code cannot be read."""
+    `UNREADABLE` if the code cannot be read."""
     try:
         return code_hash(cls, *(() if cls.trains_on_record is None else (trainer_class(cls),)))
     except Unreadable:
-        return "unreadable"
+        return UNREADABLE
 
 
 def training_code(trainer: type, source: EpisodeSource) -> str:
@@ -62,7 +66,7 @@ def training_code(trainer: type, source: EpisodeSource) -> str:
             "pinnobs_gym.training.loop",
         )
     except Unreadable:
-        return _unique()
+        return unique()
 
 
 def estimator_hash(estimator: BaseEstimator) -> str:
@@ -83,12 +87,12 @@ def estimator_hash(estimator: BaseEstimator) -> str:
     }
     code = estimator_code(type(estimator))
     try:
-        return _unique() if code == "unreadable" else digest([code, content(parts)])
+        return unique() if code == UNREADABLE else digest([code, content(parts)])
     except Unreadable:
-        return _unique()
+        return unique()
 
 
-def _unique() -> str:
+def unique() -> str:
     """Return a hash that equals no other."""
     return f"once{uuid4().hex[:8]}"
 

@@ -38,7 +38,8 @@ Row: TypeAlias = dict[str, Any]
 - ``state_rmse``: RMSE of each state in its unit, by window (``transient``, ``steady``) and name.
 - the scores of `pinnobs_gym.scoring.metrics.OPTIONAL_SCORES` that apply, in the same format; the
   others are None here and absent from the file.
-- ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in.
+- ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in; without what
+  an online estimator prepares once.
 - ``batch``: the size of that batch.
 - ``versions``, ``date``: versions of the packages, and time of the run (UTC).
 
@@ -183,6 +184,8 @@ FIELDS = {
 }
 """The required fields of each kind of row that are no scores: what is expected, and whether a value
 fits."""
+_NUMBERS = (*SCORES, "us_per_step")
+"""The numbers that every scored row has."""
 _TRAINING = {"config": _OBJECT, "seconds": _COST, "iterations": _COST}
 """The fields of a training that are read, each of which may be absent."""
 _BUDGET = ("a positive number, or null", lambda value: value is None or _is_positive(value))
@@ -279,8 +282,10 @@ def _check_training(training: Mapping[str, Any]) -> None:
 
 def _restore(row: Row) -> None:
     """Check the scores of a row and restore their infinities."""
-    for name in (*SCORES, "us_per_step"):
-        row[name] = _score(name, row[name])
+    for name in _NUMBERS:
+        value = row[name]
+        if type(value) is not float or not 0 <= value <= 1:  # most are, and every score may be
+            row[name] = _score(name, value)
     for name in OPTIONAL:
         row[name] = _score(name, row[name]) if name in row else None
     row["state_rmse"] = {
@@ -310,8 +315,6 @@ _MOST = {"coverage": 1}
 
 def _score(name: str, value: object) -> float:
     """Return a score, of which null stands for infinity."""
-    if type(value) is float and 0 <= value <= 1:  # most are, and every score may be
-        return value
     most = _MOST.get(name)
     if value is None and most is None:
         return math.inf

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.playing import play
-from pinnobs_gym.scoring.provenance import estimator_code, game_hash
+from pinnobs_gym.scoring.provenance import UNREADABLE, estimator_code, game_hash, unique
 from pinnobs_gym.training.settings import SEEDS
 
 if TYPE_CHECKING:
@@ -38,7 +39,10 @@ class Tried:
 @dataclass(frozen=True)
 class Search:
     """A search over the settings that an estimator class declares in `BaseEstimator.tunable`, by
-    Optuna's tree-structured Parzen estimator (Bergstra et al. 2011)."""
+    Optuna's tree-structured Parzen estimator (Bergstra et al. 2011).
+
+    Searches of equal estimators and games continue each other. If the code of the estimator or of
+    the game cannot be read, each search has trials of its own."""
 
     estimator: type[BaseEstimator]
     game: Game
@@ -111,7 +115,7 @@ class Search:
         self._study()
         import optuna
 
-        optuna.delete_study(study_name=self._name(), storage=self._journal())
+        optuna.delete_study(study_name=self._name, storage=self._journal())
 
     def done(self) -> int:
         """Return the number of finished trials in the storage."""
@@ -134,7 +138,7 @@ class Search:
         self.storage.parent.mkdir(parents=True, exist_ok=True)
         try:
             study = optuna.create_study(
-                storage=self._journal(), study_name=self._name(), load_if_exists=True
+                storage=self._journal(), study_name=self._name, load_if_exists=True
             )
         except Exception as error:  # whatever a file that is no journal makes it raise
             raise ValueError(f"cannot read trials from {self.storage}: {error}") from None
@@ -149,9 +153,11 @@ class Search:
 
         return JournalStorage(JournalFileBackend(str(self.storage)))
 
+    @cached_property
     def _name(self) -> str:
-        """Return the name of the study, common to its trials: those of other code are not
-        continued."""
-        code = (game_hash(self.game.source), estimator_code(self.estimator))
-        what = (*self.game.name, ESTIMATORS.name_of(self.estimator), *code)
+        """The name of the study, common to its trials: those of other code are not continued. It is
+        kept, since the hash of code that cannot be read is another each time."""
+        code = estimator_code(self.estimator)
+        hashes = (game_hash(self.game.source), unique() if code == UNREADABLE else code)
+        what = (*self.game.name, ESTIMATORS.name_of(self.estimator), *hashes)
         return "-".join([*what, f"{self.episodes} episodes", str(dict(self.estimator.tunable))])

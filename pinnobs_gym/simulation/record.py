@@ -83,6 +83,10 @@ class Record:
         prior = Prior(self.prior.mean[rows], self.prior.cov[rows])
         return Record(self.t, self.y[rows], self.u[rows], prior)
 
+    def first_samples(self, number: int) -> Record:
+        """Return the record of the first samples."""
+        return Record(self.t[:number], self.y[:, :number], self.u[:, :number], self.prior)
+
 
 def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:
     """Read a record from a CSV file with columns t (s), y1, y2, ... and, if the system has inputs,

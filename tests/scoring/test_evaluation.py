@@ -7,6 +7,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from pinnobs_gym import evaluate
 from pinnobs_gym.envs.env import EstimationEnv
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring import rows
@@ -137,6 +138,7 @@ def test_tensorboard_has_scalars_a_figure_and_hparams(tmp_path):
         ({"episodes": -3}, "episodes=-3; expected at least 1"),
         ({"episodes": 1.5}, "episodes=1.5; expected a whole number"),
         ({"seed": -1}, "seed=-1; expected at least 0"),
+        ({"estimator": PerEpisode(ReverseDuffing(), make=list, title=" mine")}, 'estimator=" mine'),
         ({"options": {"gain": 1.0}}, "estimator 'ekf': .*unexpected keyword argument 'gain'"),
         ({"estimator": EKF(Academic())}, "model is Academic .*; the env plays ReverseDuffing"),
         ({"estimator": "pinn_obs_replay"}, "has to be trained first: pinnobs train pinn_obs"),

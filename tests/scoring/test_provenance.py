@@ -3,20 +3,24 @@
 import importlib
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
 from edited import EDITS, FILES, write
+from stored_rows import row
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.provenance import (
     canonical,
     estimator_code,
     estimator_hash,
     game_hash,
+    now,
     training_code,
 )
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
@@ -109,3 +113,13 @@ def test_a_training_depends_on_its_trainer_and_on_its_plant():
 def test_canonical_values_are_plain():
     shown = canonical({"a": np.float64(1.5), "b": (1, np.array([2.0])), "c": ReverseDuffing})
     assert shown == {"a": 1.5, "b": [1, [2.0]], "c": "ReverseDuffing"}
+    endless = canonical({"a": np.float64("inf"), "b": [float("nan"), np.array([-np.inf])]})
+    assert endless == {"a": "inf", "b": ["nan", ["-inf"]]}
+    assert canonical(np.float32("inf")) == "inf"
+
+
+def test_times_are_dates_of_rows(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0, date=now())])
+    (back,) = rows.read(path)
+    assert abs(datetime.fromisoformat(back["date"]) - datetime.now(UTC)) < timedelta(days=1)

@@ -1,3 +1,4 @@
+import json
 import math
 import sys
 
@@ -27,6 +28,15 @@ def test_what_cannot_be_read_is_one_clear_line(tmp_path):
     one.write_bytes(one.read_bytes() + other.read_bytes())
     with pytest.raises(ValueError, match="lines 1 and 2, give different scores"):
         read_rows(one)
+
+
+def test_blank_lines_and_uses_are_no_episodes(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0)])
+    names = ("env_id", "setup", "condition", "game_hash", "estimator", "estimator_hash", "date")
+    known = {"schema": 5, "kind": "use", **dict.fromkeys(names, "x"), "date": "2030-01-02"}
+    path.write_text("\n" + path.read_text() + " \n" + json.dumps(known) + "\n\n")
+    assert [r["episode"] for r in read_rows(path)] == ["seed:0"]
 
 
 def test_a_cut_line_is_left_out_with_a_warning(tmp_path, caplog):

@@ -42,7 +42,7 @@ class Stubborn(Estimator):
 
 def search(path, **changes):
     chosen = {"estimator": Stubborn, "condition": "nominal", "episodes": 8, **changes}
-    game = Game.of(Linear, condition=chosen["condition"])
+    game = Game.of(chosen.get("system", Linear), condition=chosen["condition"])
     return Search(chosen["estimator"], game, chosen["episodes"], path / "trials")
 
 
@@ -95,6 +95,24 @@ def test_it_goes_on_with_what_was_tried(tmp_path):
     assert len(set(settings)) == len(settings)  # what was tried is not tried again
     again.run(7, told.append)
     assert len(told) == 7
+
+
+@pytest.mark.parametrize(("name", "base"), [("estimator", Stubborn), ("system", Linear)])
+def test_trials_of_code_that_cannot_be_read_are_not_reused(tmp_path, name, base):
+    scope = {"__name__": "nowhere", "Base": base}
+    exec("class Hidden(Base): pass", scope)
+    first, told = search(tmp_path, **{name: scope["Hidden"]}), []
+    first.run(4, told.append)
+    first.run(6, told.append)  # the same search goes on
+    assert len(told) == first.done() == 6
+    assert first.best().error == min(tried.error for tried in told if tried is not None)
+    again = search(tmp_path, **{name: scope["Hidden"]})
+    assert again.done() == 0
+    assert again.best() is None
+    again.run(2, told.append)
+    assert (again.done(), first.done(), len(told)) == (2, 6, 8)
+    again.forget()
+    assert (again.done(), first.done()) == (0, 6)
 
 
 def test_episodes_are_never_the_leaderboards(tmp_path, monkeypatch):
