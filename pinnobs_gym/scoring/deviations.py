@@ -23,7 +23,8 @@ def deviations(estimator: BaseEstimator, game: Game) -> dict[str, Any]:
     """Return what differs between an estimator and the one that its name stands for in a game: its
     settings or those of its training that are not the defaults, a noise level or a model other than
     those of the game, and a condition that it was trained under."""
-    found = _of_training(estimator) if estimator.training else _of_options(estimator)
+    trained = type(estimator).needs_training or type(estimator).trains_on_record
+    found = _of_training(estimator) if trained else _of_options(estimator)
     if "noise" in estimator.knows:
         known, played = (
             output_noise(game.source.system, std)
@@ -56,10 +57,7 @@ def _of_training(estimator: BaseEstimator) -> dict[str, Any]:
     """Return the settings of the training that are not those of the estimator's own recipe; a
     preset's name stands for its settings, unless the name of the estimator's recipe says it."""
     cls, config = type(estimator), canonical(estimator.training.get("config", {}))
-    try:
-        trainer, usual = trainer_class(cls), cls.trainer_config({})
-    except (AttributeError, ValueError):  # there is no trainer of this kind
-        return {}
+    trainer, usual = trainer_class(cls), cls.trainer_config({})
     # The preset that is nearest to the settings; the estimator's own one if several are.
     makers = {"": lambda: usual, **trainer.presets}
     presets = {name: make() for name, make in makers.items()}

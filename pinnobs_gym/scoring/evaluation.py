@@ -78,9 +78,8 @@ class Results:
             last_use = LastUse.of([*stored.rows, *stored.uses])
         if not last_use.is_last(common):
             used = {name: common[name] for name in NEEDED["use"] if name in common}
-            rows_module.append(
-                self.path, [{"schema": SCHEMA} | used | {"kind": "use", "date": now()}]
-            )
+            use = {"schema": SCHEMA, "kind": "use", **used, "date": now()}
+            rows_module.append(self.path, [use])
 
 
 def evaluate(

@@ -278,9 +278,12 @@ def _differing(row: Row, other: Row) -> str:
     if row == other:
         return ""
     for name in [n for n in (row | other) if n not in _ASIDE]:
-        one, two = row.get(name), other.get(name)
+        one, two = (each.get(name) for each in (row, other))
         if name == "training":
-            one, two = ({n: v for n, v in t.items() if n != "seconds"} for t in (one, two))
+            one, two = (
+                {n: v for n, v in each["training"].items() if n != "seconds"}
+                for each in (row, other)
+            )
         rounding = math.inf if row["diverged"] and name in _ESTIMATES else TOLERANCE
         if not _alike(one, two, rounding):
             return name

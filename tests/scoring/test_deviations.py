@@ -1,12 +1,11 @@
 """What names in tables say of an estimator's settings."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.kkl import KKLSupervised
 from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.scoring.deviations import deviations
 from pinnobs_gym.scoring.evaluation import evaluate
@@ -69,8 +68,7 @@ def test_a_training_under_another_condition_is_named():
 
         @property
         def training(self):
-            config = asdict(KKLSupervised.trainer_config({}))
-            return {"config": config, "condition": self.trained_under}
+            return {"condition": self.trained_under}
 
     estimator = Trained(ReverseDuffing())
     assert "trained_under" not in deviations(estimator, DUFFING)
