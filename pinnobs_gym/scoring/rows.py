@@ -300,8 +300,9 @@ def _alike(value: Any, other: Any, rounding: float) -> bool:
         return len(value) == len(other) and all(
             _alike(*pair, rounding) for pair in zip(value, other, strict=True)
         )
-    if type(value) in (int, float) and type(other) in (int, float):
-        return rounding == math.inf or math.isclose(value, other, rel_tol=rounding, abs_tol=1e-12)
+    numbers: list[Any] = [value, other]
+    if all(type(number) in (int, float) for number in numbers):
+        return rounding == math.inf or math.isclose(*numbers, rel_tol=rounding, abs_tol=1e-12)
     return type(value) is type(other) and value == other
 
 

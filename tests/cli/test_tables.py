@@ -206,7 +206,7 @@ def test_explanations_are_as_wide_as_the_tables(printed, monkeypatch):
 
 
 def test_what_is_left_out_is_told_beside_the_tables(path, capsys):
-    rows.append(path, rows_of("ekf", [0.3], game_hash="older", date="2029-01-01", **FACTS))
+    rows.append(path, rows_of("ekf", [0.15], game_hash="older", date="2029-01-01", **FACTS))
     assert main(["tables", str(path), "--table", "X"]) == 0
     printed = capsys.readouterr()
     assert "1 episodes of pinnobs/X-v0, benchmark, nominal are left out" in printed.err
