@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pinnobs_gym.scoring.evaluation import evaluate
     from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.system import Setup, System, stack
+    from pinnobs_gym.simulation.table import table
 
 __all__ = [
     "Estimator",
@@ -27,6 +28,7 @@ __all__ = [
     "read_rows",
     "register",
     "stack",
+    "table",
 ]
 
 __version__: str
@@ -38,6 +40,7 @@ _HOMES = {
     "Setup": "simulation.system",
     "System": "simulation.system",
     "stack": "simulation.system",
+    "table": "simulation.table",
     "evaluate": "scoring.evaluation",
     "read_rows": "scoring.table",
 }
