@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -16,7 +16,7 @@ METHODS = ("linear", "monotone")
 
 
 def table(
-    x: Array | float,
+    x: Array,
     points: Iterable[float],
     values: Iterable[float],
     method: Literal["linear", "monotone"] = "linear",
@@ -45,7 +45,8 @@ def table(
         ValueError: in one line, if the points do not increase, are fewer than two or not as many as
             the values, if a number is not finite, or if the method is unknown.
     """
-    knots, coefficients = _pieces(_numbers(points, "points"), _numbers(values, "values"), method)
+    parts: tuple[Any, Any] = _pieces(_numbers(points, "points"), _numbers(values, "values"), method)
+    knots, coefficients = parts
     if isinstance(x, np.ndarray) and x.dtype == object:
         return _of_symbols(x, knots, coefficients)
     if isinstance(x, np.ndarray | np.generic | int | float):
@@ -62,24 +63,24 @@ def table(
         piece = xp.sum(xp.astype(x[..., None] >= knots[1:], xp.int64), axis=-1)
     # An index without axes would be read as a number, which torch.func.vmap does not allow.
     at = piece[None]
-    knot, a, b, c, d = (part[at][0] for part in (knots, *coefficients))
-    s = x - knot
-    return a + s * (b + s * (c + s * d))
+    s = x - knots[at][0]
+    *lower, y = (part[at][0] for part in coefficients)
+    for part in reversed(lower):  # Horner's scheme
+        y = part + s * y
+    return y
 
 
-def _of_symbols(x: np.ndarray, knots: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return y(x) of symbols, a choice between the pieces in turn, from the last to the first."""
-    rows = list(zip(knots.tolist(), coefficients.T.tolist(), strict=True))
-    result = None
-    for (start, row), end in zip(reversed(rows), [None, *knots[:0:-1].tolist()], strict=True):
-        s = x - start
-        y = row[0] + row[1] * s
-        for power, factor in enumerate(row[2:], 2):
-            if factor:
-                y = y + factor * s**power
-        result = y if end is None else np.where(x < end, y, result)
-    assert result is not None  # there are at least three pieces
-    return result
+def _of_symbols(x: Array, knots: np.ndarray, coefficients: np.ndarray) -> Array:
+    """Return y(x) of symbols, by a choice between the pieces from the last to the first."""
+    starts = knots.tolist()
+    pieces = [
+        sum(factor * (x - start) ** power for power, factor in enumerate(row) if factor)
+        for start, row in zip(starts, coefficients.T.tolist(), strict=True)
+    ]
+    y = pieces[-1]
+    for end, piece in zip(starts[:0:-1], pieces[-2::-1], strict=True):
+        y = np.where(x < end, piece, y)
+    return y
 
 
 def _numbers(given: Iterable[float], name: str) -> tuple[float, ...]:
@@ -96,8 +97,8 @@ def _pieces(
     """Return the pieces of y: a + bs + cs² + ds³ with s = x − knot.
 
     Returns:
-        The knots, (n + 1,), and the coefficients (4, n + 1) of n points. Piece 0 is below the first
-        point, which is its knot, and piece j begins at the j-th point, its knot.
+        The knots, (n + 1,), and the coefficients (2 or 4, n + 1) of n points. Piece 0 is below the
+        first point, which is its knot, and piece j begins at the j-th point, its knot.
     """
     p, v = np.array(points), np.array(values)
     if method not in METHODS:
@@ -118,7 +119,7 @@ def _pieces(
             "increasing numbers"
         )
     slope = np.diff(v) / width
-    coefficients = np.zeros((4, len(p) + 1))
+    coefficients = np.zeros((2 if method == "linear" else 4, len(p) + 1))
     coefficients[0] = v[np.r_[0, : len(p)]]
     inner = coefficients[:, 1:-1]
     if method == "linear":
