@@ -25,11 +25,12 @@ def augmented(
 
     The further states are, in this order: the parameters by their names, ``bias_<output>``, which
     is added to an output, and ``disturbance_<state>``, which is added to the rate of change of a
-    state, in state units per second. Their scale is the standard deviation.
+    state, in state units per second. Their scale is the standard deviation, so that an error of 1
+    in the scores is no better than the prior.
 
     In each setup, initial states are those of the given system, and each constant is uniform within
     √3 standard deviations of its mean. The prior consists of the system's own and of the means and
-    variances of the constants, all independent. In a setup that names an unknown parameter, its mean
+    variances of the constants, all independent. Where a setup names an unknown parameter, the mean
     is the setup's value.
 
     Its class, ``type(augmented(...))``, is named after the system and its constants, as
@@ -85,14 +86,15 @@ def _class(
     arguments give the same class."""
     cls, constants = type(plant), dict(parameters)
     _check_input(plant, parameters)
-    extras = {
-        **constants,
-        **{f"bias_{name}": value for name, value in biases},
-        **{f"disturbance_{name}": value for name, value in disturbances},
-    }
+    pairs = [
+        *parameters,
+        *((f"bias_{name}", value) for name, value in biases),
+        *((f"disturbance_{name}", value) for name, value in disturbances),
+    ]
     kept = [f for f in fields(plant) if not f.kw_only and f.name not in constants]
-    names = [*plant.state_names, *plant.output_names, *plant.input_names]
-    _check_names(cls.__name__, extras, [*names, *(f.name for f in kept)], len(parameters))
+    taken = [*plant.state_names, *plant.output_names, *plant.input_names, *(f.name for f in kept)]
+    _check_names(cls.__name__, [name for name, _ in pairs], taken)
+    extras = dict(pairs)
     title = "_".join([cls.__name__, *extras])
     namespace = {
         **_attributes(plant, extras, [f.name for f in kept]),
@@ -112,7 +114,8 @@ def _class(
         )
     ]
     made: Any = make_dataclass(title, own, bases=(Augmented,), namespace=namespace, frozen=True)
-    _check_rows(made(), plant)
+    if parameters:
+        _check_rows(made(), plant)
     return made
 
 
@@ -217,17 +220,14 @@ def _diagonal(cov: np.ndarray, stds: np.ndarray) -> tuple[tuple[float, ...], ...
     return tuple(map(tuple, whole.tolist()))
 
 
-def _check_names(
-    system: str, extras: Mapping[str, Unknown], taken: list[str], num_parameters: int
-) -> None:
+def _check_names(system: str, names: list[str], taken: list[str]) -> None:
     """Raise ValueError if there are no constants, or if one has the name of something else."""
-    if not extras:
+    if not names:
         raise ValueError(
             f"nothing of {system} is unknown; give parameters, output_bias or disturbance"
         )
-    names = list(extras)
     for i, name in enumerate(names):
-        if name in taken or (i >= num_parameters and name in names[:num_parameters]):
+        if name in taken or name in names[:i]:
             raise ValueError(f"{system} has {name!r} already; the new state needs that name")
 
 

@@ -11,7 +11,7 @@ import sympy
 import torch
 from array_api_compat import array_namespace
 from filterpy.kalman import KalmanFilter
-from linear import A, H, Linear, record_of
+from linear import A, FeedThrough, H, Linear, record_of
 
 from pinnobs_gym import Setup, System, Unknown, augmented, stack, table
 from pinnobs_gym.envs.episodes import EpisodeSource
@@ -140,14 +140,13 @@ def test_jacobians_from_those_by_hand_are_those_of_all_equations(kind):
         assert np.array_equal(found[..., columns], exact[..., columns])
 
 
-MOTOR = InductionMotor()
 AUGMENTED = {
     "duffing": augmented(
         ReverseDuffing(), None, {"y1": Unknown(0.0, 0.3)}, {"x2": Unknown(0.1, 0.1)}
     ),
     "satellite": augmented(Satellite(), **SATELLITE),
     "undisturbed": augmented(Satellite(), {"a1": Unknown(0.5, 0.02)}),
-    "motor": augmented(MOTOR, {"T_L": Unknown(10.0, 2.0)}),
+    "driven": augmented(FeedThrough(), None, {"y2": Unknown(0.0, 0.1)}),
     "spring": augmented(Spring(), {"k": Unknown(4.0, 1.0), "gain": Unknown(1.0, 0.1)}),
 }
 AUGMENTED["twice"] = augmented(
@@ -181,10 +180,13 @@ def test_the_rest_is_the_plants():
     assert disturbed.invariants(some) is None
     assert disturbed.indistinguishable(some) == ()
     assert system.parameters == {"a2": -0.875, "a3": 2 / 3, "measure_x3": False}
-    motor, t = AUGMENTED["motor"], np.linspace(0, 1, 7)
-    assert np.array_equal(motor.input(t), MOTOR.input(t))
-    assert motor.breakpoints() == MOTOR.breakpoints()
-    assert np.array_equal(motor.observable(x[0])[:1], [True])
+    motor, t = InductionMotor(), np.linspace(0, 1, 7)
+    loaded = augmented(motor, {"T_L": Unknown(10.0, 2.0)})
+    assert np.array_equal(loaded.input(t), motor.input(t))
+    assert loaded.breakpoints() == motor.breakpoints()
+    states = np.random.default_rng(0).standard_normal((5, 6))
+    assert np.array_equal(loaded.observable(states)[:, :5], motor.observable(states[:, :5]))
+    assert loaded.observable(states)[:, 5].all()
     # What the plant leaves to System is so here, as others ask.
     assert type(system).input is System.input
     assert type(AUGMENTED["spring"]).admissible is System.admissible
@@ -276,8 +278,10 @@ class Battery(System):
     }
     voltages: ClassVar = (3.00, 3.40, 3.50, 3.57, 3.62, 3.68, 3.76, 3.86, 3.96, 4.07, 4.19)
 
+    charges: ClassVar = tuple(k / 10 for k in range(11))
+
     def ocv(self, soc):
-        return table(soc, np.linspace(0, 1, 11), self.voltages, "monotone")
+        return table(soc, self.charges, self.voltages, "monotone")
 
     def f(self, t, x, u):
         i = u[..., 0]
@@ -385,7 +389,17 @@ def test_what_cannot_be_augmented_is_refused_in_one_line(given, says):
     assert "\n" not in str(raised.value)
 
 
+@dataclass(frozen=True)
+class Taken(Spring):
+    """A parameter has the name of a bias."""
+
+    bias_y: float = 0.0
+
+
 def test_a_name_is_given_once():
+    for parameters in (None, {"bias_y": ONE}):
+        with pytest.raises(ValueError, match="Taken has 'bias_y' already; the new state"):
+            augmented(Taken(), parameters, {"y": ONE})
     once = augmented(Spring(), output_bias={"y": ONE})
     with pytest.raises(ValueError, match="Spring_bias_y has 'bias_y' already; the new state"):
         augmented(once, output_bias={"y": ONE})
