@@ -15,18 +15,24 @@ if TYPE_CHECKING:
     from pinnobs_gym.estimation.estimator import Estimator, State
     from pinnobs_gym.scoring.evaluation import evaluate
     from pinnobs_gym.scoring.table import read_rows
+    from pinnobs_gym.simulation.augmented import augmented
+    from pinnobs_gym.simulation.augmented_system import Unknown
     from pinnobs_gym.simulation.system import Setup, System, stack
+    from pinnobs_gym.simulation.table import table
 
 __all__ = [
     "Estimator",
     "Setup",
     "State",
     "System",
+    "Unknown",
     "__version__",
+    "augmented",
     "evaluate",
     "read_rows",
     "register",
     "stack",
+    "table",
 ]
 
 __version__: str
@@ -37,7 +43,10 @@ _HOMES = {
     "State": "estimation.estimator",
     "Setup": "simulation.system",
     "System": "simulation.system",
+    "Unknown": "simulation.augmented_system",
+    "augmented": "simulation.augmented",
     "stack": "simulation.system",
+    "table": "simulation.table",
     "evaluate": "scoring.evaluation",
     "read_rows": "scoring.table",
 }

@@ -105,7 +105,7 @@ class Setup:
     @property
     def times(self) -> np.ndarray:
         """Sample times in s, shape (num_steps + 1,), starting at 0."""
-        return np.arange(self.num_steps + 1) * self.dt
+        return np.arange(self.num_steps + 1) * float(self.dt)
 
     @property
     def transient_end(self) -> float:

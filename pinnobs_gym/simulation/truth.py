@@ -55,6 +55,7 @@ def truth(
     Raises:
         FloatingPointError: if a state is not finite.
     """
+    times = np.asarray(times, dtype=float)
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
     # Integrate each interval between breakpoints separately, since f is smooth only within it.

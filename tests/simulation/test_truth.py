@@ -299,6 +299,26 @@ def test_blow_up_names_the_initial_state() -> None:
     assert x[:, 0] == pytest.approx(1 / (1 / x0[0] - BENCHMARK.times[:, None]), abs=1e-9)
 
 
+@dataclass(frozen=True)
+class Falling(VanDerPol):
+    """x'' = -1, with a sample time and a duration in whole seconds."""
+
+    setups = {"benchmark": Setup((0.0, 1.0), (1.0, 2.0), duration=60, dt=2)}
+
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        return stack(x, x[..., 1], -1.0)
+
+
+def test_sample_times_may_be_whole_numbers() -> None:
+    system, t = Falling(), np.arange(31) * 2
+    x0 = np.array([[0.5, 1.5], [0.1, 1.2]])
+    x = truth(system, x0, t)
+    assert np.allclose(x[..., 0], x0[:, 0] + x0[:, 1] * t[:, None] - t[:, None] ** 2 / 2)
+    source = EpisodeSource(Falling)
+    x = source.play(source.draw(source.streams(range(3)))).x
+    assert np.allclose(x[-1, :, 1], x[0, :, 1] - 60)
+
+
 def test_few_and_irregular_samples() -> None:
     system = HarmonicOscillator()
     x0 = np.array([[1.0, 0.0, 4.0]])

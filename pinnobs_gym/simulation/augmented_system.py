@@ -1,0 +1,180 @@
+"""The equations of a system with unknown constants as further states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+from array_api_compat import array_namespace
+
+from pinnobs_gym.simulation.system import Array, System, stack
+
+_STEP = float(np.cbrt(np.finfo(float).eps))
+"""Relative step of the differences; the cube root of the rounding error minimises their error."""
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a number, truth values aside."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A constant of which only a mean and a standard deviation are known."""
+
+    mean: float
+    """Mean, in the unit of the constant."""
+    std: float
+    """Standard deviation, above 0."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("mean", self.mean), ("std", self.std)):
+            if not (is_number(value) and np.isfinite(value)) or (name == "std" and value <= 0):
+                expected = "a number" if name == "mean" else "a number above 0"
+                raise ValueError(f"{name}={value!r} of an Unknown; expected {expected}")
+
+
+Constants: TypeAlias = tuple[tuple[str, Unknown], ...]
+"""Unknown constants with the name of the parameter, output or state that each belongs to."""
+_PARAMETER, _BIAS, _DISTURBANCE = range(3)
+"""Kinds of constants, in their order in the state."""
+
+
+@dataclass(frozen=True)
+class Augmented(System):
+    """The base class of what `augmented` returns. The fields of its subclasses are the parameters
+    that remain known."""
+
+    plant: System = field(kw_only=True)
+    """The system without further states."""
+
+    constants: ClassVar[tuple[Constants, Constants, Constants]]
+    """The constants of each kind, in the order of their columns."""
+
+    def _parts(self, x: Array) -> tuple[System, Array]:
+        """Return the plant with the parameters of x (..., nx), and its state."""
+        own, n = {name: getattr(self, name) for name in self.parameters}, self.plant.nx
+        names = (name for name, _ in self.constants[_PARAMETER])
+        unknown = {name: x[..., n + i] for i, name in enumerate(names)}
+        return replace(self.plant, **own, **unknown), x[..., :n]
+
+    @property
+    def _known(self) -> System:
+        """The plant at the mean of the unknown parameters."""
+        return replace(self.plant, **{name: getattr(self, name) for name in self.parameters})
+
+    def _columns(self, kind: int, names: tuple[str, ...]) -> dict[int, int]:
+        """Return the column in the state of each constant of a kind (`_BIAS` or `_DISTURBANCE`),
+        by the number of the output or state that it is added to."""
+        first = self.plant.nx + sum(map(len, self.constants[:kind]))
+        return {names.index(name): first + i for i, (name, _) in enumerate(self.constants[kind])}
+
+    def _plus(self, y: Array, x: Array, columns: dict[int, int]) -> Array:
+        """Return y (..., m) with the constants of these columns of x (..., nx) added."""
+        if not columns:
+            return y
+        rows = range(y.shape[-1])
+        return y + stack(x, *(x[..., columns[i]] if i in columns else 0.0 for i in rows))
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        plant, state = self._parts(x)
+        columns = self._columns(_DISTURBANCE, plant.state_names)
+        return _joined(x, self._plus(plant.f(t, state, u), x, columns), 0.0)
+
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        plant, state = self._parts(x)
+        return self._plus(plant.h(t, state, u), x, self._columns(_BIAS, plant.output_names))
+
+    def input(self, t: Array) -> Array:
+        return self._known.input(t)
+
+    def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
+        """Return ∂f/∂x, (..., nx, nx), from the plant's own Jacobian (see `_jacobian`)."""
+        if not isinstance(x, np.ndarray):
+            return super().f_jacobian(t, x, u)
+        plant, state = self._parts(x)
+        above = self._jacobian(self.f, plant.f_jacobian(t, state, u), t, x, u)
+        _set_ones(above, self._columns(_DISTURBANCE, plant.state_names))
+        F = np.zeros_like(above, shape=(*x.shape, self.nx))
+        F[..., : plant.nx, :] = above
+        return F
+
+    def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
+        """Return ∂h/∂x, (..., ny, nx), from the plant's own Jacobian (see `_jacobian`)."""
+        if not isinstance(x, np.ndarray):
+            return super().h_jacobian(t, x, u)
+        plant, state = self._parts(x)
+        H = self._jacobian(self.h, plant.h_jacobian(t, state, u), t, x, u)
+        _set_ones(H, self._columns(_BIAS, plant.output_names))
+        return H
+
+    def _jacobian(
+        self,
+        function: Callable[[Array, np.ndarray, Array], Any],
+        own: Array,
+        t: Array,
+        x: np.ndarray,
+        u: Array,
+    ) -> np.ndarray:
+        """Return the derivatives of the plant's rates or outputs, (..., m, nx): its own Jacobian
+        (..., m, n), central differences by each parameter, and zero by the other constants.
+
+        The error of the differences is about 1e-10 of the function's value, relative to the larger
+        of the parameter and its standard deviation.
+        """
+        size, n = np.shape(own)[-2], self.plant.nx
+        result = np.zeros_like(own, shape=(*x.shape[:-1], size, self.nx))
+        result[..., :n] = own
+        for j in range(n, n + len(self.constants[_PARAMETER])):
+            step = _STEP * np.maximum(abs(x[..., j]), self.scale[j])
+            ends = []
+            for sign in (1, -1):
+                shifted = x.copy(order="K")
+                shifted[..., j] += sign * step
+                ends.append(function(t, shifted, u)[..., :size])
+            result[..., j] = (ends[0] - ends[1]) / (2 * step)[..., None]
+        return result
+
+    def admissible(self, x0: Array) -> Array:
+        plant, state = self._parts(x0)
+        return plant.admissible(state)
+
+    def observable(self, x: Array) -> Array:
+        """The plant's components as the plant says, and all constants."""
+        plant, state = self._parts(x)
+        return _joined(x, plant.observable(state), True)
+
+    def invariants(self, x: Array) -> Array | None:
+        """Those of the plant, if nothing disturbs it."""
+        plant, state = self._parts(x)
+        return None if self.constants[_DISTURBANCE] else plant.invariants(state)
+
+    def indistinguishable(self, x: Array) -> tuple[Array, ...]:
+        """Those of the plant with the same constants, if nothing disturbs it."""
+        if self.constants[_DISTURBANCE]:
+            return ()
+        plant, state = self._parts(x)
+        xp = array_namespace(x)
+        same = x[..., plant.nx :]
+        return tuple(xp.concat([other, same], axis=-1) for other in plant.indistinguishable(state))
+
+    def breakpoints(self) -> tuple[float, ...]:
+        return self._known.breakpoints()
+
+
+def _joined(x: Array, first: Array, value: float | bool) -> Array:
+    """Return the array (..., nx) of the columns ``first`` and one value in those that are left."""
+    if isinstance(first, np.ndarray):
+        out = np.empty_like(x, dtype=first.dtype)
+        out[..., : first.shape[-1]], out[..., first.shape[-1] :] = first, value
+        return out
+    xp = array_namespace(first)
+    rest = xp.full_like(x[..., first.shape[-1] :], value, dtype=first.dtype)
+    return xp.concat([first, rest], axis=-1)
+
+
+def _set_ones(matrix: np.ndarray, columns: dict[int, int]) -> None:
+    for row, column in columns.items():
+        matrix[..., row, column] = 1.0
