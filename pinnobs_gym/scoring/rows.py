@@ -278,20 +278,22 @@ def _differing(row: Row, other: Row) -> str:
     if row == other:
         return ""
     for name in [n for n in (row | other) if n not in _ASIDE]:
-        one, two = (each.get(name) for each in (row, other))
+        one, two = row.get(name), other.get(name)
         if name == "training":
-            one, two = (
-                {n: v for n, v in each["training"].items() if n != "seconds"}
-                for each in (row, other)
-            )
+            one, two = ({**each["training"], "seconds": None} for each in (row, other))
         rounding = math.inf if row["diverged"] and name in _ESTIMATES else TOLERANCE
         if not _alike(one, two, rounding):
             return name
     return ""
 
 
+_NUMBER: tuple[Any, ...] = (int, float)  # bool is another type
+
+
 def _alike(value: Any, other: Any, rounding: float) -> bool:
     """Return whether two values are equal, their numbers up to a relative rounding."""
+    if type(value) in _NUMBER and type(other) in _NUMBER:
+        return rounding == math.inf or math.isclose(value, other, rel_tol=rounding, abs_tol=1e-12)
     if type(value) is dict and type(other) is dict:
         return value.keys() == other.keys() and all(
             _alike(part, other[name], rounding) for name, part in value.items()
@@ -300,9 +302,6 @@ def _alike(value: Any, other: Any, rounding: float) -> bool:
         return len(value) == len(other) and all(
             _alike(*pair, rounding) for pair in zip(value, other, strict=True)
         )
-    numbers: list[Any] = [value, other]
-    if all(type(number) in (int, float) for number in numbers):
-        return rounding == math.inf or math.isclose(*numbers, rel_tol=rounding, abs_tol=1e-12)
     return type(value) is type(other) and value == other
 
 

@@ -1,6 +1,6 @@
 """Rows that no estimator was run for."""
 
-from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.scoring.metrics import DIVERGED, OPTIONAL_SCORES, SCORES
 
 
 def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
@@ -27,6 +27,7 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
             "training": {},
             "us_per_step": 1.0,
             "diverged": bad,
+            "nrmse_tail": float("inf") if bad else min(value, DIVERGED),
             "episode": f"seed:{i}",
             "state_rmse": {},
             "free_over_known": None,

@@ -111,7 +111,7 @@ def test_drawing_needs_neither_rows_nor_curves(tmp_path, counted):
 
 def test_a_contender_has_one_name_in_all_sections():
     """Other settings have fewer rows in all, but more under the condition that is ranked."""
-    gated = {"options": {"gate": 0.9}, "estimator_hash": "gated"}
+    gated = {"options": {"gate": 0.9}, "settings": {"gate": 0.9}, "estimator_hash": "gated"}
     rows = rows_of("ekf", [0.1] * 4, condition="noise5", ranked=False, **COMMON)
     rows += rows_of("ekf", [0.1], **COMMON)
     rows += rows_of("ekf", [0.2, 0.2], **gated, **COMMON)
