@@ -21,6 +21,10 @@ _NODES = 6
 _HALVINGS = 7
 """Number of steps tried, each half the one before, before an episode is passed to an adaptive
 solver."""
+_EVALUATIONS = 40_000
+"""Largest number of evaluations of f by the adaptive solver in a `_PART` of an interval."""
+_PART = 0.01
+"""Part of an interval by which the adaptive solver has to advance with that many."""
 _DIVERGED = 1e9
 """Size of a state, relative to its scale, at which it counts as diverged."""
 
@@ -53,7 +57,8 @@ def truth(
         States, shape (num_samples, batch, nx).
 
     Raises:
-        FloatingPointError: if a state is not finite.
+        FloatingPointError: in one line, if a state is not finite, or the adaptive method cannot go
+            on beyond some time.
     """
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
@@ -327,13 +332,30 @@ def _solve_adaptively(
     """Simulate one episode by LSODA, which handles stiff and non-smooth plants.
 
     Returns NaN if the state diverges; near a singularity such a method would never finish.
+
+    Raises:
+        FloatingPointError: in one line, if it takes more than `_EVALUATIONS` evaluations of f to
+            advance by a `_PART` of the interval: no step is short enough where f jumps back and
+            forth, as Coulomb friction does at rest.
     """
     from scipy.integrate import solve_ivp  # importing it takes longer than simulating an episode
 
     last = np.nextafter(end, start)
     scale = vector(system.scale, system.nx, "scale")
 
+    reached, count = start, 0
+
     def rate(t: float, x: np.ndarray) -> np.ndarray:
+        nonlocal reached, count
+        count += 1
+        if t > reached + _PART * (end - start):
+            reached, count = t, 0
+        elif count > _EVALUATIONS:
+            raise FloatingPointError(
+                f"{type(system).__name__} from x0={x0.tolist()}: its solver cannot go on beyond "
+                f"t={t:.6g} s, x={x.tolist()}, in {_EVALUATIONS} evaluations of f; expected an f "
+                f"that is continuous in x, or jumps that the state crosses"
+            )
         now = np.asarray(min(t, last))
         return system.f(now, x[None], system.input(now))[0]
 
