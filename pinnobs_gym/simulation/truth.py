@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -343,33 +344,38 @@ def _solve_adaptively(
     last = np.nextafter(end, start)
     scale = vector(system.scale, system.nx, "scale")
 
-    reached, count = start, 0
+    part, count, now, state = start, 0, start, x0
+
+    def stuck(why: str) -> FloatingPointError:
+        return FloatingPointError(
+            f"{type(system).__name__} from x0={x0.tolist()}: the solver cannot go on beyond "
+            f"t={now:.6g} s, x={state.tolist()}, {why}; expected an f that is continuous in x, or "
+            f"jumps that the state crosses"
+        )
 
     def rate(t: float, x: np.ndarray) -> np.ndarray:
-        nonlocal reached, count
-        count += 1
-        if t > reached + _PART * (end - start):
-            reached, count = t, 0
+        nonlocal part, count, now, state
+        count, now, state = count + 1, t, x
+        if t > part + _PART * (end - start):
+            part, count = t, 0
         elif count > _EVALUATIONS:
-            raise FloatingPointError(
-                f"{type(system).__name__} from x0={x0.tolist()}: its solver cannot go on beyond "
-                f"t={t:.6g} s, x={x.tolist()}, in {_EVALUATIONS} evaluations of f; expected an f "
-                f"that is continuous in x, or jumps that the state crosses"
-            )
-        now = np.asarray(min(t, last))
-        return system.f(now, x[None], system.input(now))[0]
+            raise stuck(f"with {_EVALUATIONS} evaluations of f")
+        at = np.asarray(min(t, last))
+        return system.f(at, x[None], system.input(at))[0]
 
     def margin(t: float, x: np.ndarray) -> float:
         return _DIVERGED - float((abs(x) / scale).max())
 
     margin.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
-    solution = solve_ivp(
-        rate, (start, end), x0, "LSODA", times, events=margin, rtol=1e-11, atol=1e-12 * scale
-    )
-    x = np.full((len(times), len(x0)), np.nan)
-    if solution.status == 0:
-        x[:] = solution.y.T
-    return x
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the reason for which LSODA ends is its status
+        solution = solve_ivp(
+            rate, (start, end), x0, "LSODA", times, events=margin, rtol=1e-11, atol=1e-12 * scale
+        )
+    diverged = solution.status == 1 or not np.isfinite(state).all()
+    if solution.status == -1 and not diverged:
+        raise stuck("with any step")
+    return np.full((len(times), len(x0)), np.nan) if diverged else solution.y.T
 
 
 def rows_of(system: System, rows: np.ndarray) -> System:
