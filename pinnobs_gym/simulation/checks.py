@@ -18,6 +18,8 @@ from pinnobs_gym.simulation.conformance import (
     run_all,
 )
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
 
@@ -27,6 +29,9 @@ JACOBIAN_TOLERANCE = 1e-6
 """Largest error of a Jacobian, relative to scale; that of central differences is below 1e-9."""
 TRUTH_TOLERANCE = 1e-8
 """Largest relative change of a conserved quantity along the truth."""
+STEP_WARNING = 1e-5
+"""Largest error of the model over a sample, relative to scale, without a warning. By default steps
+have a local error of at most `pinnobs_gym.simulation.runge_kutta.STEP_TOLERANCE`."""
 
 SYSTEM_CHECKS: dict[str, Callable[[type[System]], None]] = {}
 """The checks of a system by name. Each raises `CheckFailed`."""
@@ -36,7 +41,8 @@ def check_system(cls: type[System]) -> None:
     """Run all `SYSTEM_CHECKS` on a system.
 
     Warns:
-        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup.
+        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup, if the model
+            takes several Runge-Kutta steps per sample, or if it differs from the truth after one.
 
     Raises:
         CheckFailed: if any check fails; one line per failure with the check's name, what it found
@@ -295,6 +301,45 @@ def _system_prior(cls: type[System]) -> None:
                     f"x̂₀={xhat0.tolist()}; filters that linearise there fail",
                     stacklevel=2,
                 )
+
+
+@add_check(SYSTEM_CHECKS, "model_step")
+def _system_model_step(cls: type[System]) -> None:
+    """The model's step over a sample agrees with the truth. A warning says where it does not, and
+    where a sample takes several Runge-Kutta steps, which take time."""
+    for name, system, setup in _setups(cls):
+        step, dt = longest_step(system), setup.dt
+        where = f"system {cls.__name__}, setup {name!r}: a sample of {dt:g} s"
+        if system.model_step is None and step < dt * (1 - 1e-9):
+            found = f"{where} takes Runge-Kutta steps of at most {step:g} s to be precise"
+            warnings.warn(f"{found}; set model_step if they are too many", stacklevel=2)
+        off = _model_error(system, setup)
+        if not off <= STEP_WARNING:
+            warnings.warn(
+                f"{where} by the model, in steps of {step:g} s, is off by {off:.1e} of scale; "
+                f"expected at most {STEP_WARNING:.0e}: set a shorter model_step, or add the times "
+                f"at which f jumps to breakpoints()",
+                stacklevel=2,
+            )
+
+
+def _model_error(system: System, setup: Setup) -> float:
+    """Return the largest difference of the model's step over a sample from the truth, relative to
+    the larger of state and scale. Samples over a breakpoint do not count."""
+    times = setup.times
+    count = 1 if setup.fixed_x0 else 5
+    first = np.unique(np.linspace(0, len(times) - 2, 100).astype(int))
+    x0 = initial_states(system, setup, count)
+    path = truth(system, x0, times[: first[-1] + 2], setup.truth_step)
+    off = 0.0
+    for k in first:
+        t0, t1 = times[k], times[k + 1]
+        if not any(t0 <= b <= t1 for b in system.breakpoints()):
+            with np.errstate(all="ignore"):
+                x = model_step(system, t0, t1, path[k])
+                size = np.maximum(abs(path[k + 1]), vector(system.scale, system.nx, "scale"))
+                off = np.maximum(off, (abs(x - path[k + 1]) / size).max())  # NaN stays
+    return float(off)
 
 
 @add_check(SYSTEM_CHECKS, "invariants")

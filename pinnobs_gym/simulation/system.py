@@ -152,7 +152,8 @@ class System(ABC):
     uncertain: ClassVar[tuple[str, ...] | None] = None
     """Parameters that the mismatch conditions change; all numeric ones if None."""
     model_step: ClassVar[float | None] = None
-    """Longest Runge-Kutta step of model-based estimators in s; the benchmark's dt if None."""
+    """Longest Runge-Kutta step of model-based estimators in s; if None, one that keeps the local
+    error small is found (`pinnobs_gym.simulation.runge_kutta.longest_step`)."""
 
     @property
     def nx(self) -> int:
