@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium as gym
 
+from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.systems import SYSTEMS
 
 if TYPE_CHECKING:
@@ -40,9 +41,12 @@ def env_id(system: str | type[System]) -> str:
 
     Raises:
         ValueError: listing the known systems, if it is unknown.
+        TypeError: in one line, if the class is incomplete or one of its functions fails
+            (`pinnobs_gym.simulation.probe.probe`).
     """
     cls = SYSTEMS.resolve(system)
     register_system(cls)
+    probe(cls)
     return _id(cls)
 
 

@@ -19,6 +19,7 @@ from pinnobs_gym.simulation.conformance import (
 )
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.probe import ModelError, probe
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
@@ -46,8 +47,11 @@ def check_system(cls: type[System]) -> None:
 
     Raises:
         CheckFailed: if any check fails; one line per failure with the check's name, what it found
-            and what it expected.
+            and what it expected. A class that is incomplete, or of which a function fails, is told
+            in one line, without further checks.
     """
+    for name in ("attributes", "equations"):  # without these the others fail for the same reason
+        SYSTEM_CHECKS[name](cls)
     run_all(SYSTEM_CHECKS, cls)
 
 
@@ -109,6 +113,15 @@ def _system_attributes(cls: type[System]) -> None:
         cls.model_step is None or cls.model_step > 0,
         f"model_step={cls.model_step}; expected a positive number of seconds",
     )
+
+
+@add_check(SYSTEM_CHECKS, "equations")
+def _system_equations(cls: type[System]) -> None:
+    """All functions can be called on a batch."""
+    try:
+        probe(cls)
+    except ModelError as error:
+        raise Found(str(error)) from error
 
 
 @add_check(SYSTEM_CHECKS, "shapes")
