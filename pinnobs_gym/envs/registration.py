@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import gymnasium as gym
 
-from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.systems import SYSTEMS
 
 if TYPE_CHECKING:
@@ -44,6 +43,8 @@ def env_id(system: str | type[System]) -> str:
         TypeError: in one line, if the class is incomplete or one of its functions fails
             (`pinnobs_gym.simulation.probe.probe`).
     """
+    from pinnobs_gym.simulation.probe import probe  # it imports the systems' base class
+
     cls = SYSTEMS.resolve(system)
     register_system(cls)
     probe(cls)
