@@ -13,6 +13,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.conditions import parse_condition
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
@@ -98,7 +99,9 @@ class EpisodeSource:
             if name not in Changes.__annotations__:
                 known = ", ".join(["setup", "condition", *Changes.__annotations__])
                 raise ValueError(f"unknown argument {name!r}; known are {known}")
-        self.system, chosen = SYSTEMS.resolve(system).configured(setup, **changes)
+        cls = SYSTEMS.resolve(system)
+        probe(cls)
+        self.system, chosen = cls.configured(setup, **changes)
         self.condition = parse_condition(condition)
         self.condition.plant(self.system, ())  # raises if the condition does not apply
         self.setup = self.condition.setup(self.system, chosen)

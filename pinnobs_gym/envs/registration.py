@@ -40,9 +40,14 @@ def env_id(system: str | type[System]) -> str:
 
     Raises:
         ValueError: listing the known systems, if it is unknown.
+        TypeError: in one line, if the class is incomplete or one of its functions fails
+            (`pinnobs_gym.simulation.probe.probe`).
     """
+    from pinnobs_gym.simulation.probe import probe  # it imports the systems' base class
+
     cls = SYSTEMS.resolve(system)
     register_system(cls)
+    probe(cls)
     return _id(cls)
 
 

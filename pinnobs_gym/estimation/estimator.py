@@ -11,6 +11,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_noise, output_scale
 
@@ -106,6 +107,7 @@ class BaseEstimator(ABC):
     before the correction by y_k."""
 
     def __post_init__(self) -> None:
+        probe(type(self.system))
         check_settings(self, self.setting_fields())
 
     @classmethod

@@ -17,8 +17,9 @@ from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.registry import TRAINERS
-from pinnobs_gym.simulation.model import runge_kutta, substeps
+from pinnobs_gym.simulation.model import substeps
 from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.runge_kutta import runge_kutta
 from pinnobs_gym.simulation.system import System
 
 

@@ -18,6 +18,9 @@ from pinnobs_gym.simulation.conformance import (
     run_all,
 )
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.probe import ModelError, probe
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
 
@@ -27,6 +30,9 @@ JACOBIAN_TOLERANCE = 1e-6
 """Largest error of a Jacobian, relative to scale; that of central differences is below 1e-9."""
 TRUTH_TOLERANCE = 1e-8
 """Largest relative change of a conserved quantity along the truth."""
+STEP_WARNING = 1e-5
+"""Largest error of the model over a sample, relative to scale, without a warning. By default steps
+have a local error of at most `pinnobs_gym.simulation.runge_kutta.STEP_TOLERANCE`."""
 
 SYSTEM_CHECKS: dict[str, Callable[[type[System]], None]] = {}
 """The checks of a system by name. Each raises `CheckFailed`."""
@@ -36,12 +42,16 @@ def check_system(cls: type[System]) -> None:
     """Run all `SYSTEM_CHECKS` on a system.
 
     Warns:
-        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup.
+        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup, if the model
+            takes several Runge-Kutta steps per sample, or if it differs from the truth after one.
 
     Raises:
         CheckFailed: if any check fails; one line per failure with the check's name, what it found
-            and what it expected.
+            and what it expected. A class that is incomplete, or of which a function fails, is told
+            in one line, without further checks.
     """
+    for name in ("attributes", "equations"):  # without these the others fail for the same reason
+        SYSTEM_CHECKS[name](cls)
     run_all(SYSTEM_CHECKS, cls)
 
 
@@ -103,6 +113,15 @@ def _system_attributes(cls: type[System]) -> None:
         cls.model_step is None or cls.model_step > 0,
         f"model_step={cls.model_step}; expected a positive number of seconds",
     )
+
+
+@add_check(SYSTEM_CHECKS, "equations")
+def _system_equations(cls: type[System]) -> None:
+    """All functions can be called on a batch."""
+    try:
+        probe(cls)
+    except ModelError as error:
+        raise Found(str(error)) from error
 
 
 @add_check(SYSTEM_CHECKS, "shapes")
@@ -295,6 +314,44 @@ def _system_prior(cls: type[System]) -> None:
                     f"x̂₀={xhat0.tolist()}; filters that linearise there fail",
                     stacklevel=2,
                 )
+
+
+@add_check(SYSTEM_CHECKS, "model_step")
+def _system_model_step(cls: type[System]) -> None:
+    """The model's step over a sample agrees with the truth. A warning says where it does not, and
+    where a sample takes several Runge-Kutta steps, which take time."""
+    for name, system, setup in _setups(cls):
+        step, dt = longest_step(system), setup.dt
+        where = f"system {cls.__name__}, setup {name!r}: a sample of {dt:g} s"
+        if system.model_step is None and step < dt * (1 - 1e-9):
+            found = f"{where} takes Runge-Kutta steps of at most {step:g} s to be precise"
+            warnings.warn(f"{found}; set model_step if they are too many", stacklevel=2)
+        off = _model_error(system, setup)
+        if not off <= STEP_WARNING:
+            warnings.warn(
+                f"{where} by the model, in steps of {step:g} s, is off by {off:.1e} of scale; "
+                f"expected at most {STEP_WARNING:.0e}: set a shorter model_step, or add the times "
+                f"at which f jumps to breakpoints()",
+                stacklevel=2,
+            )
+
+
+def _model_error(system: System, setup: Setup) -> float:
+    """Return the largest difference of the model's step over a sample from the truth, relative to
+    the larger of state and scale. Samples over a breakpoint do not count."""
+    x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 5)
+    first = np.unique(np.linspace(0, setup.num_steps - 1, 100).astype(int))
+    samples = np.unique([first, first + 1])
+    times, path = setup.times[samples], truth(system, x0, setup.times[samples], setup.truth_step)
+    off = 0.0
+    for k in np.flatnonzero(np.isin(samples, first)):
+        t0, t1, end = times[k], times[k + 1], path[k + 1]
+        if not any(t0 <= b <= t1 for b in system.breakpoints()):
+            with np.errstate(all="ignore"):
+                size = np.maximum(abs(end), vector(system.scale, system.nx, "scale"))
+                error = abs(model_step(system, t0, t1, path[k]) - end) / size
+            off = np.maximum(off, error.max())  # NaN stays
+    return float(off)
 
 
 @add_check(SYSTEM_CHECKS, "invariants")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.matrices import identity, product
+from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
 from pinnobs_gym.simulation.system import Array, System
 
 _STAGES = np.array([0, 1, 1, 2])
@@ -19,43 +20,11 @@ _PARTS = np.array([0.0, 0.5, 1.0])
 """A step's start, middle and end, in steps."""
 
 
-def runge_kutta(rate: Callable[[int, Array], Array], x: Array, h: Array | float) -> Array:
-    """Take one step of the classical Runge-Kutta method of order 4 (Kutta 1901).
-
-    Args:
-        rate: dx/dt as a function of the stage, 0 to 3, and the point of that stage. The stages are
-            at the start, twice at the middle, and at the end of the step.
-        x: the point at the start of the step.
-        h: length of the step.
-
-    Returns:
-        The point at the end of the step.
-    """
-    k1 = rate(0, x)
-    point = h / 2 * k1
-    point += x
-    k2 = rate(1, point)
-    point = h / 2 * k2
-    point += x
-    k3 = rate(2, point)
-    point = h * k3
-    point += x
-    k4 = rate(3, point)
-    # x + h(k1 + 2k2 + 2k3 + k4)/6, accumulated in place
-    end = k2 + k3
-    end *= 2
-    end += k1
-    end += k4
-    end *= h / 6
-    end += x
-    return end
-
-
 def model_step(
     system: System, t0: Array, t1: Array, x: Array, u0: Array | None = None, u1: Array | None = None
 ) -> Array:
     """Propagate the model's state x (..., nx) from t0 to t1 (s) by the classical Runge-Kutta
-    method, in equal steps of at most the system's `System.model_step`. Rows (batch, nx) of x may
+    method, in equal steps of at most `longest_step`. Rows (batch, nx) of x may
     have their own times, t0 and t1 of shape (batch,); all rows take the same number of steps.
 
     ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used, with linear
@@ -137,7 +106,7 @@ def substeps(
     (3, batch), and the length is (batch, 1).
     """
     xp = np if isinstance(x, np.ndarray) else array_namespace(x)
-    longest = min(longest, system.model_step or system.setups["benchmark"].dt)
+    longest = min(longest, longest_step(system))
     by_row = getattr(t0, "ndim", 0) > 0
     whole = t1 - t0
     count = max(1, math.ceil(float(whole.max() if by_row else whole) / longest - 1e-6))

@@ -12,6 +12,9 @@ import numpy as np
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.system import Setup, System
 
+_SHOWN = 60
+"""Number of characters of a text that a message shows."""
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -100,12 +103,7 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
         ValueError: in one line that names the file, the row and what was expected.
     """
     path = Path(path)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"cannot read log {path}: {error}") from None
-    rows = [(number, row) for number, row in enumerate(rows, 1) if any(c.strip() for c in row)]
+    rows = _rows(path)
     if not rows:
         raise ValueError(f"log {path} is empty; expected a header and rows of numbers")
     header = [name.strip() for name in rows[0][1]]
@@ -143,6 +141,39 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
     return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior)
 
 
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the cells of each line of a CSV file that is not blank, with the line's number.
+
+    Each line is parsed by itself, as no cell of a log extends over several lines: a quote that is
+    not closed is thus found in its own line, rather than at the end of the file.
+
+    Raises:
+        ValueError: in one line that names the file and the line.
+    """
+    rows = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            for number, line in enumerate(file, 1):
+                try:
+                    cells = next(csv.reader([line], strict=True))
+                except csv.Error as error:
+                    raise ValueError(
+                        f"log {path}, line {number}: {_shown(line)} is no line of a CSV file "
+                        f"({error}); expected every quote to be closed in its line"
+                    ) from None
+                if any(cell.strip() for cell in cells):
+                    rows.append((number, cells))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read log {path}: {error}") from None
+    return rows
+
+
+def _shown(text: str) -> str:
+    """Return the representation of a text, of which only the beginning is shown if it is long."""
+    text = text.strip()
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
+
 def _number(cell: str, name: str, where: str) -> float:
     text = cell.strip()
     missing = text == "" or text.lower() == "nan"
@@ -153,5 +184,5 @@ def _number(cell: str, name: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{where}: {name}={cell!r} is not a finite number")
+        raise ValueError(f"{where}: {name}={_shown(cell)} is not a finite number")
     return value

@@ -152,7 +152,8 @@ class System(ABC):
     uncertain: ClassVar[tuple[str, ...] | None] = None
     """Parameters that the mismatch conditions change; all numeric ones if None."""
     model_step: ClassVar[float | None] = None
-    """Longest Runge-Kutta step of model-based estimators in s; the benchmark's dt if None."""
+    """Longest Runge-Kutta step of model-based estimators in s; if None, one that keeps the local
+    error small is found (`pinnobs_gym.simulation.runge_kutta.longest_step`)."""
 
     @property
     def nx(self) -> int:
@@ -191,12 +192,12 @@ class System(ABC):
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         """Return ∂f/∂x, (..., nx, nx), by forward-mode automatic differentiation unless
         overridden."""
-        return _jacobian(lambda x, t, u: self.f(t, x, u), x, t, u)
+        return _jacobian(self, "f", t, x, u)
 
     def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         """Return ∂h/∂x, (..., ny, nx), by forward-mode automatic differentiation unless
         overridden."""
-        return _jacobian(lambda x, t, u: self.h(t, x, u), x, t, u)
+        return _jacobian(self, "h", t, x, u)
 
     def admissible(self, x0: Array) -> Array:
         """Return which states (..., nx) of a setup's box are valid initial states: bool (...)."""
@@ -406,17 +407,21 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
     )
 
 
-def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array:
-    """Return ∂function/∂x, (..., m, nx), by forward-mode differentiation in torch, as an array of
+def _jacobian(system: System, name: str, t: Array, x: Array, u: Array) -> Array:
+    """Return ∂f/∂x or ∂h/∂x, (..., m, nx), by forward-mode differentiation in torch, as an array of
     the library of x."""
     import torch
 
+    from pinnobs_gym.simulation.probe import probe_torch
+
+    probe_torch(type(system), name)
+    function: Callable[..., Array] = getattr(system, name)
     given = torch.as_tensor(x)
-    tensors = [
+    now, inputs = [
         other
         if isinstance(other, torch.Tensor)
         else torch.tensor(other, dtype=given.dtype, device=given.device)
-        for other in others
+        for other in (t, u)
     ]
     nx = given.shape[-1]
     # One forward derivative per unit vector, all in one batch.
@@ -424,7 +429,7 @@ def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array
     directions = directions.reshape(nx, *([1] * (given.ndim - 1)), nx)
     repeated = given.expand(nx, *given.shape).clone()
     tangents = directions.expand(repeated.shape).clone()
-    columns = torch.func.jvp(lambda x: function(x, *tensors), (repeated,), (tangents,))[1]
+    columns = torch.func.jvp(lambda x: function(now, x, inputs), (repeated,), (tangents,))[1]
     jacobian = torch.movedim(columns, 0, -1)
     return jacobian if isinstance(x, torch.Tensor) else jacobian.numpy()
 
@@ -451,8 +456,15 @@ def output_scale(system: System) -> np.ndarray:
     setup, scale = system.setups["benchmark"], vector(system.scale, system.nx, "scale")
     t = np.repeat(np.linspace(0.0, setup.duration, _TIMES), _STATES)
     x = np.tile(initial_states(system, setup, _STATES), (_TIMES, 1))
-    H = system.h_jacobian(t, x, np.asarray(system.input(t)))
-    size = abs(H * scale).max(axis=(0, -1))
+    u = np.asarray(system.input(t))
+    if type(system).h_jacobian is System.h_jacobian:
+        # Central differences: h may be written in NumPy only, and importing torch takes long.
+        steps = 6e-6 * np.diag(scale)
+        pairs = [(np.asarray(system.h(t, x + s, u)), system.h(t, x - s, u)) for s in steps]
+        changes = np.stack([(ahead - behind) / 1.2e-5 for ahead, behind in pairs], axis=-1)
+    else:
+        changes = system.h_jacobian(t, x, u) * scale
+    size = abs(changes).max(axis=(0, -1))
     return np.where(size > 0, size, 1.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -21,6 +22,10 @@ _NODES = 6
 _HALVINGS = 7
 """Number of steps tried, each half the one before, before an episode is passed to an adaptive
 solver."""
+_EVALUATIONS = 40_000
+"""Largest number of evaluations of f by the adaptive solver in a `_PART` of an interval."""
+_PART = 0.01
+"""Part of an interval by which the adaptive solver has to advance with that many."""
 _DIVERGED = 1e9
 """Size of a state, relative to its scale, at which it counts as diverged."""
 
@@ -53,7 +58,8 @@ def truth(
         States, shape (num_samples, batch, nx).
 
     Raises:
-        FloatingPointError: if a state is not finite.
+        FloatingPointError: in one line, if a state is not finite, or the adaptive method cannot go
+            on beyond some time.
     """
     times = np.asarray(times, dtype=float)
     x = np.empty((len(times), *x0.shape)) if out is None else out
@@ -328,27 +334,49 @@ def _solve_adaptively(
     """Simulate one episode by LSODA, which handles stiff and non-smooth plants.
 
     Returns NaN if the state diverges; near a singularity such a method would never finish.
+
+    Raises:
+        FloatingPointError: in one line, if it takes more than `_EVALUATIONS` evaluations of f to
+            advance by a `_PART` of the interval: no step is short enough where f jumps back and
+            forth, as Coulomb friction does at rest.
     """
     from scipy.integrate import solve_ivp  # importing it takes longer than simulating an episode
 
     last = np.nextafter(end, start)
     scale = vector(system.scale, system.nx, "scale")
 
+    part, count, now, state = start, 0, start, x0
+
+    def stuck(why: str) -> FloatingPointError:
+        return FloatingPointError(
+            f"{type(system).__name__} from x0={x0.tolist()}: the solver cannot go on beyond "
+            f"t={now:.6g} s, x={state.tolist()}, {why}; expected an f that is continuous in x, or "
+            f"jumps that the state crosses"
+        )
+
     def rate(t: float, x: np.ndarray) -> np.ndarray:
-        now = np.asarray(min(t, last))
-        return system.f(now, x[None], system.input(now))[0]
+        nonlocal part, count, now, state
+        count, now, state = count + 1, t, x
+        if t > part + _PART * (end - start):
+            part, count = t, 0
+        elif count > _EVALUATIONS:
+            raise stuck(f"with {_EVALUATIONS} evaluations of f")
+        at = np.asarray(min(t, last))
+        return system.f(at, x[None], system.input(at))[0]
 
     def margin(t: float, x: np.ndarray) -> float:
         return _DIVERGED - float((abs(x) / scale).max())
 
     margin.terminal = True  # pyright: ignore[reportFunctionMemberAccess]
-    solution = solve_ivp(
-        rate, (start, end), x0, "LSODA", times, events=margin, rtol=1e-11, atol=1e-12 * scale
-    )
-    x = np.full((len(times), len(x0)), np.nan)
-    if solution.status == 0:
-        x[:] = solution.y.T
-    return x
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the reason for which LSODA ends is its status
+        solution = solve_ivp(
+            rate, (start, end), x0, "LSODA", times, events=margin, rtol=1e-11, atol=1e-12 * scale
+        )
+    diverged = solution.status == 1 or not np.isfinite(state).all()
+    if solution.status == -1 and not diverged:
+        raise stuck("with any step")
+    return np.full((len(times), len(x0)), np.nan) if diverged else solution.y.T
 
 
 def rows_of(system: System, rows: np.ndarray) -> System:

@@ -245,6 +245,10 @@ class WithoutParameters(Pendulum):
     pass
 
 
+class TwoFaults(WrongJacobian):
+    invariants = WrongInvariant.invariants
+
+
 @pytest.mark.parametrize("cls", [Pendulum, QuickPendulum, Shaken, DrivenShaken, WithoutParameters])
 def test_sound_system_passes(cls: type[System]) -> None:
     check_system(cls)
@@ -298,11 +302,17 @@ def test_broken_system_fails(cls: type[System], check: str, says: str) -> None:
 
 def test_failures_are_collected() -> None:
     with pytest.raises(CheckFailed) as failure:
-        check_system(NoLastAxis)
+        check_system(TwoFaults)
     names = [line.split(":")[0] for line in str(failure.value).splitlines()]
-    assert "shapes" in names
-    assert len(names) > 1
-    assert set(names) <= set(SYSTEM_CHECKS)
+    assert names == ["f_jacobian", "invariants"]
+
+
+def test_a_function_that_fails_on_a_batch_is_one_failure() -> None:
+    says = (
+        r"equations: NoLastAxis\.h \(test_checks\.py, line \d+\) returns shape \(2,\) .* \(2, 1\)"
+    )
+    with pytest.raises(CheckFailed, match=f"^{says}$"):
+        check_system(NoLastAxis)
 
 
 @dataclass(frozen=True)

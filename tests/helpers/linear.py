@@ -18,6 +18,7 @@ class Linear(System):
     state_names = ("x1", "x2")
     output_names = ("y1", "y2")
     scale = (1.0, 1.0)
+    model_step = 0.1  # one step per sample, as in `runge_kutta_matrix`
     setups = {
         "benchmark": Setup(
             (-1.0, -1.0),

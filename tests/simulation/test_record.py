@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 
@@ -56,12 +58,38 @@ def test_without_input_columns_the_systems_own_input_is_taken(tmp_path):
         ("t,y1\n0,1\n,1\n", "line 3: t='' is not a finite number"),
         ("t,y1\n0,inf\n", "line 2: y1='inf' is not a finite number"),
         ("t,y1\n0,1,2\n", "line 2: 3 cells; expected 2"),
+        ('t,y1\n0,1\n1,"2\n2,3\n3,4\n', """line 3: '1,"2' is no line of a CSV file .*quote"""),
+        ('t,y1\n\n0,1\n1,2"\n2,3\n', """line 4: y1='2"' is not a finite number"""),
+        ('t,y1\n0,"1"2\n', """line 2: '0,"1"2' is no line of a CSV file"""),
+        ('t,"y1\n0,1\n', """line 1: 't,"y1' is no line"""),
     ],
 )
 def test_bad_logs_are_one_clear_line(tmp_path, text, message):
     with pytest.raises(ValueError, match=message) as caught:
         read(log(tmp_path, text))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("rows", [10, 20000])
+def test_a_stray_quote_is_told_by_its_line_in_a_file_of_any_length(tmp_path, rows):
+    """The cell that the quote opens would be longer than the largest that the csv module reads."""
+    quoted = "".join(f"{k},{chr(34) if k == 5 else ''}{k}.123456\n" for k in range(rows))
+    path = log(tmp_path, "t,y1\n" + quoted)
+    with pytest.raises(ValueError, match=f"log {re.escape(str(path))}, line 7: ") as caught:
+        read(path)
+    assert len(str(caught.value)) < len(str(path)) + 150
+
+
+def test_a_line_of_any_length_is_one_short_line(tmp_path):
+    with pytest.raises(ValueError, match=", line 2: ") as caught:
+        read(log(tmp_path, f"t,y1\n0,{'1' * 200_000}\n"))
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+def test_quoted_cells_and_blank_lines(tmp_path):
+    _, record = read(log(tmp_path, '"t","y1"\r\n\r\n"0","1.5"\r\n"1",""\r\n'))
+    np.testing.assert_array_equal(record.t, [0.0, 1.0])
+    np.testing.assert_array_equal(record.y[0, :, 0], [1.5, np.nan])
 
 
 def test_a_log_that_is_not_there(tmp_path):

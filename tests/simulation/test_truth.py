@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -317,6 +318,46 @@ def test_sample_times_may_be_whole_numbers() -> None:
     source = EpisodeSource(Falling)
     x = source.play(source.draw(source.streams(range(3)))).x
     assert np.allclose(x[-1, :, 1], x[0, :, 1] - 60)
+
+
+@dataclass(frozen=True)
+class Friction(VanDerPol):
+    """ẍ = -sign(ẋ)/2: a block that Coulomb friction brings to rest at t = 2ẋ(0)."""
+
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        return stack(x, x[..., 1], -0.5 * array_namespace(x).sign(x[..., 1]))
+
+
+@pytest.mark.usefixtures("limited")
+@pytest.mark.parametrize("breakpoints", [(), (0.5,)])
+def test_a_solver_that_cannot_go_on_says_where(breakpoints: tuple[float, ...]) -> None:
+    """From x₂ = 0.75 it comes to rest at 1.5 s; until then x₁ = 0.75·t − t²/4."""
+
+    class Piecewise(Friction):
+        def breakpoints(self) -> tuple[float, ...]:
+            return breakpoints
+
+    x0 = np.array([[0.0, 0.75]])
+    with pytest.raises(FloatingPointError, match=r"Piecewise from x0=.* cannot go on") as caught:
+        truth(Piecewise(), x0, BENCHMARK.times)
+    where = re.search(r"beyond t=(\S+) s, x=\[(\S+), (\S+)\]", str(caught.value))
+    assert where is not None
+    assert [float(number) for number in where.groups()] == pytest.approx(
+        [1.5, 0.5625, 0.0], abs=1e-5
+    )
+    moving = BENCHMARK.times[BENCHMARK.times < 1.5]
+    x = truth(Piecewise(), x0, moving)[:, 0]  # until it comes to rest
+    assert x[:, 0] == pytest.approx(0.75 * moving - moving**2 / 4, abs=1e-9)
+
+
+@pytest.mark.usefixtures("limited")
+def test_an_equation_that_is_drawn_anew_at_each_call_comes_to_an_end() -> None:
+    class Noisy(VanDerPol):
+        def f(self, t: Any, x: Any, u: Any) -> Any:
+            return -x + np.random.default_rng().standard_normal(x.shape)
+
+    with pytest.raises(FloatingPointError, match=r"Noisy from x0=.* cannot go on"):
+        truth(Noisy(), np.array([[1.0, 0.5]]), BENCHMARK.times)
 
 
 def test_few_and_irregular_samples() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from pinnobs_gym.estimation.learned.kkl_dynamics import Dynamics, Start, at_rest
-from pinnobs_gym.simulation.model import runge_kutta
+from pinnobs_gym.simulation.runge_kutta import runge_kutta
 from pinnobs_gym.simulation.system import Array, System, vector
 from pinnobs_gym.simulation.truth import truth
 

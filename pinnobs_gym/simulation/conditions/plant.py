@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pinnobs_gym.simulation.conditions.base import Condition, Unknowns
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Array, Setup, System, vector
 
 
@@ -81,7 +82,7 @@ class OtherRates(System):
     @property
     def model_step(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Longest Runge-Kutta step of the original plant in s."""
-        return self.plant.model_step or self.plant.setups["benchmark"].dt
+        return longest_step(self.plant)
 
     def f(self, t: Array, x: Array, u: Array) -> Array:
         return self.factors * self.plant.f(t, x, u)
