@@ -57,7 +57,7 @@ class Spring(System):
             (1, 0),
             (1, 0),
             duration=1,
-            dt=0.1,
+            dt=0.05,
             xhat0=(0.8, 0),
             P0=((1, 0.5), (0.5, 2)),
             parameters={"k": 9.0, "damping": 0.3},
