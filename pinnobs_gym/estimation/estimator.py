@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from pinnobs_gym.estimation.given import checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.simulation.record import Prior, Record
@@ -105,6 +106,12 @@ class BaseEstimator(ABC):
     environment. φ is the model's flow from the previous sample; a raised minus marks quantities
     before the correction by y_k."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name, check in (("run", checked_run), ("update", checked_update)):
+            if name in vars(cls) and not getattr(vars(cls)[name], "__isabstractmethod__", False):
+                setattr(cls, name, check(vars(cls)[name]))
+
     def __post_init__(self) -> None:
         check_settings(self, self.setting_fields())
 
@@ -125,7 +132,12 @@ class BaseEstimator(ABC):
 
     @abstractmethod
     def run(self, record: Record) -> Estimates:
-        """Return the estimates for a batch of records."""
+        """Return the estimates for a batch of records.
+
+        Raises:
+            ValueError: in one line, if the record does not fit the system, see
+                `Record.check_fits`. The check precedes the method of any subclass.
+        """
 
     @property
     def output_variance(self) -> np.ndarray:
@@ -188,6 +200,10 @@ class Estimator(BaseEstimator):
             t: time of the sample in s, later than ``state.t``; steps may be irregular.
             y: outputs, shape (batch, ny); NaN marks a missing output.
             u: inputs, shape (batch, nu).
+
+        Raises:
+            ValueError: in one line, if y or u has another shape. The check precedes the method of
+                any subclass.
         """
 
     def run(self, record: Record) -> Estimates:
