@@ -35,6 +35,9 @@ class State:
     """Covariances of the innovations, shape (batch, ny, ny)."""
     memory: Any = None
     """Any further state of the estimator."""
+    root: np.ndarray | None = None
+    """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
+    `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
 
 
 @dataclass(frozen=True)
