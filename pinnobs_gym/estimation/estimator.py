@@ -11,9 +11,10 @@ import numpy as np
 
 from pinnobs_gym.estimation.given import checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
+from pinnobs_gym.estimation.noise import assumed_noise
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_noise, output_scale
+from pinnobs_gym.simulation.system import Setup, System
 
 
 @dataclass(frozen=True)
@@ -144,16 +145,9 @@ class BaseEstimator(ABC):
 
     @property
     def output_variance(self) -> np.ndarray:
-        """Diagonal of R, shape (ny,), in squared output units.
-
-        Each variance is at least (`NOISE_FLOOR`·`output_scale`)², because filters need a positive
-        definite R.
-
-        Raises:
-            ValueError: in one line, if the noise level is negative or not finite.
-        """
-        std = output_noise(self.system, self.noise_std)
-        return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
+        """Diagonal of R, shape (ny,), in squared output units: that of
+        `pinnobs_gym.estimation.noise.assumed_noise`, which is positive."""
+        return assumed_noise(self.system, self.noise_std) ** 2
 
     @property
     def label(self) -> str:

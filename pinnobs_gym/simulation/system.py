@@ -430,7 +430,7 @@ def _jacobian(function: Callable[..., Array], x: Array, *others: Array) -> Array
 
 
 NOISE_FLOOR = 1e-3
-"""Smallest standard deviation of output noise in R, relative to the output's scale."""
+"""Standard deviation that filters assume for outputs without noise, relative to their scale."""
 
 
 _TIMES = 9
