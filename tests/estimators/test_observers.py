@@ -271,7 +271,7 @@ def test_a_known_gain_of_reverse_duffing_settles():
 
 def test_large_gains_are_stable_and_missing_outputs_correct_nothing():
     H1 = np.array([[[1.0, 0.0]]] * 2)
-    K = injection(np.array([[1e9], [1.0]]), H1, np.array([[1.0], [0.0]]), 0.1)
+    K = injection(np.array([[1e9], [1.0]]), H1, np.array([[0.1], [0.0]]))
     np.testing.assert_allclose(K[0, :, 0], [1.0, 1e-9], rtol=1e-6)
     assert (K[1] == 0).all()
 
