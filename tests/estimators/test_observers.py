@@ -314,7 +314,7 @@ def test_an_lmi_without_a_solution_is_said_to_have_none(name):
     ("kind", "options", "message"),
     [
         (StrongTrackingEKF, {"gamma": -1.0}, "gamma=-1"),
-        (EnKF, {"members": 2}, "members=2; expected more than nx=2"),
+        (EnKF, {"members": 1}, "members=1; expected at least 2"),
         (EnKF, {"inflation": 0.9}, "inflation=0.9; expected"),
         (ParticleFilter, {"particles": 1}, "particles=1; expected at least 2"),
         (ParticleFilter, {"discount": 0.3}, "discount=0.3; expected"),
