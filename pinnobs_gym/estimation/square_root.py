@@ -53,7 +53,8 @@ def carried(L: np.ndarray) -> np.ndarray:
 def compressed(*parts: np.ndarray) -> np.ndarray:
     """Return the lower triangular L (batch, n, n) with LLᵀ = ΣAAᵀ for the given A (batch, n, m)."""
     stacked = np.concatenate([part.swapaxes(1, 2) for part in parts], axis=1)
-    return np.linalg.qr(stacked, mode="r").swapaxes(1, 2)
+    R: np.ndarray = np.linalg.qr(stacked)[1]
+    return R.swapaxes(1, 2)
 
 
 def covariance(L: np.ndarray) -> np.ndarray:

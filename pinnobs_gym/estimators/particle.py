@@ -224,7 +224,7 @@ def _predicted_output(weights: np.ndarray, outputs: np.ndarray) -> tuple[np.ndar
     ny) over the particles at which they are defined; NaN and zero if there are none."""
     if math.isfinite(outputs.sum()):
         return moments(weights, outputs)
-    defined = (abs(outputs) < _LARGEST).all(axis=-1)
+    defined: np.ndarray = np.all(abs(outputs) < _LARGEST, axis=-1)
     weights = np.where(defined, weights, 0.0)
     sums = total(weights)
     mean, S = moments(
