@@ -17,9 +17,10 @@ from gymnasium.spaces import Box
 from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.noise import assumed_noise
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
-from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_scale, vector
+from pinnobs_gym.simulation.system import Setup, System, vector
 
 LARGEST_REWARD = 10.0
 """Bound of the absolute value of the reward ``improvement``."""
@@ -345,9 +346,7 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
     P = np.broadcast_to(cov[..., None], (nx, nx, _DRAWS))
     scale = vector(system.scale, nx, "scale")
     Q = np.diag((GaussianEstimator.process_noise * scale) ** 2)[..., None]
-    floor = NOISE_FLOOR * output_scale(system)
-    noise = np.maximum(vector(setup.noise_std, system.ny, "noise_std"), floor)
-    R = np.diag(noise**2)[..., None]
+    R = np.diag(assumed_noise(system, setup.noise_std) ** 2)[..., None]
     u = np.broadcast_to(np.asarray(system.input(times))[:, None], (len(times), _DRAWS, system.nu))
     zero = np.zeros((_DRAWS, system.ny))
     variance, S_all = np.empty((len(times), nx, _DRAWS)), np.empty((len(times), system.ny, _DRAWS))

@@ -9,11 +9,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from pinnobs_gym.estimation.given import checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
+from pinnobs_gym.estimation.noise import assumed_noise
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import NOISE_FLOOR, Setup, System, output_noise, output_scale
+from pinnobs_gym.simulation.system import Setup, System
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,9 @@ class State:
     """Covariances of the innovations, shape (batch, ny, ny)."""
     memory: Any = None
     """Any further state of the estimator."""
+    root: np.ndarray | None = None
+    """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
+    `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,12 @@ class BaseEstimator(ABC):
     environment. φ is the model's flow from the previous sample; a raised minus marks quantities
     before the correction by y_k."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name, check in (("run", checked_run), ("update", checked_update)):
+            if name in vars(cls) and not getattr(vars(cls)[name], "__isabstractmethod__", False):
+                setattr(cls, name, check(vars(cls)[name]))
+
     def __post_init__(self) -> None:
         probe(type(self.system))
         check_settings(self, self.setting_fields())
@@ -127,20 +138,18 @@ class BaseEstimator(ABC):
 
     @abstractmethod
     def run(self, record: Record) -> Estimates:
-        """Return the estimates for a batch of records."""
+        """Return the estimates for a batch of records.
+
+        Raises:
+            ValueError: in one line, if the record does not fit the system, see
+                `Record.check_fits`. The check precedes the method of any subclass.
+        """
 
     @property
     def output_variance(self) -> np.ndarray:
-        """Diagonal of R, shape (ny,), in squared output units.
-
-        Each variance is at least (`NOISE_FLOOR`·`output_scale`)², because filters need a positive
-        definite R.
-
-        Raises:
-            ValueError: in one line, if the noise level is negative or not finite.
-        """
-        std = output_noise(self.system, self.noise_std)
-        return np.maximum(std, NOISE_FLOOR * output_scale(self.system)) ** 2
+        """Diagonal of R, shape (ny,), in squared output units: that of
+        `pinnobs_gym.estimation.noise.assumed_noise`, which is positive."""
+        return assumed_noise(self.system, self.noise_std) ** 2
 
     @property
     def label(self) -> str:
@@ -190,6 +199,10 @@ class Estimator(BaseEstimator):
             t: time of the sample in s, later than ``state.t``; steps may be irregular.
             y: outputs, shape (batch, ny); NaN marks a missing output.
             u: inputs, shape (batch, nu).
+
+        Raises:
+            ValueError: in one line, if y or u has another shape. The check precedes the method of
+                any subclass.
         """
 
     def run(self, record: Record) -> Estimates:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pinnobs_gym.estimation import square_root
 from pinnobs_gym.estimation.estimator import BaseEstimator, Range, State
-from pinnobs_gym.estimation.kalman import predict
+from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, vector
 
@@ -86,6 +87,46 @@ def predicted(
         u: inputs at the next sample, shape (batch, nu).
     """
     assert state.t is not None  # no prediction precedes the first sample
-    xhat, P, _ = predict(system, (state.t, t), state.xhat, P, Q, (state.u, u))
-    covariance = P.transpose(2, 0, 1)
-    return State(xhat, state.t, state.u, covariance, state.innovation, None, state.memory)
+    xhat, P, F = predict(system, (state.t, t), state.xhat, P, Q, (state.u, u))
+    covariance, L = P.transpose(2, 0, 1), state.root
+    if L is not None:
+        rows = square_root.carried(L)
+        noise = np.broadcast_to(Q, (*Q.shape[:2], len(xhat)))[..., rows]
+        L, covariance = L.copy(), covariance.copy()
+        moved = F.transpose(2, 0, 1)[rows] @ L[rows]
+        L[rows] = square_root.compressed(moved, square_root.root_of(noise.transpose(2, 0, 1)))
+        covariance[rows] = square_root.covariance(L[rows])
+    return State(xhat, state.t, state.u, covariance, state.innovation, None, state.memory, L)
+
+
+def corrected(
+    state: State,
+    sample: tuple[float, np.ndarray],
+    P: np.ndarray,
+    innovation: np.ndarray,
+    H: np.ndarray,
+    R: np.ndarray,
+) -> State:
+    """Return the state after a Kalman update: in Joseph's form, or by the roots of the covariances
+    in the rows that have them.
+
+    Args:
+        state: the prediction; its memory is kept.
+        sample: time in s, and inputs (batch, nu), of the sample.
+        P: covariances of the prediction, shape (nx, nx, batch).
+        innovation: y − h(t, x̂, u), shape (batch, ny), zero where y is missing.
+        H: output Jacobians, shape (ny, nx, batch), zero where y is missing.
+        R: covariance of the output noise, shape (ny, ny, batch or 1).
+    """
+    xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
+    covariance, L = P.transpose(2, 0, 1), state.root
+    if L is not None:
+        rows = square_root.carried(L)
+        noise = np.broadcast_to(R, (*R.shape[:2], len(xhat)))[..., rows].transpose(2, 0, 1)
+        L, xhat, covariance = L.copy(), xhat.copy(), covariance.copy()
+        outputs = H.transpose(2, 0, 1)[rows]
+        step, L[rows] = square_root.updated(L[rows], innovation[rows], outputs, noise)
+        xhat[rows] = state.xhat[rows] + step
+        covariance[rows] = square_root.covariance(L[rows])
+    S = S.transpose(2, 0, 1)
+    return State(xhat, *sample, covariance, innovation, S, state.memory, L)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.model import model_step, model_step_jacobian
-from pinnobs_gym.simulation.system import System, initial_states, vector
+from pinnobs_gym.simulation.system import System, initial_states, output_scale, vector
 
 TIME_CONSTANTS = 20.0
 """Duration of a benchmark episode over an observer's time constant, by default."""
@@ -55,7 +55,8 @@ def operating_points(system: System) -> tuple[float, np.ndarray]:
 def linearised_scaled(
     system: System, t: float, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return A and H at a state (nx,), both for states divided by their scale, and the scale (nx,).
+    """Return A and H at a state (nx,), for states and outputs divided by their scales, and the
+    scale of the states (nx,). With scaled outputs, designs do not depend on the outputs' units.
 
     Raises:
         ValueError: if (A, H) is not observable.
@@ -63,7 +64,7 @@ def linearised_scaled(
     now, scale = np.asarray(t), vector(system.scale, system.nx, "scale")
     u = np.asarray(system.input(now))
     A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
-    H = np.asarray(system.h_jacobian(now, x, u)) * scale
+    H = np.asarray(system.h_jacobian(now, x, u)) * scale / output_scale(system)[:, None]
     # Rank of the observability matrix; A is normalised so that its powers stay of one size.
     powers = [np.linalg.matrix_power(A / max(abs(A).max(), 1e-300), i) for i in range(system.nx)]
     rows = np.concatenate([H @ power for power in powers])
@@ -87,7 +88,7 @@ def placed_gains(
 
     Returns:
         The gains L (num_gains, nx, ny), and the Jacobians A (num_gains, nx, nx) and H (num_gains,
-        ny, nx) of the points. Those are of states divided by their scale, L is not.
+        ny, nx) of the points. Those are of states and outputs divided by their scales, L is not.
 
     Raises:
         ValueError: in one line, if (A, H) is observable at none of the points, or the number of
@@ -100,7 +101,8 @@ def placed_gains(
     for x in points:
         try:
             A, H, scale = linearised_scaled(system, t, x)
-            found.append((scale[:, None] * _scaled_gain(A, H, rate, poles), A, H))
+            scaled = _scaled_gain(A, H, rate, poles)
+            found.append((scale[:, None] * scaled / output_scale(system), A, H))
         except (ValueError, np.linalg.LinAlgError) as error:
             failed = error
     if not found:
@@ -136,7 +138,7 @@ def placed_gain(system: System, rate: float, poles: Sequence[complex] | None = N
     """
     L, A, H = placed_gains(system, rate, poles)
     scale = vector(system.scale, system.nx, "scale")
-    closed = A - (L / scale[:, None])[:, None] @ H
+    closed = A - (L * output_scale(system) / scale[:, None])[:, None] @ H
     slowest = np.linalg.eigvals(closed).real.max(axis=(1, 2))
     return L[np.argmin(slowest)]
 
@@ -170,7 +172,7 @@ def settling_gain(system: System, rate: float, largest: float = 1.0) -> np.ndarr
         remaining = np.maximum(remaining, _remaining_error(system, largest * candidates))
     asked = np.exp(-rate * system.setups["benchmark"].duration)
     remaining = np.maximum(remaining, asked)
-    size = np.linalg.norm(candidates / scale[:, None], axis=(1, 2))
+    size = np.linalg.norm(candidates * output_scale(system) / scale[:, None], axis=(1, 2))
     gain = candidates[np.lexsort((size, remaining))[0]]
     gain.flags.writeable = False  # the cache returns the same array again
     return gain
@@ -192,7 +194,7 @@ def _remaining_error(system: System, gains: np.ndarray) -> np.ndarray:
             x, F = model_step_jacobian(system, times[k], times[k + 1], x, u[k], u[k + 1])
             H = np.asarray(system.h_jacobian(times[k + 1], x, u[k + 1]))
             F, H = (np.tile(each, (len(gains), 1, 1)) for each in (F, H))
-            K = injection(L, H, weight, times[k + 1] - times[k])
+            K = injection(L, H, (times[k + 1] - times[k]) * weight)
             flow = F @ flow
             flow = flow - K @ (H @ flow)
         scale = vector(system.scale, nx, "scale")
@@ -232,7 +234,7 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
     now = np.asarray(0.0)
     u = np.asarray(system.input(now))
     A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
-    H = np.asarray(system.h_jacobian(now, x, u)) * scale
+    H = np.asarray(system.h_jacobian(now, x, u)) * scale / output_scale(system)[:, None]
     A, kept = np.unique(np.round(A, 12), axis=0, return_index=True)
     # One inequality per vertex of the polytope; the trace keeps P small.
     P, Y = cp.Variable((nx, nx), symmetric=True), cp.Variable((nx, system.ny))
@@ -248,23 +250,23 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
             f"{type(system).__name__} has no constant gain and metric with which errors decay at "
             f"{rate:g}/s at all {len(A)} Jacobians of its initial set: the LMI is {problem.status}"
         )
-    return scale[:, None] * np.linalg.solve(P.value, Y.value)
+    return scale[:, None] * np.linalg.solve(P.value, Y.value) / output_scale(system)
 
 
-def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np.ndarray:
+def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the gain K (batch, nx, ny) of the correction x̂ = x⁻ + K(y − h(t, x⁻, u)).
 
-    It is one linearised step of Euler's implicit method for x̂' = L·weight·(y − h(t, x̂, u)):
-    K = dt·L·weight·(I + dt·H·L·weight)⁻¹. Unlike dt·L, it is stable for large gains.
+    It is one linearised step of Euler's implicit method for x̂' = L·(y − h(t, x̂, u)):
+    K = L·weight·(I + H·L·weight)⁻¹. Unlike L·weight, it is stable for large gains.
 
     Args:
         L: continuous-time gain, shape (nx, ny) or (batch, nx, ny), in state units per output unit
             and s.
         H: output Jacobians, shape (batch, ny, nx).
-        weight: factor of each output, shape (batch, ny); zero for a missing output.
-        dt: length of the step in s.
+        weight: length of the step in s times any factor of the output, shape (batch, ny); zero for
+            a missing output. See `time_since`.
     """
-    weighted = dt * L * weight[:, None]
+    weighted = L * weight[:, None]
     # The batch is the first axis in memory, so that sums are formed alike in any batch.
     M = np.eye(H.shape[1]) + np.ascontiguousarray(H) @ weighted
     # Rows that have diverged give NaN instead of an error.
@@ -272,3 +274,20 @@ def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray, dt: float) -> np
     inverse = np.full_like(M, np.nan)
     inverse[usable] = np.linalg.inv(M[usable])
     return weighted @ inverse
+
+
+def time_since(
+    last: np.ndarray | None, t: float, missing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the time (s) that has passed since each output's last sample, zero for a missing
+    output, and the time of its last sample after this one, (batch, ny) each.
+
+    Args:
+        last: times of the last samples, (batch, ny); None at the first sample, before which no time
+            has passed.
+        t: time of this sample in s.
+        missing: whether each output is missing, (batch, ny).
+    """
+    if last is None:
+        return np.zeros(missing.shape), np.full(missing.shape, t)
+    return np.where(missing, 0.0, t - last), np.where(missing, last, t)

@@ -11,6 +11,14 @@ from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.square_root import (
+    carried,
+    compressed,
+    covariance,
+    gain,
+    prior_root,
+    root_of,
+)
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
@@ -66,13 +74,14 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         unit, mean_weights, cov_weights = self.points()
         points = unit, mean_weights[:, None, None], np.sqrt(cov_weights)[:, None]
         memory = SigmaPointMemory(*self.tuning(batch), points, np.zeros(batch))
-        return State(prior.mean, P=prior.cov, memory=memory)
+        root = prior_root(self.system, prior, self.output_variance)
+        return State(prior.mean, P=prior.cov, memory=memory, root=root)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
-        L, memory = _factor(covariances(state), memory)
+        L, memory = _factor(state, memory)
         points = unit @ L  # (nx, num_points, batch)
         points += state.xhat.T[:, None]
         # Propagate each point through the model; then compute mean and covariance.
@@ -81,13 +90,16 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
         P = (outer(X, X) + memory.Q).transpose(2, 0, 1)
-        return State(mean.T, state.t, state.u, P, state.innovation, None, memory)
+        after = State(mean.T, state.t, state.u, P, state.innovation, None, memory, state.root)
+        return (
+            after if state.root is None else _rooted(after, X, root_of(memory.Q.transpose(2, 0, 1)))
+        )
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
         xhat = state.xhat
-        L, memory = _factor(covariances(state), memory)
+        L, memory = _factor(state, memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
         points = X + xhat.T[:, None]
@@ -100,16 +112,41 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
         K, S = gain_of_deviations(X, Y, memory.R)
+        if state.root is not None:
+            rows = carried(state.root)
+            parts = (part.transpose(2, 0, 1)[rows] for part in (X, Y, memory.R))
+            K[..., rows] = gain(*parts).transpose(1, 2, 0)
         # Covariance in Joseph's form, (X − KY)(X − KY)ᵀ + KRKᵀ.
         X -= product(K, Y)
         P = outer(X, X)
         P += sandwich(K, memory.R)
         xhat = (xhat.T + mapped(K, innovation).T).T
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S, memory)
+        after = State(xhat, t, u, P, innovation, S, memory, state.root)
+        if state.root is None:
+            return after
+        noise = K.transpose(2, 0, 1) @ root_of(memory.R.transpose(2, 0, 1))
+        return _rooted(after, X, noise)
 
 
-def _factor(P: np.ndarray, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:
-    """Return the Cholesky factors of P (nx, nx, batch), and the memory with the updated jitter."""
-    L, jitter = factor(P, memory.jitter)
+def _factor(state: State, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:
+    """Return roots of the state's covariances (nx, nx, batch): those that it has, and Cholesky
+    factors otherwise. Also return the memory with the updated jitter."""
+    L, jitter = factor(covariances(state), memory.jitter)
+    if state.root is not None:
+        rows = carried(state.root)
+        L[..., rows], jitter = state.root[rows].transpose(1, 2, 0), jitter.copy()
+        jitter[rows] = memory.jitter[rows]
     return L, memory if jitter is memory.jitter else replace(memory, jitter=jitter)
+
+
+def _rooted(state: State, X: np.ndarray, noise: np.ndarray) -> State:
+    """Return the state with new roots in the rows that have them, from weighted deviations X (nx,
+    num_points, batch) and roots of what noise adds (batch, nx, m)."""
+    assert state.root is not None
+    assert state.P is not None
+    rows = carried(state.root)
+    root, P = state.root.copy(), state.P.copy()
+    root[rows] = compressed(X.transpose(2, 0, 1)[rows], noise[rows])
+    P[rows] = covariance(root[rows])
+    return replace(state, root=root, P=P)

@@ -7,9 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
-from pinnobs_gym.estimation.kalman import innovation_covariance, joseph_update, observe
+from pinnobs_gym.estimation.gaussian import (
+    GaussianEstimator,
+    checked,
+    corrected,
+    covariances,
+    predicted,
+)
+from pinnobs_gym.estimation.kalman import innovation_covariance, observe
+from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.square_root import prior_root
 from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
@@ -86,7 +94,8 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         bounds = self._gate_bounds()
         beyond = np.zeros(len(P0), dtype=int)
         memory = EKFMemory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
-        return State(prior.mean, P=P0, memory=memory)
+        L = prior_root(self.system, prior, self.output_variance)
+        return State(prior.mean, P=P0, memory=memory, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         return predicted(self.system, state, covariances(state), state.memory.Q, t, u)
@@ -96,12 +105,11 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         P, R = covariances(state), memory.R
         innovation, H = observe(self.system, t, state.xhat, y, u)
         if self.gate is not None:
-            P, memory = self._gated(P, innovation, H, memory)
+            state = self._gated(state, innovation, H)
+            P = covariances(state)
         if self.huber is not None:
             R = self._reweighted(P, innovation, H, R)
-        xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
-        covariance, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
-        return State(xhat, t, u, covariance, innovation, S, memory)
+        return corrected(state, (t, u), P, innovation, H, R)
 
     def _gate_bounds(self) -> np.ndarray:
         """Return the gate's bounds on the NIS of 0, 1, ... ny outputs, which are χ² quantiles."""
@@ -112,17 +120,22 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         degrees = np.maximum(np.arange(self.system.ny + 1), 1)
         return 2 * gammaincinv(degrees / 2, self.gate)
 
-    def _gated(
-        self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, memory: EKFMemory
-    ) -> tuple[np.ndarray, EKFMemory]:
-        """Return P, reset where the gate restarts the filter, and the updated memory."""
+    def _gated(self, state: State, innovation: np.ndarray, H: np.ndarray) -> State:
+        """Return the prediction with P and its root reset where the gate restarts the filter, and
+        with the updated memory."""
+        memory: EKFMemory = state.memory
+        P, L = covariances(state), state.root
         present = H.any(axis=1).sum(axis=0)  # number of outputs that are not missing
         nis = squared_size(innovation, innovation_covariance(P, H, memory.R))
         beyond = ~(nis <= memory.bounds[present])
         count = np.where(present > 0, np.where(beyond, memory.beyond + 1, 0), memory.beyond)
         restart = count >= self.patience
         P = np.where(restart, memory.P_restart, P)
-        return P, replace(memory, beyond=np.where(restart, 0, count))
+        if L is not None:  # a row without a root keeps NaN
+            wide = np.isfinite(L) & restart[:, None, None]
+            L = np.where(wide, root(memory.P_restart).transpose(2, 0, 1), L)
+        memory = replace(memory, beyond=np.where(restart, 0, count))
+        return replace(state, P=P.transpose(2, 0, 1), memory=memory, root=L)
 
     def _reweighted(
         self, P: np.ndarray, innovation: np.ndarray, H: np.ndarray, R: np.ndarray

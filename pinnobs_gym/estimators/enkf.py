@@ -38,6 +38,11 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """The ensemble Kalman filter with perturbed outputs (Evensen 1994; Burgers, van Leeuwen &
     Evensen 1998) and multiplicative inflation of the ensemble (Anderson & Anderson 1999).
 
+    The inflation follows an analysis and gives back at most the spread that the analysis has taken,
+    state by state, as the relaxation to prior spread does (Whitaker & Hamill 2012). A state of
+    which the outputs tell nothing is not inflated. An ensemble with no more members than states is
+    allowed; its covariance is singular.
+
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
     in its batch. The numbers have mean zero and unit variance over the ensemble.
@@ -49,19 +54,21 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     members: int = 50
     """Size of the ensemble."""
     inflation: float = 1.01
-    """Factor of the deviations from the ensemble mean in each prediction."""
+    """Largest factor of the deviations from the ensemble mean after each analysis."""
     seed: int = 0
     """Seed of the random numbers."""
 
     name = "enkf"
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
     equations = r"""
-\chi_i &= \varphi(x_{k-1}^i), \qquad \bar\chi = \tfrac1N \sum_i \chi_i \\
-x_k^{i-} &= \bar\chi + \lambda\, (\chi_i - \bar\chi) + w_i, \qquad w_i \sim \mathcal N(0, Q) \\
+\chi_i &= \varphi(x_{k-1}^i) \\
+x_k^{i-} &= \chi_i + w_i, \qquad w_i \sim \mathcal N(0, Q) \\
 X &= \tfrac{1}{\sqrt{N-1}} \bigl[ x_k^{i-} - \bar x_k^- \bigr]_i, \qquad
 Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(t_k, x_k^{i-}, u_k) - \bar y \bigr]_i \\
 K &= X Y^\top (Y Y^\top + R)^{-1} \\
 x_k^i &= x_k^{i-} + K\, (y_k + v_i - h(t_k, x_k^{i-}, u_k)), \qquad v_i \sim \mathcal N(0, R) \\
+x_k^i &:= \hat x_k + \ell \odot (x_k^i - \hat x_k), \qquad
+\ell_j = \min\bigl(\lambda, (1 - (K Y X^\top)_{jj} / (X X^\top)_{jj})^{-1/2}\bigr) \\
 \hat x_k &= \tfrac1N \sum_i x_k^i, \qquad
 P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 """
@@ -69,8 +76,8 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.members <= self.system.nx:
-            raise ValueError(f"members={self.members}; expected more than nx={self.system.nx}")
+        if self.members < 2:
+            raise ValueError(f"members={self.members}; expected at least 2")
         if not 1 <= self.inflation < np.inf:
             raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
 
@@ -86,11 +93,8 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         assert state.t is not None
         memory: EnsembleMemory = state.memory
         members = model_step(self.system, state.t, t, memory.members, state.u, u)
-        # Inflate the deviations from the ensemble mean, and add the process noise.
-        mean = total(members) / self.members
         noise = self._noise(memory.sample)
-        moved = memory.Q_std * noise[..., : self.system.nx]
-        members = mean + self.inflation * (members - mean) + moved
+        members = members + memory.Q_std * noise[..., : self.system.nx]
         memory = replace(memory, members=members, noise=noise)
         return State(total(members) / self.members, state.t, state.u, memory=memory)
 
@@ -111,10 +115,20 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         for p, column in enumerate(K.transpose(1, 2, 0)):
             members = members + errors[..., p, None] * column
         xhat = total(members) / self.members
-        X = weight * (members - xhat).transpose(2, 0, 1)
+        deviations = self._inflation(X, Y, K) * (members - xhat)
+        members, X = xhat + deviations, weight * deviations.transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
         memory = replace(memory, members=members, sample=memory.sample + 1)
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
+
+    def _inflation(self, X: np.ndarray, Y: np.ndarray, K: np.ndarray) -> np.ndarray:
+        """Return the factors (batch, nx) of the deviations after an analysis with the gains K (nx,
+        ny, batch) and the weighted deviations X and Y of states and outputs before it."""
+        # The analysis is expected to take the variances KYXᵀ, of XXᵀ.
+        taken = np.add.accumulate(K * outer(X, Y), axis=1)[:, -1]
+        variance = total((X * X).transpose(1, 2, 0)).T
+        share = np.where(variance > 0, taken / variance, 0.0)
+        return np.clip(1 / np.sqrt(1 - np.clip(share, 0.0, 1.0)), 1.0, self.inflation).T
 
     def _noise(self, sample: int) -> np.ndarray:
         """Return standard normal numbers (members, 1, nx + ny) for the noise of states and outputs

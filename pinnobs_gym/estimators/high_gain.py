@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
-from pinnobs_gym.estimation.kalman import joseph_update, observe
+from pinnobs_gym.estimation.gaussian import (
+    GaussianEstimator,
+    checked,
+    corrected,
+    covariances,
+    predicted,
+)
+from pinnobs_gym.estimation.kalman import observe
 from pinnobs_gym.estimation.observer_gains import default_rate
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.square_root import prior_root
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -55,22 +62,26 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         largest = self._size(prior.cov.transpose(1, 2, 0)) + self.system.nx
-        return State(prior.mean, P=prior.cov, memory=(*self.tuning(len(prior.mean)), largest))
+        memory = (*self.tuning(len(prior.mean)), largest)
+        L = prior_root(self.system, prior, self.output_variance)
+        return State(prior.mean, P=prior.cov, memory=memory, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         P, (Q, _, largest) = covariances(state), state.memory
         assert state.t is not None
         theta = default_rate(self.system) if self.theta is None else self.theta
         grown = P * np.exp(theta * (t - state.t))
-        P = np.where(self._size(grown) < largest, grown, P)
+        forgets = self._size(grown) < largest
+        P = np.where(forgets, grown, P)
+        if state.root is not None:
+            factor = np.where(forgets, np.exp(0.5 * theta * (t - state.t)), 1.0)
+            state = replace(state, root=state.root * factor[:, None, None])
         return predicted(self.system, state, P, Q, t, u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         P, (_, R, _) = covariances(state), state.memory
         innovation, H = observe(self.system, t, state.xhat, y, u)
-        xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
-        P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S, state.memory)
+        return corrected(state, (t, u), P, innovation, H, R)
 
     def _size(self, P: np.ndarray) -> np.ndarray:
         """Return the sum of the variances in P (nx, nx, batch) over scale², shape (batch,)."""

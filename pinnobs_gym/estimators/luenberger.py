@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.observer_gains import (
     lmi_gain,
     placed_gain,
     settling_gain,
+    time_since,
 )
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
@@ -26,8 +27,9 @@ class Luenberger(RecursiveEstimator):
     (Luenberger 1964).
 
     Between samples the observer integrates the model. At a sample it applies the correction over
-    the time since the previous sample, by Euler's implicit method
+    the time since the output's previous sample, by Euler's implicit method
     (`pinnobs_gym.estimation.observer_gains.injection`). A missing output contributes no correction.
+    Gains are designed for scaled outputs, so that estimates do not depend on the outputs' units.
 
     Default tuning is the same rule for all systems. For each of 16 states of the benchmark's
     initial set, the model is linearised a quarter of a benchmark episode later, and a gain places
@@ -86,7 +88,7 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
         return settling_gain(self.system, rate)
 
     def reset(self, prior: Prior) -> State:
-        return State(prior.mean.astype(float), memory=self.designed())
+        return State(prior.mean.astype(float), memory=(self.designed(), None))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
@@ -94,11 +96,11 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
         return State(xhat, state.t, state.u, memory=state.memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, L = state.xhat, state.memory
-        dt = 0.0 if state.t is None else t - state.t
+        xhat, (L, last) = state.xhat, state.memory
         missing = np.isnan(y)
+        dt, last = time_since(last, t, missing)
         innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
         H = np.asarray(self.system.h_jacobian(t, xhat, u))
-        K = injection(L, H, 1.0 - missing, dt)
+        K = injection(L, H, dt)
         xhat = xhat + (K @ innovation[..., None])[..., 0]
-        return State(xhat, t, u, innovation=innovation, memory=L)
+        return State(xhat, t, u, innovation=innovation, memory=(L, last))

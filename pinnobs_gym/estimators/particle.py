@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.notices import say_once
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import factor, moments, spread, total, weighted_mean
 from pinnobs_gym.simulation.model import model_step
@@ -21,6 +23,11 @@ _FEW = 10
 their number over this."""
 _ROUNDS = 20
 """Largest number of tempering steps per sample."""
+_LARGEST = 1e150
+"""Absolute value of a state beyond which a particle counts as overflowed; its square is finite."""
+_ZERO = -1e300
+"""Logarithm of the weight of a particle that is out of the question. It is finite, so that a zeroth
+power of it is one."""
 _HALVINGS = 20
 """Number of bisection steps in the search of a tempering power."""
 
@@ -47,6 +54,10 @@ class ParticleFilter(RecursiveEstimator):
     towards the mean so that the mean and the covariance of the set are preserved in expectation.
     Without these Gaussians, few distinct particles would soon remain. The likelihood of a sample
     that would reduce the effective number below a tenth is tempered (Neal 2001).
+
+    A particle that overflows, or at which the output is not defined, has the weight zero. Where
+    this holds for all particles of an episode, they stay where they are, or the sample counts as
+    missing, and the log says so once.
 
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
@@ -99,8 +110,28 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         assert state.t is not None
         memory: ParticleMemory = state.memory
         x = model_step(self.system, state.t, t, memory.particles, state.u, u)
-        xhat = weighted_mean(np.exp(memory.log_weights), x)
-        return State(xhat, state.t, state.u, memory=replace(memory, particles=x))
+        log_weights = memory.log_weights
+        lost = ~(abs(x) < _LARGEST).all(axis=-1)
+        if lost.any():
+            x, log_weights = self._without(lost, x, memory)
+        xhat = weighted_mean(np.exp(log_weights), x)
+        memory = replace(memory, particles=x, log_weights=log_weights)
+        return State(xhat, state.t, state.u, memory=memory)
+
+    def _without(
+        self, lost: np.ndarray, x: np.ndarray, memory: ParticleMemory
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the particles and the logarithms of their weights, zero for the lost ones (number,
+        batch). These take their states before the step, which are finite."""
+        x = np.where(lost[..., None], memory.particles, x)
+        trial = np.where(lost, _ZERO, memory.log_weights)
+        every = trial.max(axis=0) <= _ZERO
+        if every.any():
+            self._say("all particles overflow in the model; they stay where they are")
+        return x, np.where(every, memory.log_weights, _normalised(trial))
+
+    def _say(self, what: str) -> None:
+        say_once(f"particle filter on {type(self.system).__name__}: {what}")
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: ParticleMemory = state.memory
@@ -108,7 +139,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         missing = np.isnan(y)
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
-        yhat, S = moments(np.exp(log_weights), outputs)
+        yhat, S = _predicted_output(np.exp(log_weights), outputs)
         S = S + np.diag(self.output_variance)
         x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
         weights = np.exp(log_weights)
@@ -118,7 +149,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         if len(rows):
             x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
         memory = ParticleMemory(x, log_weights, memory.sample + 1)
-        innovation = np.where(missing, 0.0, y - yhat)
+        innovation = np.where(missing | np.isnan(yhat), 0.0, y - yhat)
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 
     def _tempered(
@@ -151,8 +182,15 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
         t, y, u = seen
-        errors = np.nan_to_num(y - np.asarray(self.system.h(t, x, u)))
-        return np.einsum("nbp,p->nb", errors**2, -0.5 / self.output_variance)
+        errors = np.where(np.isnan(y), 0.0, y - np.asarray(self.system.h(t, x, u)))
+        log_likelihood = np.einsum("nbp,p->nb", errors**2, -0.5 / self.output_variance)
+        if math.isfinite(log_likelihood.sum()):
+            return log_likelihood
+        log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, _ZERO)
+        impossible = log_likelihood.max(axis=0) <= _ZERO
+        if impossible.any():
+            self._say("an output is not defined, or impossible, at all particles; it is left out")
+        return np.where(impossible, 0.0, log_likelihood)
 
     def _resampled(
         self, x: np.ndarray, log_weights: np.ndarray, rows: np.ndarray, stream: tuple[int, int]
@@ -179,6 +217,20 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         x[:, rows] = shrinkage * drawn + (1 - shrinkage) * mean + noise
         log_weights[:, rows] = -np.log(count)
         return x, log_weights
+
+
+def _predicted_output(weights: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means (batch, ny) and covariances (batch, ny, ny) of the outputs (number, batch,
+    ny) over the particles at which they are defined; NaN and zero if there are none."""
+    if math.isfinite(outputs.sum()):
+        return moments(weights, outputs)
+    defined: np.ndarray = np.all(abs(outputs) < _LARGEST, axis=-1)
+    weights = np.where(defined, weights, 0.0)
+    sums = total(weights)
+    mean, S = moments(
+        weights / np.where(sums > 0, sums, 1.0), np.where(defined[..., None], outputs, 0.0)
+    )
+    return np.where(sums[:, None] > 0, mean, np.nan), S
 
 
 def _normalised(log_weights: np.ndarray) -> np.ndarray:

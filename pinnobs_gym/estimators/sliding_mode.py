@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
-from pinnobs_gym.estimation.observer_gains import default_rate, injection, settling_gain
+from pinnobs_gym.estimation.observer_gains import (
+    default_rate,
+    injection,
+    settling_gain,
+    time_since,
+)
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
@@ -20,8 +25,9 @@ class SlidingMode(RecursiveEstimator):
 
     The switching term drives e to the surface e = 0 as long as it exceeds the unmodelled part of
     the output's rate. Within the boundary layer it acts as a higher gain; beyond the layer it is
-    constant. At a sample the observer applies the correction over the time since the previous
-    sample, by Euler's implicit method with the secant of the saturation, which avoids chattering.
+    constant. At a sample the observer applies the correction over the time since the output's
+    previous sample, by Euler's implicit method with the secant of the saturation, which avoids
+    chattering.
 
     Default tuning is the same rule for all systems: L is designed as for the Luenberger observer
     (`pinnobs_gym.estimation.observer_gains.settling_gain`), ε is `layer` standard deviations of the
@@ -60,7 +66,7 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         rate = default_rate(self.system) if self.rate is None else self.rate
         L = settling_gain(self.system, rate, 1 + self.switching)
         layer = self.layer * np.sqrt(self.output_variance)
-        return State(prior.mean.astype(float), memory=(L, layer))
+        return State(prior.mean.astype(float), memory=(L, layer, None))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
@@ -68,12 +74,12 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         return State(xhat, state.t, state.u, memory=state.memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, (L, layer) = state.xhat, state.memory
-        dt = 0.0 if state.t is None else t - state.t
+        xhat, (L, layer, last) = state.xhat, state.memory
         missing = np.isnan(y)
+        dt, last = time_since(last, t, missing)
         innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
         secant = 1 + self.switching / np.maximum(abs(innovation) / layer, 1.0)
         H = np.asarray(self.system.h_jacobian(t, xhat, u))
-        K = injection(L, H, np.where(missing, 0.0, secant), dt)
+        K = injection(L, H, dt * secant)
         xhat = xhat + (K @ innovation[..., None])[..., 0]
-        return State(xhat, t, u, innovation=innovation, memory=state.memory)
+        return State(xhat, t, u, innovation=innovation, memory=(L, layer, last))

@@ -7,9 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Range, State
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances, predicted
-from pinnobs_gym.estimation.kalman import cautious, joseph_update, observe
+from pinnobs_gym.estimation.gaussian import (
+    GaussianEstimator,
+    checked,
+    corrected,
+    covariances,
+    predicted,
+)
+from pinnobs_gym.estimation.kalman import cautious, observe
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.square_root import prior_root
 from pinnobs_gym.simulation.matrices import inner
 from pinnobs_gym.simulation.record import Prior
 
@@ -60,7 +67,8 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
         prior = checked(prior)
         growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
         memory = (*self.tuning(len(prior.mean)), self.output_variance, growth)
-        return State(prior.mean, P=prior.cov, memory=memory)
+        L = prior_root(self.system, prior, self.output_variance)
+        return State(prior.mean, P=prior.cov, memory=memory, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         Q, _, variance, growth = state.memory
@@ -73,6 +81,4 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
         P, (_, R, _, _) = covariances(state), state.memory
         innovation, H = observe(self.system, t, state.xhat, y, u)
         R = cautious(P, H, R, self.output_factor)
-        xhat, P, S = joseph_update(state.xhat, P, innovation, H, R)
-        P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S, state.memory)
+        return corrected(state, (t, u), P, innovation, H, R)

@@ -11,6 +11,7 @@ Functions annotated with `Array` take NumPy arrays and torch tensors, and preser
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -44,14 +45,37 @@ def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 def divide(A: Array, S: Array) -> Array:
     """Return AS⁻¹, shape (n, m, batch), for A of that shape and S (m, m, batch), symmetric and
-    positive definite. In NumPy the result is NaN where S is not positive definite and m > 1."""
+    positive definite.
+
+    In NumPy, where rounding leaves S no Cholesky factor, as for two equal sensors and P much larger
+    than R, the result is that of the pseudoinverse; it is NaN where S is zero or not finite.
+    """
     if len(S) == 1:
         return A / S
     if not isinstance(S, np.ndarray):
         inverse = array_namespace(S).linalg.inv(S.swapaxes(0, 2))  # batch first; S is symmetric
         return product(A, inverse.swapaxes(0, 2))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return divide_factored(A, cholesky(S))
+        L = cholesky(S)
+        X = divide_factored(A, L)
+    # A pivot that is not positive makes this one NaN: the sum tells whether there is any.
+    if not math.isfinite(L[-1, -1].sum()):
+        rows = np.flatnonzero(~np.isfinite(L[-1, -1]) & np.isfinite(S).all(axis=(0, 1)))
+        if len(rows):
+            X[..., rows] = _by_eigenvalues(A[..., rows if A.shape[2] > 1 else [0]], S[..., rows])
+    return X
+
+
+def _by_eigenvalues(A: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Return AS⁺ (n, m, batch) with the pseudoinverse of S (m, m, batch), for which eigenvalues
+    within the rounding error of the largest are zero; NaN where S is zero."""
+    values, vectors = np.linalg.eigh(S.transpose(2, 0, 1))
+    largest = values[:, -1:]
+    kept = values > 1e-14 * len(S) * largest
+    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+    inverse = np.where(largest > 0, inverse, np.nan)
+    parts = (A.transpose(2, 0, 1) @ vectors) * inverse[:, None]
+    return (parts @ vectors.swapaxes(1, 2)).transpose(1, 2, 0)
 
 
 def divide_factored(A: np.ndarray, L: np.ndarray) -> np.ndarray:

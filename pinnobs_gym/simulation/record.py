@@ -6,6 +6,7 @@ import csv
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,10 @@ class Prior:
     cov: np.ndarray
     """Prior covariances P₀, shape (batch, nx, nx)."""
 
+    def __post_init__(self) -> None:
+        for name in ("mean", "cov"):
+            object.__setattr__(self, name, _real(f"the prior's {name}", getattr(self, name)))
+
     @staticmethod
     def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
         """Return the prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
@@ -40,7 +45,15 @@ class Prior:
 
 @dataclass(frozen=True)
 class Record:
-    """The samples of a batch of episodes with common sample times."""
+    """The samples of a batch of episodes with common sample times.
+
+    Arrays of float32 or of whole numbers are converted to double precision.
+
+    Raises:
+        ValueError: in one line, if an array does not hold real numbers, has another number of rows
+            or samples than the others, or holds infinite values; if t does not increase; or if a
+            time or an input is not a number.
+    """
 
     t: np.ndarray
     """Sample times in s, ascending, shape (num_samples,)."""
@@ -52,6 +65,8 @@ class Record:
     """The prior of the initial state."""
 
     def __post_init__(self) -> None:
+        for name in ("t", "y", "u"):
+            object.__setattr__(self, name, _real(name, getattr(self, name)))
         steps = np.diff(self.t)
         if self.t.ndim != 1 or not len(self.t):
             raise ValueError(f"t has shape {self.t.shape}; expected (num_samples,)")
@@ -69,6 +84,34 @@ class Record:
             if array.ndim != 3 or array.shape[:2] != (batch, len(self.t)):
                 raise ValueError(
                     f"{name} has shape {array.shape}; expected ({batch}, {len(self.t)}, n{name})"
+                )
+        for name, wrong in (("y", np.isinf(self.y)), ("u", ~np.isfinite(self.u))):
+            if wrong.any():
+                row, sample, i = (int(index) for index in np.argwhere(wrong)[0])
+                allowed = "finite numbers, or NaN if missing" if name == "y" else "finite numbers"
+                raise ValueError(
+                    f"{name}{i + 1} of row {row} is {getattr(self, name)[row, sample, i]} at "
+                    f"sample {sample}; expected {allowed}"
+                )
+
+    def check_fits(self, system: System) -> None:
+        """Check that the record has the outputs, the inputs and the states of a system.
+
+        Raises:
+            ValueError: in one line that names the array, its size and the size expected.
+        """
+        kind, nx = type(system).__name__, system.nx
+        for name, size in (("y", system.ny), ("u", system.nu)):
+            found = getattr(self, name).shape[2]
+            if found != size:
+                raise ValueError(
+                    f"{name} has {found} column(s) in the record; {kind} has n{name}={size}"
+                )
+        for name, size in (("mean", (nx,)), ("cov", (nx, nx))):
+            shape, expected = getattr(self.prior, name).shape, (self.batch, *size)
+            if shape != expected:
+                raise ValueError(
+                    f"the prior's {name} has shape {shape}; {kind} has nx={nx}, expected {expected}"
                 )
 
     @property
@@ -89,6 +132,19 @@ class Record:
     def first_samples(self, number: int) -> Record:
         """Return the record of the first samples."""
         return Record(self.t[:number], self.y[:, :number], self.u[:, :number], self.prior)
+
+
+def _real(name: str, value: Any) -> np.ndarray:
+    """Return the value as an array in double precision.
+
+    Raises:
+        ValueError: in one line, if it does not consist of real numbers.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        first = f", such as {array.flat[0]!r}" if array.size else ""
+        raise ValueError(f"{name} holds values of type {array.dtype}{first}; expected real numbers")
+    return array.astype(float, copy=False)
 
 
 def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:

@@ -435,7 +435,7 @@ def _jacobian(system: System, name: str, t: Array, x: Array, u: Array) -> Array:
 
 
 NOISE_FLOOR = 1e-3
-"""Smallest standard deviation of output noise in R, relative to the output's scale."""
+"""Standard deviation that filters assume for outputs without noise, relative to their scale."""
 
 
 _TIMES = 9

@@ -271,7 +271,7 @@ def test_a_known_gain_of_reverse_duffing_settles():
 
 def test_large_gains_are_stable_and_missing_outputs_correct_nothing():
     H1 = np.array([[[1.0, 0.0]]] * 2)
-    K = injection(np.array([[1e9], [1.0]]), H1, np.array([[1.0], [0.0]]), 0.1)
+    K = injection(np.array([[1e9], [1.0]]), H1, np.array([[0.1], [0.0]]))
     np.testing.assert_allclose(K[0, :, 0], [1.0, 1e-9], rtol=1e-6)
     assert (K[1] == 0).all()
 
@@ -314,7 +314,7 @@ def test_an_lmi_without_a_solution_is_said_to_have_none(name):
     ("kind", "options", "message"),
     [
         (StrongTrackingEKF, {"gamma": -1.0}, "gamma=-1"),
-        (EnKF, {"members": 2}, "members=2; expected more than nx=2"),
+        (EnKF, {"members": 1}, "members=1; expected at least 2"),
         (EnKF, {"inflation": 0.9}, "inflation=0.9; expected"),
         (ParticleFilter, {"particles": 1}, "particles=1; expected at least 2"),
         (ParticleFilter, {"discount": 0.3}, "discount=0.3; expected"),

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -283,15 +284,9 @@ def _check(system: System, record: Record, config: PinnObsConfig) -> None:
         raise ValueError(
             f"the record has {record.num_samples} samples; PINN-Obs needs {MIN_SAMPLES} or more"
         )
-    sizes = (("y", record.y, system.ny), ("u", record.u, system.nu))
-    for symbol, array, size in (*sizes, ("xhat0", record.prior.mean, system.nx)):
-        if array.shape[-1] != size:
-            raise ValueError(f"{symbol} has {array.shape[-1]} columns; {name} has n={size}")
+    record.check_fits(system)
+    checked(record.prior)
     y = record.y[0]
-    if np.isinf(y).any():
-        raise ValueError(
-            f"y holds infinite numbers; {name} needs finite ones, or NaN where missing"
-        )
     present = [column[~np.isnan(column)] for column in y.T]
     if not any(len(column) and np.ptp(column) > 0 for column in present):
         raise ValueError(f"y of {name} does not vary over the record; there is nothing to learn")

@@ -27,7 +27,7 @@ from small_trainings import (
 
 from pinnobs_gym.estimation.learned.mlp import Activation, Architecture
 from pinnobs_gym.estimators.pinn_obs import PinnObs, PinnObsDirect, PinnObsReplay, TrainedNetwork
-from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.systems import SYSTEMS
 from trainers.pinn_obs import PinnObsConfig, paper
 from trainers.pinn_obs.adam import Adam
@@ -516,21 +516,41 @@ def with_y(y):
     return replace(random_record(Spring()), y=y)
 
 
+def with_P0(P0):
+    record = random_record(Spring())
+    return replace(record, prior=replace(record.prior, cov=np.array([P0])))
+
+
 @pytest.mark.parametrize(
     ("record", "message"),
     [
         (random_record(Spring(), batch=2), "holds 2 episodes"),
         (random_record(Spring(), 9), "has 9 samples"),
-        (random_record(Mixer()), "y has 2 columns; Spring has n=1"),
+        (random_record(Mixer()), r"y has 2 column\(s\) in the record; Spring has ny=1"),
         (with_y(np.ones((1, 40, 1))), "y of Spring does not vary"),
         (with_y(np.full((1, 40, 1), np.nan)), "y of Spring does not vary"),
-        (with_y(np.where(np.eye(40)[None, :, :1] > 0, np.inf, 0.0)), "infinite"),
+        (with_P0([[1.0, 2.0], [2.0, 1.0]]), "P0 of row 0 has eigenvalue -1; expected a covarianc"),
+        (with_P0([[1.0, 2.0], [0.0, 1.0]]), "P0 is not symmetric and finite; expected a covarianc"),
+        (with_P0(np.full((2, 2), np.nan)), "P0 is not symmetric and finite; expected a covariance"),
     ],
 )
 def test_a_record_that_cannot_be_trained_on_is_refused(record, message):
     with pytest.raises(ValueError, match=message) as caught:
         train_pinn_obs(Spring(), SMALL, record=record)
     assert "\n" not in str(caught.value)
+
+
+def test_records_of_other_real_types_are_trained_on():
+    """The sums of single and of whole numbers are those of the same numbers in double precision."""
+    record = random_record(Spring())
+    t, y, mean = np.arange(40.0), record.y.round(), record.prior.mean.round()
+    trained = []
+    for dtype in (float, np.float32, int):
+        prior = Prior(mean.astype(dtype), record.prior.cov.astype(dtype))
+        given = Record(t.astype(dtype), y.astype(dtype), record.u.astype(dtype), prior)
+        trained.append(train_pinn_obs(Spring(), replace(SMALL, iterations=2), record=given))
+    assert same_weights(trained[0], trained[1])
+    assert same_weights(trained[0], trained[2])
 
 
 @pytest.mark.parametrize(
