@@ -29,7 +29,7 @@ Row: TypeAlias = dict[str, Any]
   where there is nothing of this kind.
 - ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
   and its options. One that was trained under the condition that is scored has a track of its own.
-- ``settings``: the settings of the evaluation, an object.
+- ``settings``: what is not as usual (`pinnobs_gym.scoring.deviations`); names in tables have it.
 - ``estimator_code``: hash of the estimator's code.
 - ``estimator_hash``: hash of its code, settings, model and training.
 - ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,
