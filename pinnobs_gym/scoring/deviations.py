@@ -57,7 +57,10 @@ def _of_training(estimator: BaseEstimator) -> dict[str, Any]:
     """Return the settings of the training that are not those of the estimator's own recipe; a
     preset's name stands for its settings, unless the name of the estimator's recipe says it."""
     cls, config = type(estimator), canonical(estimator.training.get("config", {}))
-    trainer, usual = trainer_class(cls), cls.trainer_config({})
+    try:
+        trainer, usual = trainer_class(cls), cls.trainer_config({})
+    except ValueError:  # its trainer is not known here, so that no settings are the usual ones
+        return {}
     # The preset that is nearest to the settings; the estimator's own one if several are.
     makers = {"": lambda: usual, **trainer.presets}
     presets = {name: make() for name, make in makers.items()}

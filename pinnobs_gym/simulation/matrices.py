@@ -48,7 +48,8 @@ def divide(A: Array, S: Array) -> Array:
     positive definite.
 
     In NumPy, where rounding leaves S no Cholesky factor, as for two equal sensors and P much larger
-    than R, the result is that of the pseudoinverse; it is NaN where S is zero or not finite.
+    than R, the result is that of the pseudoinverse; it is NaN where S is zero, not finite, or has a
+    negative eigenvalue that is no rounding error.
     """
     if len(S) == 1:
         return A / S
@@ -68,12 +69,14 @@ def divide(A: Array, S: Array) -> Array:
 
 def _by_eigenvalues(A: np.ndarray, S: np.ndarray) -> np.ndarray:
     """Return AS⁺ (n, m, batch) with the pseudoinverse of S (m, m, batch), for which eigenvalues
-    within the rounding error of the largest are zero; NaN where S is zero."""
+    within the rounding error of the largest are zero; NaN where S is zero or has a negative one
+    beyond it."""
     values, vectors = np.linalg.eigh(S.transpose(2, 0, 1))
     largest = values[:, -1:]
-    kept = values > 1e-14 * len(S) * largest
+    rounding = 1e-14 * len(S) * largest
+    kept = values > rounding
     inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
-    inverse = np.where(largest > 0, inverse, np.nan)
+    inverse = np.where((largest > 0) & (values[:, :1] >= -rounding), inverse, np.nan)
     parts = (A.transpose(2, 0, 1) @ vectors) * inverse[:, None]
     return (parts @ vectors.swapaxes(1, 2)).transpose(1, 2, 0)
 

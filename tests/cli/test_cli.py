@@ -269,7 +269,7 @@ def test_a_failed_job_is_told_left_out_and_tried_again_if_asked(folder, capsys):
     printed = capsys.readouterr().out
     name = "broken on ReverseDuffing, nominal, 4 episodes"
     assert f"failed: {name}: RuntimeError: out of luck" in printed
-    assert "Failed: broken, 4 episodes: RuntimeError: out of luck." in printed
+    assert "Failed: broken, 4 episodes: RuntimeError: out of luck." in " ".join(printed.split())
     assert scored() == {"ekf"}
     (failure,) = rows.load(path).failures
     assert (failure["estimator"], failure["error"]) == ("broken", "RuntimeError: out of luck")

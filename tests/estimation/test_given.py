@@ -11,8 +11,10 @@ from pinnobs_gym.estimation.estimator import Estimates, Estimator, OfflineEstima
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.systems import SYSTEMS
 
-RECORD = linear_record()
+with SYSTEMS.isolated():  # what is registered while tests are collected would stay
+    RECORD = linear_record()
 EVERY = [*untrained(), "pinn_obs"]
 ONLINE = [n for n in untrained() if issubclass(ESTIMATORS.resolve(n), Estimator)]
 

@@ -137,7 +137,7 @@ def test_the_packages_of_the_class_itself_count(hash_of):
     files = {"my_pkg/sub/est": text(), "my_pkg/__init__": "", "my_pkg/sub/__init__": ""}
     hashes = {hash_of(files)}
     for package in ("my_pkg/__init__", "my_pkg/sub/__init__"):
-        hashes.add(hash_of({**files, package: "import numpy\n\nnumpy.seterr(all='raise')"}))
+        hashes.add(hash_of({**files, package: "import numpy\n\nGAIN = numpy.pi"}))
     assert len(hashes) == 3
 
 
