@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pinnobs_gym.scoring.recency import LastUse
+from pinnobs_gym.scoring.recency import LastUse, facts_of
 from pinnobs_gym.scoring.rows import Row, game_of
 
 _SHOWN = 6
@@ -76,7 +76,7 @@ def _of_present_games(rows: Sequence[Row], last_use: LastUse) -> tuple[list[Row]
 def _named_by_difference(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]:
     """Return rows whose estimators are renamed where several have one name; dates are those of the
     last use of each row's code."""
-    keys = [(name_of(row), json.dumps(_facts(row), sort_keys=True)) for row in rows]
+    keys = [(name_of(row), json.dumps(facts_of(row), sort_keys=True)) for row in rows]
     last: dict[tuple[str, str], str] = {}
     for key, date in zip(keys, dates, strict=True):
         last[key] = max(last.get(key, date), date)
@@ -90,17 +90,6 @@ def _named_by_difference(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]
         row | {"estimator": f"{row['estimator']} ({suffixes[key]})"} if key in suffixes else row
         for row, key in zip(rows, keys, strict=True)
     ]
-
-
-def _facts(row: Row) -> dict[str, Any]:
-    """Return what may differ between estimators of one name: settings and code. Trained ones may
-    differ in their training seeds and still be one."""
-    config = row["training"].get("config", {})
-    trained = {name: value for name, value in config.items() if name not in ("seed", "budget")}
-    if "condition" in row["training"]:
-        trained["trained_under"] = row["training"]["condition"]
-    settings = trained if row["training"] else row["options"]
-    return {**settings, "code": row["estimator_code"]}
 
 
 def _difference(facts: Mapping[str, Any], plain: Mapping[str, Any]) -> str:

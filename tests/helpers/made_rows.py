@@ -9,6 +9,7 @@ def rows_of(estimator, nrmse, track="online", diverged=None, **changes):
         {
             **dict.fromkeys(SCORES, value),
             **dict.fromkeys(OPTIONAL_SCORES),
+            "kind": "score",
             "ranked": True,
             "nx": 2,
             "options": {},
