@@ -12,6 +12,7 @@ from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.noise import noise_std
 from pinnobs_gym.simulation.system import System, vector
 
 
@@ -92,10 +93,13 @@ def _setups(cls: type[System]) -> str:
             start = f"x₀ = {low}"
         else:
             start = f"x₀ uniform in {low} to {high}, where admissible"
-        noise = vector(setup.noise_std, system.ny, "noise_std").tolist()
+        noise = noise_std(setup.noise_std, system.ny, "noise_std").tolist()
+        process = noise_std(setup.process_noise, system.nx, "process_noise")
         lines.append(
             f"- `{name}`: {start}; x̂₀ = {xhat0}, P₀ = {P0}; output "
-            f"noise {noise}" + (f"; {dict(setup.parameters)}" if setup.parameters else "")
+            f"noise {noise}"
+            + (f"; process noise {process.tolist()} per √s" if process.any() else "")
+            + (f"; {dict(setup.parameters)}" if setup.parameters else "")
         )
         if setup.poor_prior is not None:
             xhat0, P0 = setup.poor_prior.xhat0, setup.poor_prior.P0

@@ -17,9 +17,9 @@ from gymnasium.spaces import Box
 from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.estimation.least_squares import root
-from pinnobs_gym.estimation.noise import assumed_noise
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.noise import AssumedNoise
 from pinnobs_gym.simulation.system import Setup, System, vector
 
 LARGEST_REWARD = 10.0
@@ -344,20 +344,19 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
     draws = np.random.default_rng(0).standard_normal((_DRAWS, nx))
     x = mean + draws @ root(cov[..., None])[..., 0].T
     P = np.broadcast_to(cov[..., None], (nx, nx, _DRAWS))
-    scale = vector(system.scale, nx, "scale")
-    Q = np.diag((GaussianEstimator.process_noise * scale) ** 2)[..., None]
-    R = np.diag(assumed_noise(system, setup.noise_std) ** 2)[..., None]
+    told = system.noise(setup.noise_std, setup.process_noise)
+    noise = AssumedNoise.of(system, told, GaussianEstimator.assumed_noise)
     u = np.broadcast_to(np.asarray(system.input(times))[:, None], (len(times), _DRAWS, system.nu))
     zero = np.zeros((_DRAWS, system.ny))
     variance, S_all = np.empty((len(times), nx, _DRAWS)), np.empty((len(times), system.ny, _DRAWS))
     with np.errstate(all="ignore"):  # the model may diverge from some draws
         for k, t in enumerate(times):
             if k:
-                x, P, _ = predict(system, (times[k - 1], t), x, P, Q, (u[k - 1], u[k]))
+                x, P, *_ = predict(system, (times[k - 1], t), x, P, noise, (u[k - 1], u[k]))
             variance[k] = np.einsum("iib->ib", P)
             # Covariances of the update; the zero innovation leaves the trajectory unchanged.
             H = system.h_jacobian(t, x, u[k]).transpose(1, 2, 0)
-            _, P, S = joseph_update(x, P, zero, H, R)
+            _, P, S = joseph_update(x, P, zero, H, noise.R(float(t)))
             S_all[k] = np.einsum("iib->ib", S)
         sound = np.isfinite(variance).all(axis=(0, 1)) & np.isfinite(S_all).all(axis=(0, 1))
     if not sound.any():

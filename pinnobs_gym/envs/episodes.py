@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -13,8 +14,10 @@ import numpy as np
 
 from pinnobs_gym.simulation.conditions import parse_condition
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
 from pinnobs_gym.systems import SYSTEMS
@@ -35,7 +38,7 @@ class Changes(TypedDict, total=False):
     """Time between samples in s."""
     duration: float | None
     """Length of an episode in s."""
-    noise_std: Sequence[float] | float | None
+    noise_std: Level | None
     """Standard deviation of the output noise, in output units."""
     parameters: Mapping[str, float] | None
     """Physical parameters."""
@@ -50,7 +53,8 @@ class Draws:
     noise: np.ndarray
     """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
     seeds: tuple[int, ...]
-    """A seed per episode for the draws of its condition; empty if the condition draws nothing."""
+    """A seed per episode for the draws of its condition and of the process noise; empty if neither
+    draws anything."""
 
     def row(self, i: int) -> Draws:
         """Return the draws of one episode."""
@@ -106,14 +110,16 @@ class EpisodeSource:
         self.condition.plant(self.system, ())  # raises if the condition does not apply
         self.setup = self.condition.setup(self.system, chosen)
         self.fixed_x0 = self.setup.fixed_x0
-        self.process_noise = self.condition.process_noise(self.system)
+        own = self.system.noise(self.setup.noise_std, self.setup.process_noise)
+        self.noise = own.and_process(self.condition.process_noise(self.system, self.setup))
         self.trivial = type(self.condition) is Condition
         self.deterministic = self.fixed_x0 and self.trivial and not np.any(self.setup.noise_std)
+        self.deterministic &= not self.noise.stochastic
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
         self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
-        self._noise_std = vector(self.setup.noise_std, self.system.ny, "noise_std")
+        self._parts = math.ceil(self.setup.dt / longest_step(self.system) - 1e-6)
 
     def contains(self, x0: np.ndarray) -> np.ndarray:
         """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
@@ -137,7 +143,8 @@ class EpisodeSource:
         for i, stream in enumerate(streams):
             x0[i] = stream.next_x0(self)
             stream.noise.standard_normal(out=noise[i])
-        seeds = () if self.trivial else tuple(int(s.conditions.integers(2**63)) for s in streams)
+        drawing = not self.trivial or self.noise.stochastic
+        seeds = tuple(int(s.conditions.integers(2**63)) for s in streams) if drawing else ()
         return Draws(x0, noise, seeds)
 
     def play(
@@ -155,16 +162,16 @@ class EpisodeSource:
         x, y, observations = episodes.x, episodes.y, episodes.observations
         rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
-        if self.process_noise is not None:
-            steps = (len(self.times) - 1, self.system.nx)
-            drawn = np.stack([rng.standard_normal(steps) for rng in rngs], axis=1)
-            noise = self.process_noise * drawn
-            disturbed_truth(plant, start, self.times, noise, self.setup.truth_step, out=x)
+        if self.noise.stochastic:
+            shape = (len(self.times) - 1, self._parts, 2, self.noise.L(0.0).shape[1])
+            drawn = np.stack([rng.standard_normal(shape) for rng in rngs], axis=3)
+            step = self.setup.truth_step
+            disturbed_truth(plant, self.noise, start, self.times, drawn, step, out=x)
         elif plant is self.system and len(start) > 1 and (start == start[0]).all():
             x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
         else:
             truth(plant, start, self.times, self.setup.truth_step, out=x)
-        np.multiply(draws.noise.swapaxes(0, 1), self._noise_std, out=y)
+        y[:] = self.noise.outputs(self.times, draws.noise.swapaxes(0, 1))
         y += plant.h(self.times[:, None], x, self.inputs[:, None])
         if not self.trivial:
             sent = Outputs(self.times, y, noise_scale(self.system, self.setup))

@@ -95,9 +95,10 @@ def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False
         steps *= rng.uniform(0.3, 2.0, len(steps))
     t = np.append(0.0, np.cumsum(steps))
     x = truth(system, initial_states(system, setup, batch), t).swapaxes(0, 1)
-    std = vector(setup.noise_std, system.ny, "noise_std")
+    noise = system.noise(setup.noise_std, setup.process_noise)
     u = np.broadcast_to(system.input(t), (batch, len(t), system.nu)).copy()
-    y = system.h(t, x, u) + std * rng.standard_normal((batch, len(t), system.ny))
+    drawn = rng.standard_normal((len(t), batch, system.ny))
+    y = system.h(t, x, u) + noise.outputs(t, drawn).swapaxes(0, 1)
     return Record(t, y, u, Prior.of(system, setup, batch))
 
 

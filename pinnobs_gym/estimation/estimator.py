@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import Field, dataclass, fields
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from pinnobs_gym.estimation.given import checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
-from pinnobs_gym.estimation.noise import assumed_noise
 from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System
@@ -83,9 +84,12 @@ class BaseEstimator(ABC):
 
     system: System
     """The model of the plant."""
-    noise_std: Sequence[float] | float | None = None
-    """Standard deviation of the output noise known to the estimator, in output units; that of the
-    setup ``benchmark`` if None."""
+    noise_std: Level | SampledLevel | None = None
+    """Output noise known to the estimator, as `Setup.noise_std` or by sample; that of the setup
+    ``benchmark`` if None."""
+    process_noise: Level | None = None
+    """Process noise known to the estimator, as `Setup.process_noise`; that of the setup
+    ``benchmark`` if None."""
 
     track: ClassVar[str]
     """``online`` (causal) or ``offline`` (uses the whole record); the two are ranked separately."""
@@ -119,12 +123,13 @@ class BaseEstimator(ABC):
 
     def __post_init__(self) -> None:
         probe(type(self.system))
+        self.system.noise(self.noise_std, self.process_noise)  # raises for a wrong level
         check_settings(self, self.setting_fields())
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
-        """Return the estimator for a model, with a setup's noise level and the given settings."""
-        return cls(system, noise_std=setup.noise_std, **options)
+        """Return the estimator for a model, with a setup's noise and the given settings."""
+        return cls(system, setup.noise_std, setup.process_noise, **options)
 
     @classmethod
     def trainer_config(cls, changes: Mapping[str, Any]) -> Any:
@@ -145,11 +150,11 @@ class BaseEstimator(ABC):
                 `Record.check_fits`. The check precedes the method of any subclass.
         """
 
-    @property
-    def output_variance(self) -> np.ndarray:
-        """Diagonal of R, shape (ny,), in squared output units: that of
-        `pinnobs_gym.estimation.noise.assumed_noise`, which is positive."""
-        return assumed_noise(self.system, self.noise_std) ** 2
+    @cached_property
+    def noise(self) -> AssumedNoise:
+        """The noise that the estimator assumes: that which it is told, with an output noise above
+        zero."""
+        return AssumedNoise.of(self.system, self.system.noise(self.noise_std, self.process_noise))
 
     @property
     def label(self) -> str:

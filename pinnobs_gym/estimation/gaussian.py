@@ -3,40 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pinnobs_gym.estimation import square_root
 from pinnobs_gym.estimation.estimator import BaseEstimator, Range, State
 from pinnobs_gym.estimation.kalman import joseph_update, predict
+from pinnobs_gym.simulation.noise import AssumedNoise, Noise
 from pinnobs_gym.simulation.record import Prior
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System
 
 
 @dataclass(frozen=True)
 class GaussianEstimator(BaseEstimator):
     """The settings of estimators with a mean and a covariance.
 
-    The tuning rule is the same for all systems: x̂₀ and P₀ are those of the prior, R is diagonal
-    with `BaseEstimator.output_variance`, and Q = diag(`process_noise`·scale)² per sample.
+    The tuning rule is the same for all systems: x̂₀ and P₀ are those of the prior, R is that of the
+    known output noise, and the process noise is the known one with `assumed_noise` added.
     """
 
-    process_noise: float = 1e-4
-    """Standard deviation of the process noise per sample, relative to the state's scale."""
+    assumed_noise: float = 3e-3
+    """Standard deviation of process noise that is assumed beyond the known one, over each state's
+    scale and the benchmark's duration: what the model may be off after that time."""
 
-    tunable = {"process_noise": Range(1e-7, 1e-1, log=True)}
+    tunable = {"assumed_noise": Range(3e-6, 3.0, log=True)}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.process_noise < np.inf:
-            raise ValueError(f"process_noise={self.process_noise}; expected a number of at least 0")
+        if not 0 <= self.assumed_noise < np.inf:
+            raise ValueError(f"assumed_noise={self.assumed_noise}; expected a number of at least 0")
 
-    def tuning(self, batch: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return Q (nx, nx, batch) and R (ny, ny, batch), the same for all rows."""
-        scale = vector(self.system.scale, self.system.nx, "scale")
-        Q = np.diag((self.process_noise * scale) ** 2)
-        R = np.diag(self.output_variance)
-        return np.repeat(Q[..., None], batch, axis=-1), np.repeat(R[..., None], batch, axis=-1)
+    @cached_property
+    def noise(self) -> AssumedNoise:
+        """The known noise, with `assumed_noise` and an output noise above zero."""
+        told = self.system.noise(self.noise_std, self.process_noise)
+        return AssumedNoise.of(self.system, told, self.assumed_noise)
 
 
 def checked(prior: Prior) -> Prior:
@@ -73,7 +75,13 @@ def covariances(state: State) -> np.ndarray:
 
 
 def predicted(
-    system: System, state: State, P: np.ndarray, Q: np.ndarray, t: float, u: np.ndarray
+    system: System,
+    state: State,
+    P: np.ndarray,
+    noise: Noise,
+    t: float,
+    u: np.ndarray,
+    growth: np.ndarray | None = None,
 ) -> State:
     """Return the state with the prediction x̂(k|k−1) and its covariance ΦPΦᵀ + Q; see
     `RecursiveEstimator.predict`.
@@ -82,19 +90,22 @@ def predicted(
         system: the model.
         state: the state after the previous sample.
         P: covariances at that sample, shape (nx, nx, batch), in place of those of the state.
-        Q: covariance of the process noise per sample, shape (nx, nx, batch or 1).
+        noise: the noise, of which the process noise is used.
         t: time of the next sample in s.
         u: inputs at the next sample, shape (batch, nu).
+        growth: a covariance to be added to Q, shape (nx, nx, batch or 1); none if None.
     """
     assert state.t is not None  # no prediction precedes the first sample
-    xhat, P, F = predict(system, (state.t, t), state.xhat, P, Q, (state.u, u))
+    xhat, P, F, Q = predict(system, (state.t, t), state.xhat, P, noise, (state.u, u))
+    if growth is not None:
+        P, Q = P + growth, Q + growth
     covariance, L = P.transpose(2, 0, 1), state.root
     if L is not None:
         rows = square_root.carried(L)
-        noise = np.broadcast_to(Q, (*Q.shape[:2], len(xhat)))[..., rows]
+        added = np.broadcast_to(Q, (*Q.shape[:2], len(xhat)))[..., rows]
         L, covariance = L.copy(), covariance.copy()
         moved = F.transpose(2, 0, 1)[rows] @ L[rows]
-        L[rows] = square_root.compressed(moved, square_root.root_of(noise.transpose(2, 0, 1)))
+        L[rows] = square_root.compressed(moved, square_root.root_of(added.transpose(2, 0, 1)))
         covariance[rows] = square_root.covariance(L[rows])
     return State(xhat, state.t, state.u, covariance, state.innovation, None, state.memory, L)
 

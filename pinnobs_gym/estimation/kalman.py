@@ -10,7 +10,8 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.matrices import divide, identity, mapped, outer, product, sandwich
-from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.model import model_step_moments
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import Array, System
 
 
@@ -19,9 +20,9 @@ def predict(
     times: tuple[float, float],
     xhat: np.ndarray,
     P: np.ndarray,
-    Q: np.ndarray,
+    noise: Noise,
     inputs: tuple[np.ndarray | None, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Predict estimates and covariances from one sample to the next.
 
     Args:
@@ -29,18 +30,17 @@ def predict(
         times: times of the two samples in s.
         xhat: estimates at the first, shape (batch, nx).
         P: their covariances, shape (nx, nx, batch).
-        Q: covariance of the process noise, shape (nx, nx, batch or 1).
+        noise: the noise, of which the process noise is used.
         inputs: inputs at the two samples, shape (batch, nu).
 
     Returns:
-        Predictions (batch, nx), their covariances ΦPΦᵀ + Q (nx, nx, batch), and the Jacobian Φ of
-        the model's step (nx, nx, batch).
+        Predictions (batch, nx), their covariances ΦPΦᵀ + Q (nx, nx, batch), the Jacobian Φ of the
+        model's step (nx, nx, batch), and Q (nx, nx, batch or 1).
     """
-    xhat, F = model_step_jacobian(system, *times, xhat, *inputs)
-    F = F.transpose(1, 2, 0)
+    xhat, F, Q = model_step_moments(system, noise, *times, xhat, *inputs)
     P = sandwich(F, P)
     P += Q
-    return xhat, P, F
+    return xhat, P, F, Q
 
 
 def observe(

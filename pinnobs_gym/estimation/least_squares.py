@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import observe
-from pinnobs_gym.simulation.matrices import inner, mapped, product
+from pinnobs_gym.simulation.matrices import divide, mapped, product, squared_size
 from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import System
 
 
@@ -36,23 +37,23 @@ class Fit:
 
 def linearised(
     system: System,
+    noise: Noise,
     t: Sequence[float] | np.ndarray,
     y: Sequence[np.ndarray] | np.ndarray,
     u: Sequence[np.ndarray] | np.ndarray,
     x: np.ndarray,
     X: np.ndarray,
-    R: np.ndarray,
 ) -> Fit:
     """Simulate the model from x, and form the normal equations of the output errors.
 
     Args:
         system: the model.
+        noise: the noise, of which the output noise is used.
         t: sample times in s, num_samples of them.
         y: outputs (batch, ny) at each time; NaN marks a missing output.
         u: inputs (batch, nu) at each time.
         x: states at the first time, shape (batch, nx).
         X: derivatives of x by the parameters, shape (nx, n, batch).
-        R: variances of the output noise, shape (ny,).
     """
     n, batch = X.shape[1:]
     cost, right = np.zeros(batch), np.zeros((n, batch))
@@ -67,9 +68,9 @@ def linearised(
         error, H = observe(system, float(t[k]), x, y[k], u[k])  # zero where y is missing
         G = product(H, X)
         # Accumulate the normal equations.
-        weighted = (G / R[:, None, None]).transpose(1, 0, 2)
-        e = np.ascontiguousarray(error.T)
-        cost += inner(e / R[:, None], e)
+        R = noise.R(float(t[k]), y[k])
+        weighted = divide(G.transpose(1, 0, 2), R)
+        cost += squared_size(error, R)
         right += mapped(weighted, error).T
         information += product(weighted, G)
     return Fit(cost, information, right, states, derivatives)

@@ -20,7 +20,7 @@ from pinnobs_gym.estimation.square_root import (
     root_of,
 )
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
-from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -28,10 +28,6 @@ from pinnobs_gym.simulation.record import Prior
 class SigmaPointMemory:
     """The filter's memory in addition to the fields of `State`. The batch is the last axis."""
 
-    Q: np.ndarray
-    """Covariance of the process noise, shape (nx, nx, batch)."""
-    R: np.ndarray
-    """Covariance of the output noise, shape (ny, ny, batch)."""
     points: tuple[np.ndarray, np.ndarray, np.ndarray]
     """Points (num_points, nx), their weights in means (num_points, 1, 1), and the square roots of
     their weights in covariances (num_points, 1); see `SigmaPointFilter.points`."""
@@ -43,7 +39,8 @@ class SigmaPointMemory:
 class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     """A Kalman filter that computes moments from points propagated through the model.
 
-    New points are generated after the prediction, so that their spread includes Q. With the
+    New points are generated after the prediction, so that their spread includes Q, which is that
+    along the trajectory of the estimate. With the
     weighted deviations X of the points and Y of their outputs, the gain is K = XYᵀ(YYᵀ + R)⁻¹ and
     the covariance P⁺ = (X − KY)(X − KY)ᵀ + KRKᵀ. This is Joseph's form, positive semidefinite for
     any K (Arasaratnam & Haykin 2009, the square-root form of section VII). If a covariance has no
@@ -73,8 +70,8 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         batch = len(prior.mean)
         unit, mean_weights, cov_weights = self.points()
         points = unit, mean_weights[:, None, None], np.sqrt(cov_weights)[:, None]
-        memory = SigmaPointMemory(*self.tuning(batch), points, np.zeros(batch))
-        root = prior_root(self.system, prior, self.output_variance)
+        memory = SigmaPointMemory(points, np.zeros(batch))
+        root = prior_root(self.system, prior, self.noise.R(0.0))
         return State(prior.mean, P=prior.cov, memory=memory, root=root)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
@@ -84,21 +81,20 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         L, memory = _factor(state, memory)
         points = unit @ L  # (nx, num_points, batch)
         points += state.xhat.T[:, None]
+        _, _, Q = model_step_moments(self.system, self.noise, state.t, t, state.xhat, state.u, u)
         # Propagate each point through the model; then compute mean and covariance.
         points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
-        P = (outer(X, X) + memory.Q).transpose(2, 0, 1)
+        P = (outer(X, X) + Q).transpose(2, 0, 1)
         after = State(mean.T, state.t, state.u, P, state.innovation, None, memory, state.root)
-        return (
-            after if state.root is None else _rooted(after, X, root_of(memory.Q.transpose(2, 0, 1)))
-        )
+        return after if state.root is None else _rooted(after, X, root_of(Q.transpose(2, 0, 1)))
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
-        xhat = state.xhat
+        xhat, R = state.xhat, self.noise.R(t, y)
         L, memory = _factor(state, memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
@@ -111,21 +107,21 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         if np.count_nonzero(missing):
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
-        K, S = gain_of_deviations(X, Y, memory.R)
+        K, S = gain_of_deviations(X, Y, R)
         if state.root is not None:
-            rows = carried(state.root)
-            parts = (part.transpose(2, 0, 1)[rows] for part in (X, Y, memory.R))
+            rows, noise = carried(state.root), np.broadcast_to(R, (*R.shape[:2], len(y)))
+            parts = (part.transpose(2, 0, 1)[rows] for part in (X, Y, noise))
             K[..., rows] = gain(*parts).transpose(1, 2, 0)
         # Covariance in Joseph's form, (X − KY)(X − KY)ᵀ + KRKᵀ.
         X -= product(K, Y)
         P = outer(X, X)
-        P += sandwich(K, memory.R)
+        P += sandwich(K, R)
         xhat = (xhat.T + mapped(K, innovation).T).T
         P, S = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1), S.transpose(2, 0, 1)
         after = State(xhat, t, u, P, innovation, S, memory, state.root)
         if state.root is None:
             return after
-        noise = K.transpose(2, 0, 1) @ root_of(memory.R.transpose(2, 0, 1))
+        noise = K.transpose(2, 0, 1) @ root_of(R.transpose(2, 0, 1))
         return _rooted(after, X, noise)
 
 
@@ -147,6 +143,7 @@ def _rooted(state: State, X: np.ndarray, noise: np.ndarray) -> State:
     assert state.P is not None
     rows = carried(state.root)
     root, P = state.root.copy(), state.P.copy()
+    noise = np.broadcast_to(noise, (len(root), *noise.shape[1:]))
     root[rows] = compressed(X.transpose(2, 0, 1)[rows], noise[rows])
     P[rows] = covariance(root[rows])
     return replace(state, root=root, P=P)

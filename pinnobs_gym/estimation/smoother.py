@@ -20,7 +20,8 @@ from pinnobs_gym.simulation.matrices import (
     product,
     sandwich,
 )
-from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.model import model_step_moments
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 
@@ -47,7 +48,7 @@ class Filtered(Path):
     F: np.ndarray
     """Jacobians of the model's steps, shape (num_samples − 1, nx, nx, batch)."""
     Q: np.ndarray
-    """Covariance of the process noise per sample, shape (nx, nx, 1)."""
+    """Covariances of the process noise over the steps, shape (num_samples − 1, nx, nx, batch)."""
     K: np.ndarray
     """Kalman gains, shape (num_samples, nx, ny, batch)."""
     H: np.ndarray
@@ -57,8 +58,7 @@ class Filtered(Path):
 def forward(
     system: System,
     record: Record,
-    Q: np.ndarray,
-    R: np.ndarray,
+    noise: Noise,
     about: np.ndarray | None = None,
     caution: float = 0.0,
 ) -> Filtered:
@@ -67,8 +67,7 @@ def forward(
     Args:
         system: the model.
         record: record of a batch of episodes.
-        Q: covariance of the process noise per sample, shape (nx, nx, 1).
-        R: covariance of the output noise, shape (ny, ny, batch or 1).
+        noise: the noise.
         about: states (num_samples, batch, nx) of linearisation; the filter's own estimates if None,
             as in the extended Kalman filter.
         caution: fraction of HPHᵀ that is added to R, which shortens every update (as in Boutayeb &
@@ -80,16 +79,17 @@ def forward(
     x, P = record.prior.mean, record.prior.cov.transpose(1, 2, 0)
     before, after = (Path(np.empty((n, batch, nx)), np.empty((n, nx, nx, batch))) for _ in range(2))
     K, H = np.empty((n, nx, ny, batch)), np.empty((n, ny, nx, batch))
-    ends, F = np.empty((0, batch, nx)), np.empty((n - 1, nx, nx, batch))
+    ends, F, Q = np.empty((0, batch, nx)), *(np.empty((n - 1, nx, nx, batch)) for _ in range(2))
     if about is not None:
-        ends, F = flows(system, t, about, u)
+        ends, F, Q = flows(system, noise, t, about, u)
     for k in range(n):
         # Prediction: of the EKF, or by the steps linearised about the given states.
         if k and about is None:
-            x, P, F[k - 1] = predict(system, (t[k - 1], t[k]), x, P, Q, (u[k - 1], u[k]))
+            times, inputs = (t[k - 1], t[k]), (u[k - 1], u[k])
+            x, P, F[k - 1], Q[k - 1] = predict(system, times, x, P, noise, inputs)
         elif k and about is not None:
             x = ends[k - 1] + mapped(F[k - 1], x - about[k - 1])
-            P = sandwich(F[k - 1], P) + Q
+            P = sandwich(F[k - 1], P) + Q[k - 1]
         before.xhat[k], before.P[k] = x, P
         # Innovation, with h linearised about the same states.
         at = x if about is None else about[k]
@@ -97,9 +97,9 @@ def forward(
         if about is not None:
             innovation = innovation - mapped(H[k], x - about[k])
         # Update.
-        noise = cautious(P, H[k], R, caution)
-        K[k], _ = kalman_gain(P, H[k], noise)
-        x, P = update_with(K[k], x, P, innovation, H[k], noise)
+        R = cautious(P, H[k], noise.R(float(t[k]), y[k]), caution)
+        K[k], _ = kalman_gain(P, H[k], R)
+        x, P = update_with(K[k], x, P, innovation, H[k], R)
         after.xhat[k], after.P[k] = x, P
     return Filtered(after.xhat, after.P, before, F, Q, K, H)
 
@@ -126,8 +126,7 @@ def backward(filtered: Filtered) -> Path:
 def iterated(
     system: System,
     record: Record,
-    Q: Sequence[np.ndarray],
-    R: np.ndarray,
+    noises: Sequence[Noise],
     about: np.ndarray | None = None,
     *,
     caution: float = 0.0,
@@ -142,10 +141,8 @@ def iterated(
     Args:
         system: the model.
         record: record of a batch of episodes.
-        Q: covariance of the process noise per sample, shape (nx, nx, 1), for each pass. A row has
-            converged when a pass with the last covariance moves none of its states by more than
-            ``settled``.
-        R: covariance of the output noise, shape (ny, ny, batch or 1).
+        noises: the noise of each pass. A row has converged when a pass with the last one moves none
+            of its states by more than ``settled``. Output noise does not differ between rows.
         about: states (num_samples, batch, nx) of the first linearisation; the filter's own
             estimates if None.
         caution: see `forward`; it applies to the first pass, and only if ``about`` is None.
@@ -160,16 +157,15 @@ def iterated(
     if about is not None:
         x[:] = about
     rows, first = np.arange(batch), about is None
-    for each in Q:
+    for noise in noises:
         at = None if first else x[:, rows]
-        noise = R if R.shape[-1] == 1 else R[..., rows]
         remaining = record if len(rows) == batch else record.rows(rows)
         # One Gauss-Newton step: filter and smooth the model linearised at the last trajectory.
-        path = backward(forward(system, remaining, each, noise, at, caution if first else 0.0))
+        path = backward(forward(system, remaining, noise, at, caution if first else 0.0))
         moved = np.inf if at is None else (abs(path.xhat - at) / scale).max(axis=(0, 2))
         x[:, rows], P[..., rows] = path.xhat, path.P
         # Drop the rows that have converged or diverged.
-        last = np.array_equal(each, Q[-1])
+        last = noise is noises[-1]
         done = ~np.isfinite(path.xhat).all(axis=(0, 2)) | (last & (moved <= settled))
         rows, first = rows[~done], False
         if not len(rows):
@@ -186,35 +182,38 @@ def _gains_back(filtered: Filtered, start: int, stop: int) -> tuple[np.ndarray, 
         filtered.P[start:stop],
         filtered.F[start:stop],
         filtered.predicted.P[start + 1 : stop + 1],
+        filtered.Q[start:stop],
     )
-    P, F, ahead = (
+    P, F, ahead, Q = (
         np.ascontiguousarray(a.transpose(1, 2, 0, 3)).reshape(*a.shape[1:3], -1) for a in parts
     )
     L, _ = factor(ahead, np.zeros(ahead.shape[-1]))
     C = divide_factored(product(P, F.transpose(1, 0, 2)), L)
-    own = sandwich(identity(len(C), C.shape[-1]) - product(C, F), P) + sandwich(C, filtered.Q)
+    own = sandwich(identity(len(C), C.shape[-1]) - product(C, F), P) + sandwich(C, Q)
     C, own = (a.reshape(*a.shape[:2], stop - start, -1).transpose(2, 0, 1, 3) for a in (C, own))
     return C, own
 
 
 def flows(
-    system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    system: System, noise: Noise, t: np.ndarray, x: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predict from the states x (num_samples, batch, nx) to the next samples.
 
     Returns:
-        The predictions (num_samples − 1, batch, nx), and their Jacobians
-        (num_samples − 1, nx, nx, batch).
+        The predictions (num_samples − 1, batch, nx), their Jacobians, and the covariances of the
+        process noise, (num_samples − 1, nx, nx, batch) each.
     """
     n, batch, nx = x.shape
-    ends, F = np.empty((n - 1, batch, nx)), np.empty((n - 1, nx, nx, batch))
+    ends, (F, Q) = np.empty((n - 1, batch, nx)), np.empty((2, n - 1, nx, nx, batch))
     count = max(1, _ROWS // batch)
     for first in range(0, n - 1, count):
         size = min(count, n - 1 - first)
         starts, stops = slice(first, first + size), slice(first + 1, first + size + 1)
         t0, t1 = np.repeat(t[starts], batch), np.repeat(t[stops], batch)
         u0, u1 = (u[part].reshape(size * batch, u.shape[-1]) for part in (starts, stops))
-        end, flow = model_step_jacobian(system, t0, t1, x[starts].reshape(-1, nx), u0, u1)
+        end, *moved = model_step_moments(system, noise, t0, t1, x[starts].reshape(-1, nx), u0, u1)
         ends[starts] = end.reshape(size, batch, nx)
-        F[starts] = flow.reshape(size, batch, nx, nx).transpose(0, 2, 3, 1)
-    return ends, F
+        for whole, part in zip((F, Q), moved, strict=True):
+            part = np.broadcast_to(part, (nx, nx, size * batch)).reshape(nx, nx, size, batch)
+            whole[starts] = part.transpose(2, 0, 1, 3)
+    return ends, F, Q

@@ -25,18 +25,18 @@ scale, beyond which an episode is carried by roots. Covariances then lose up to 
 in the first update alone."""
 
 
-def prior_root(system: System, prior: Prior, variance: np.ndarray) -> np.ndarray | None:
+def prior_root(system: System, prior: Prior, R: np.ndarray) -> np.ndarray | None:
     """Return roots of the covariances of a prior, shape (batch, nx, nx): NaN in rows that are not
     wide, and None if no row is.
 
     Args:
         system: the model.
         prior: the prior, checked.
-        variance: variances of the output noise, shape (ny,).
+        R: covariance of the output noise, shape (ny, ny, batch or 1).
     """
     scale = vector(system.scale, system.nx, "scale")
     widest = np.sqrt(np.einsum("bii->bi", prior.cov).max(axis=0, initial=0.0)) / scale
-    noise = np.sqrt(variance) / output_scale(system)
+    noise = np.sqrt(np.einsum("iib->ib", R).min(axis=1)) / output_scale(system)
     limit = WIDE * noise.min()
     if not (widest > limit).any():
         return None

@@ -23,8 +23,8 @@ class BatchLeastSquares(OfflineEstimator):
     an oscillation, known from the prior, is thus not lost. With an exact model the errors approach
     the Cramér–Rao bound. Covariances are those of the smoothed states, Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, and R follows from the
-    known noise level (`BaseEstimator.output_variance`).
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and R that of the
+    known output noise.
     """
 
     max_iterations: int = 20
@@ -80,8 +80,8 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
         root_of = L[..., rows]
         x0 = record.prior.mean[rows] + mapped(root_of, z.T)
         y, u = record.y[rows, :length].swapaxes(0, 1), record.u[rows, :length].swapaxes(0, 1)
-        R = self.output_variance
-        fit = linearised(self.system, record.t[:length], y, u, x0, root_of, R)
+        t = record.t[:length]
+        fit = linearised(self.system, self.noise, t, y, u, x0, root_of)
         information = fit.information + np.eye(len(z))[..., None]
         return Fit(fit.cost + inner(z, z), information, fit.right - z, fit.x, fit.X)
 

@@ -14,8 +14,8 @@ class CKF(SigmaPointFilter):
     """The cubature Kalman filter of third degree (Arasaratnam & Haykin 2009). Its 2·nx points
     x̂ ± √nx·columns of √P have equal weights.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
+    the known one with `assumed_noise` added.
     """
 
     name = "ckf"

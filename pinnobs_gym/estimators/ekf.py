@@ -27,10 +27,6 @@ from pinnobs_gym.simulation.system import vector
 class EKFMemory:
     """The filter's memory in addition to the fields of `State`. The batch is the last axis."""
 
-    Q: np.ndarray
-    """Covariance of the process noise, shape (nx, nx, batch)."""
-    R: np.ndarray
-    """Covariance of the output noise, shape (ny, ny, batch)."""
     P_restart: np.ndarray
     """Covariances with which the gate restarts the filter, shape (nx, nx, batch)."""
     bounds: np.ndarray
@@ -47,8 +43,8 @@ class EKF(RecursiveEstimator, GaussianEstimator):
     Runge-Kutta method, and P⁻ = ΦPΦᵀ + Q. The update at a sample has Joseph's form, which keeps P
     symmetric and positive semidefinite. A missing output is left out of the update.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
+    the known one with `assumed_noise` added.
     """
 
     gate: float | None = None
@@ -67,7 +63,7 @@ class EKF(RecursiveEstimator, GaussianEstimator):
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u), \qquad
 \dot\Phi = \tfrac{\partial f}{\partial x}(t, \hat x, u)\, \Phi \\
-P_k^- &= \Phi P_{k-1} \Phi^\top + Q, \qquad Q = \operatorname{diag}(q \cdot \mathrm{scale})^2 \\
+P_k^- &= \Phi P_{k-1} \Phi^\top + Q, \qquad Q = \textstyle\int \Psi L L^\top \Psi^\top ds \\
 e_k &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
 H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
 S &= H P_k^- H^\top + R, \qquad K = P_k^- H^\top S^{-1} \\
@@ -93,19 +89,18 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         wide = P0 + np.diag(vector(self.system.scale, self.system.nx, "scale") ** 2)
         bounds = self._gate_bounds()
         beyond = np.zeros(len(P0), dtype=int)
-        memory = EKFMemory(*self.tuning(len(P0)), wide.transpose(1, 2, 0), bounds, beyond)
-        L = prior_root(self.system, prior, self.output_variance)
+        memory = EKFMemory(wide.transpose(1, 2, 0), bounds, beyond)
+        L = prior_root(self.system, prior, self.noise.R(0.0))
         return State(prior.mean, P=P0, memory=memory, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        return predicted(self.system, state, covariances(state), state.memory.Q, t, u)
+        return predicted(self.system, state, covariances(state), self.noise, t, u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: EKFMemory = state.memory
-        P, R = covariances(state), memory.R
+        P, R = covariances(state), self.noise.R(t, y)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         if self.gate is not None:
-            state = self._gated(state, innovation, H)
+            state = self._gated(state, innovation, H, R)
             P = covariances(state)
         if self.huber is not None:
             R = self._reweighted(P, innovation, H, R)
@@ -120,13 +115,13 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         degrees = np.maximum(np.arange(self.system.ny + 1), 1)
         return 2 * gammaincinv(degrees / 2, self.gate)
 
-    def _gated(self, state: State, innovation: np.ndarray, H: np.ndarray) -> State:
+    def _gated(self, state: State, innovation: np.ndarray, H: np.ndarray, R: np.ndarray) -> State:
         """Return the prediction with P and its root reset where the gate restarts the filter, and
         with the updated memory."""
         memory: EKFMemory = state.memory
         P, L = covariances(state), state.root
         present = H.any(axis=1).sum(axis=0)  # number of outputs that are not missing
-        nis = squared_size(innovation, innovation_covariance(P, H, memory.R))
+        nis = squared_size(innovation, innovation_covariance(P, H, R))
         beyond = ~(nis <= memory.bounds[present])
         count = np.where(present > 0, np.where(beyond, memory.beyond + 1, 0), memory.beyond)
         restart = count >= self.patience

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,23 +13,16 @@ from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import outer, spread, total
-from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
 class EnsembleMemory:
-    """The ensemble, and the noise that perturbs it."""
+    """The ensemble."""
 
     members: np.ndarray
     """States, shape (num_members, batch, nx)."""
-    Q_std: np.ndarray
-    """Standard deviations of the process noise, shape (nx,)."""
-    R_std: np.ndarray
-    """Standard deviations of the output noise, shape (ny,)."""
-    noise: np.ndarray
-    """Standard normal numbers for the noise of states and outputs at this sample, shape
-    (num_members, 1, nx + ny)."""
     sample: int = 0
     """Number of samples processed so far."""
 
@@ -47,8 +41,8 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     Results are therefore reproducible, and the result of an episode does not depend on the others
     in its batch. The numbers have mean zero and unit variance over the ensemble.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
+    the known one with `assumed_noise` added.
     """
 
     members: int = 50
@@ -61,8 +55,8 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     name = "enkf"
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
     equations = r"""
-\chi_i &= \varphi(x_{k-1}^i) \\
-x_k^{i-} &= \chi_i + w_i, \qquad w_i \sim \mathcal N(0, Q) \\
+x_k^{i-} &= \varphi(x_{k-1}^i, w_i) \quad
+\text{with } dx = f\, dt + L\, dw_i \text{ between the samples} \\
 X &= \tfrac{1}{\sqrt{N-1}} \bigl[ x_k^{i-} - \bar x_k^- \bigr]_i, \qquad
 Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(t_k, x_k^{i-}, u_k) - \bar y \bigr]_i \\
 K &= X Y^\top (Y Y^\top + R)^{-1} \\
@@ -84,18 +78,24 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         L = root(prior.cov.transpose(1, 2, 0))
-        members = prior.mean + spread(L, self._draws(0, self.system.nx))
-        stds = self.process_noise * np.asarray(self.system.scale), np.sqrt(self.output_variance)
-        memory = EnsembleMemory(members, *stds, self._noise(0))
-        return State(prior.mean, P=prior.cov, memory=memory)
+        members = prior.mean + spread(L, self._normal(0)(self.system.nx))
+        return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
         memory: EnsembleMemory = state.memory
-        members = model_step(self.system, state.t, t, memory.members, state.u, u)
-        noise = self._noise(memory.sample)
-        members = members + memory.Q_std * noise[..., : self.system.nx]
-        memory = replace(memory, members=members, noise=noise)
+        normal = self._normal(2 * memory.sample + 1)
+        members = noisy_model_step(
+            self.system,
+            self.noise,
+            state.t,
+            t,
+            memory.members,
+            state.u,
+            u,
+            lambda size: normal(size)[:, None],
+        )
+        memory = replace(memory, members=members)
         return State(total(members) / self.members, state.t, state.u, memory=memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
@@ -103,13 +103,16 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         members = memory.members
         mean, outputs = total(members) / self.members, np.asarray(self.system.h(t, members, u))
         yhat = total(outputs) / self.members
-        noise = memory.R_std * memory.noise[..., self.system.nx :]
+        # v = Gw with G of R, for each member.
+        G = self.noise.G(t)
+        normal = self._normal(2 * memory.sample + 2)
+        noise = np.einsum("pmb,nm->nbp", G, normal(G.shape[1]))
         weight = 1 / np.sqrt(self.members - 1)
         X = weight * (members - mean).transpose(2, 0, 1)
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
         missing = np.isnan(y)
         Y = np.where(missing.T[:, None], 0.0, Y)
-        K, S = gain_of_deviations(X, Y, np.diag(memory.R_std**2)[..., None])
+        K, S = gain_of_deviations(X, Y, self.noise.R(t, y))
         # Correct each member with its own perturbed output.
         errors = np.where(missing, 0.0, y + noise - outputs)
         for p, column in enumerate(K.transpose(1, 2, 0)):
@@ -130,14 +133,14 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         share = np.where(variance > 0, taken / variance, 0.0)
         return np.clip(1 / np.sqrt(1 - np.clip(share, 0.0, 1.0)), 1.0, self.inflation).T
 
-    def _noise(self, sample: int) -> np.ndarray:
-        """Return standard normal numbers (members, 1, nx + ny) for the noise of states and outputs
-        in the step that follows this number of samples."""
-        return self._draws(sample + 1, self.system.nx + self.system.ny)[:, None]
+    def _normal(self, stream: int) -> Callable[[int], np.ndarray]:
+        """Return a function that draws normal numbers (members, size) with mean zero and unit
+        variance over the ensemble, one after another from a random stream."""
+        rng = np.random.default_rng([self.seed, stream])
 
-    def _draws(self, sample: int, size: int) -> np.ndarray:
-        """Return normal numbers (members, size) with mean zero and unit variance over the
-        ensemble, from the random stream of a sample."""
-        draws = np.random.default_rng([self.seed, sample]).standard_normal((self.members, size))
-        draws -= draws.mean(axis=0)
-        return draws / draws.std(axis=0, ddof=1)
+        def normal(size: int) -> np.ndarray:
+            draws = rng.standard_normal((self.members, size))
+            draws -= draws.mean(axis=0)
+            return draws / draws.std(axis=0, ddof=1)
+
+        return normal

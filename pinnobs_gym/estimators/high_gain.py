@@ -32,13 +32,12 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     determine. The factor exp(θ·dt) is therefore omitted where it would make P larger than
     P₀ + diag(scale²), as measured by the sum of the variances over scale².
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), and a benchmark episode lasts 20 time
-    constants 1/θ.
+    Default tuning is the same rule for all systems: P₀ is that of the prior, the noise is the known
+    one, and a benchmark episode lasts 20 time constants 1/θ.
     """
 
-    process_noise: float = 0.0
-    """Standard deviation of the process noise per sample, relative to the state's scale."""
+    assumed_noise: float = 0.0
+    """As in `GaussianEstimator`; forgetting takes its place."""
     theta: float | None = None
     """Forgetting rate θ in 1/s; 20 time constants per benchmark episode if None."""
 
@@ -62,12 +61,11 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         largest = self._size(prior.cov.transpose(1, 2, 0)) + self.system.nx
-        memory = (*self.tuning(len(prior.mean)), largest)
-        L = prior_root(self.system, prior, self.output_variance)
-        return State(prior.mean, P=prior.cov, memory=memory, root=L)
+        L = prior_root(self.system, prior, self.noise.R(0.0))
+        return State(prior.mean, P=prior.cov, memory=largest, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        P, (Q, _, largest) = covariances(state), state.memory
+        P, largest = covariances(state), state.memory
         assert state.t is not None
         theta = default_rate(self.system) if self.theta is None else self.theta
         grown = P * np.exp(theta * (t - state.t))
@@ -76,10 +74,10 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
         if state.root is not None:
             factor = np.where(forgets, np.exp(0.5 * theta * (t - state.t)), 1.0)
             state = replace(state, root=state.root * factor[:, None, None])
-        return predicted(self.system, state, P, Q, t, u)
+        return predicted(self.system, state, P, self.noise, t, u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        P, (_, R, _) = covariances(state), state.memory
+        P, R = covariances(state), self.noise.R(t, y)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         return corrected(state, (t, u), P, innovation, H, R)
 

@@ -18,10 +18,6 @@ from pinnobs_gym.simulation.record import Prior
 class WindowMemory:
     """The window and the prior of its first state. The batch is the last axis of matrices."""
 
-    Q: np.ndarray
-    """Covariance of the process noise, shape (nx, nx, 1)."""
-    R: np.ndarray
-    """Covariance of the output noise, shape (ny, ny, 1)."""
     arrival: np.ndarray
     """x̄, the estimate of the window's first state from all samples before the window, shape
     (batch, nx)."""
@@ -48,13 +44,12 @@ class MHE(Estimator, GaussianEstimator):
     Within the window the model is assumed exact. A window longer than the record gives
     full-information estimation.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), and Q = diag(`process_noise`·scale)² is
-    added to P̄ whenever the window moves.
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
+    the known one with `assumed_noise` added. Process noise is added to P̄ when the window moves.
     """
 
-    process_noise: float = 2e-5
-    """Standard deviation of the process noise per sample, relative to the state's scale."""
+    assumed_noise: float = 6e-4
+    """As in `GaussianEstimator`."""
     window: int = 10
     """Number of samples in the window."""
     steps: int = 1
@@ -80,7 +75,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         P0, mean = prior.cov.transpose(1, 2, 0), prior.mean
-        return State(mean, P=prior.cov, memory=WindowMemory(*self.tuning(), mean, P0, mean))
+        return State(mean, P=prior.cov, memory=WindowMemory(mean, P0, mean))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: WindowMemory = state.memory
@@ -101,7 +96,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         xhat = fit.x[-1] + mapped(fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
         memory = replace(memory, start=start)
-        S = _innovation_covariance(P, H, memory.R).transpose(2, 0, 1)
+        S = _innovation_covariance(P, H, self.noise.R(t, y)).transpose(2, 0, 1)
         P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
         return State(xhat, t, u, P, innovation, S, memory)
 
@@ -110,8 +105,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         equations of the outputs about it."""
         nx, batch = self.system.nx, len(start)
         X = identity(nx, batch)
-        R = np.diagonal(memory.R[..., 0])
-        return linearised(self.system, memory.t, memory.y, memory.u, start, X, R)
+        return linearised(self.system, self.noise, memory.t, memory.y, memory.u, start, X)
 
     def _moved(self, memory: WindowMemory, t: float, u: np.ndarray) -> WindowMemory:
         """Return the memory without the window's first sample, with which x̄ and P̄ are updated. The
@@ -121,11 +115,12 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         # Update x̄ − x and P̄ with the sample, with the output linearised about x.
         offset = memory.arrival - start
         innovation = innovation - mapped(H, offset)
-        offset, P, _ = joseph_update(offset, memory.P, innovation, H, memory.R)
+        R = self.noise.R(memory.t[0], memory.y[0])
+        offset, P, _ = joseph_update(offset, memory.P, innovation, H, R)
         # Predict x, x̄ and P̄ to the next sample, which becomes the first of the window.
         second, u_second = (*memory.t, t)[1], (*memory.u, u)[1]
         times, inputs = (memory.t[0], second), (memory.u[0], u_second)
-        start, P, F = predict(self.system, times, start, P, memory.Q, inputs)
+        start, P, F, _ = predict(self.system, times, start, P, self.noise, inputs)
         arrival = start + mapped(F, offset)
         memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
         return replace(memory, arrival=arrival, P=P, start=start)

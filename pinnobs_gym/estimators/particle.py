@@ -1,4 +1,4 @@
-"""The particle filter of Liu and West."""
+"""The particle filter: the bootstrap filter, and that of Liu and West without process noise."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
-from pinnobs_gym.estimation.notices import say_once
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import factor, moments, spread, total, weighted_mean
-from pinnobs_gym.simulation.model import model_step
+from pinnobs_gym.simulation.matrices import cholesky, factor, moments, spread, total, weighted_mean
+from pinnobs_gym.simulation.model import noisy_model_step
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 
 _Sample = tuple[float, np.ndarray, np.ndarray]
@@ -21,6 +21,8 @@ _Sample = tuple[float, np.ndarray, np.ndarray]
 _FEW = 10
 """The likelihood is tempered if it would reduce the effective number of particles to less than
 their number over this."""
+_DISCOUNT = 0.95
+"""Liu and West's δ where kernels are needed."""
 _ROUNDS = 20
 """Largest number of tempering steps per sample."""
 _LARGEST = 1e150
@@ -46,14 +48,18 @@ class ParticleMemory:
 
 @dataclass(frozen=True)
 class ParticleFilter(RecursiveEstimator):
-    """A particle filter for plants without process noise (Liu & West 2001).
+    """The bootstrap particle filter (Gordon, Salmond & Smith 1993), with the kernels of Liu and
+    West (2001) for plants without process noise.
 
-    Particles are propagated by the model and weighted by the likelihood of the outputs. Where their
-    effective number falls below half of the particles, they are resampled systematically (Kitagawa
-    1996). New particles are drawn from Gaussians about the resampled ones, whose centres are shrunk
-    towards the mean so that the mean and the covariance of the set are preserved in expectation.
-    Without these Gaussians, few distinct particles would soon remain. The likelihood of a sample
-    that would reduce the effective number below a tenth is tempered (Neal 2001).
+    Particles are propagated by the model, with its process noise, and weighted by the likelihood of
+    the outputs. Where their effective number falls below half of the particles, they are resampled
+    systematically (Kitagawa 1996). The likelihood of a sample that would reduce the effective
+    number below a tenth is tempered (Neal 2001).
+
+    Without process noise, few distinct particles would soon remain. New particles are then drawn
+    from Gaussians about the resampled ones, whose centres are shrunk towards the mean so that the
+    mean and the covariance of the set are preserved in expectation. This is artificial noise, and
+    it also follows each tempering step.
 
     A particle that overflows, or at which the output is not defined, has the weight zero. Where
     this holds for all particles of an episode, they stay where they are, or the sample counts as
@@ -64,20 +70,21 @@ class ParticleFilter(RecursiveEstimator):
     in its batch.
 
     Default tuning is the same rule for all systems: particles are drawn from the Gaussian prior,
-    and the likelihood follows from the known noise level (`BaseEstimator.output_variance`).
+    and the likelihood follows from the known output noise.
     """
 
     particles: int = 500
     """Number of particles."""
-    discount: float = 0.95
-    """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set."""
+    discount: float | None = None
+    """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set. If
+    None, it is 1 with process noise, 0.95 without, and 0.95 in tempering."""
     seed: int = 0
     """Seed of the random numbers."""
 
     name = "particle"
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
     equations = r"""
-x_i &:= \varphi(x_i) \\
+x_i &:= \varphi(x_i, w_i) \quad \text{with } dx = f\, dt + L\, dw_i \\
 w_i &:\propto w_i \exp\bigl( -\tfrac12 e_i^\top R^{-1} e_i \bigr), \qquad
 e_i = y_k - h(t_k, x_i, u_k) \\
 \hat x_k &= \sum_i w_i x_i, \qquad P_k = \sum_i w_i (x_i - \hat x_k)(x_i - \hat x_k)^\top \\
@@ -93,7 +100,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         super().__post_init__()
         if self.particles < 2:
             raise ValueError(f"particles={self.particles}; expected at least 2")
-        if not 1 / 3 < self.discount <= 1:
+        if self.discount is not None and not 1 / 3 < self.discount <= 1:
             raise ValueError(f"discount={self.discount}; expected a number in (1/3, 1]")
 
     def reset(self, prior: Prior) -> State:
@@ -109,9 +116,19 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
         memory: ParticleMemory = state.memory
-        x = model_step(self.system, state.t, t, memory.particles, state.u, u)
+        rng = np.random.default_rng([self.seed, 2, memory.sample])
+        x = noisy_model_step(
+            self.system,
+            self.noise,
+            state.t,
+            t,
+            memory.particles,
+            state.u,
+            u,
+            lambda size: rng.standard_normal((self.particles, 1, size)),
+        )
         log_weights = memory.log_weights
-        lost = ~(abs(x) < _LARGEST).all(axis=-1)
+        lost: np.ndarray = np.logical_not((abs(x) < _LARGEST).all(axis=-1))
         if lost.any():
             x, log_weights = self._without(lost, x, memory)
         xhat = weighted_mean(np.exp(log_weights), x)
@@ -140,14 +157,17 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
         yhat, S = _predicted_output(np.exp(log_weights), outputs)
-        S = S + np.diag(self.output_variance)
+        S = S + self.noise.R(t, y).transpose(2, 0, 1)
         x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
         weights = np.exp(log_weights)
         xhat, P = moments(weights, x)
         # Resample the episodes whose effective number of particles, 1/Σw², is below half.
         rows = np.flatnonzero(total(weights**2) > 2 / self.particles)
         if len(rows):
-            x, log_weights = self._resampled(x, log_weights, rows, (memory.sample, _ROUNDS))
+            usual = 1.0 if self.noise.stochastic else _DISCOUNT
+            discount = usual if self.discount is None else self.discount
+            stream = memory.sample, _ROUNDS
+            x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
         memory = ParticleMemory(x, log_weights, memory.sample + 1)
         innovation = np.where(missing | np.isnan(yhat), 0.0, y - yhat)
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
@@ -175,7 +195,9 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             log_weights = log_weights.copy()
             log_weights[:, rows] = _normalised(old + part * likelihood)
             remaining[rows] -= part
-            x, log_weights = self._resampled(x, log_weights, rows, (sample, part_number))
+            discount = _DISCOUNT if self.discount is None else self.discount
+            stream = sample, part_number
+            x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
             log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), (t, y[rows], u[rows]))
         return x, _normalised(log_weights + remaining * log_likelihood)
 
@@ -183,7 +205,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
         t, y, u = seen
         errors = np.where(np.isnan(y), 0.0, y - np.asarray(self.system.h(t, x, u)))
-        log_likelihood = np.einsum("nbp,p->nb", errors**2, -0.5 / self.output_variance)
+        log_likelihood = -0.5 * _squared_sizes(errors, self.noise.R(t, y))
         if math.isfinite(log_likelihood.sum()):
             return log_likelihood
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, _ZERO)
@@ -193,7 +215,12 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         return np.where(impossible, 0.0, log_likelihood)
 
     def _resampled(
-        self, x: np.ndarray, log_weights: np.ndarray, rows: np.ndarray, stream: tuple[int, int]
+        self,
+        x: np.ndarray,
+        log_weights: np.ndarray,
+        rows: np.ndarray,
+        stream: tuple[int, int],
+        discount: float,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Resample the particles of the given episodes to equal weights, with their mean and
         covariance preserved in expectation. The stream identifies the random numbers of this
@@ -201,7 +228,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         rng = np.random.default_rng([self.seed, 1, *stream])
         # `take` keeps the order in memory, on which that of sums depends; indexing changes it.
         old, weights, count = x.take(rows, 1), np.exp(log_weights.take(rows, 1)), self.particles
-        shrinkage = (3 * self.discount - 1) / (2 * self.discount)
+        shrinkage = (3 * discount - 1) / (2 * discount)
         mean, P = moments(weights, old)
         # Systematic resampling: the number of copies of each particle.
         ends = np.clip(np.ceil(np.cumsum(weights, axis=0) * count - rng.random()), 0, count)
@@ -209,14 +236,28 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         copies = np.diff(ends, axis=0, prepend=0).astype(int)
         ancestors = np.repeat(np.tile(np.arange(count), len(rows)), copies.T.ravel())
         drawn = np.take_along_axis(old, ancestors.reshape(len(rows), count).T[..., None], axis=0)
+        x, log_weights = x.copy(), log_weights.copy()
+        log_weights[:, rows] = -np.log(count)
+        if shrinkage == 1:
+            x[:, rows] = drawn
+            return x, log_weights
         # Shrink the copies towards the mean, and restore the covariance by Gaussian noise.
         L, _ = factor(P.transpose(1, 2, 0), np.zeros(len(rows)))
         L = np.sqrt(1 - shrinkage**2) * L
         noise = spread(L, rng.standard_normal((count, x.shape[-1])))
-        x, log_weights = x.copy(), log_weights.copy()
         x[:, rows] = shrinkage * drawn + (1 - shrinkage) * mean + noise
-        log_weights[:, rows] = -np.log(count)
         return x, log_weights
+
+
+def _squared_sizes(errors: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return eᵀR⁻¹e, (number, batch), of errors e (number, batch, ny) with the covariance R (ny,
+    ny, batch or 1)."""
+    L, sizes, whitened = cholesky(R), np.zeros(errors.shape[:2]), []
+    for p in range(len(R)):  # forward substitution
+        rest = errors[..., p] - sum((L[p, q] * each for q, each in enumerate(whitened)), 0.0)
+        whitened.append(rest / L[p, p])
+        sizes += whitened[-1] ** 2
+    return sizes
 
 
 def _predicted_output(weights: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -82,34 +82,32 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
     knows = ("model", "prior", "noise", "initial set")
 
     def reset(self, prior: Prior) -> State:
-        return self.begin(checked(prior), self.output_variance[:, None])
+        return self.begin(checked(prior))
 
-    def begin(self, prior: Prior, variance: np.ndarray) -> State:
-        """Return the state before the first sample, as `reset` does, for variances of the output
-        noise of shape (ny, batch or 1), which may differ between rows."""
+    def begin(self, prior: Prior, R: np.ndarray | None = None) -> State:
+        """Return the state before the first sample, as `reset` does; a covariance R of the output
+        noise of all samples, shape (ny, ny, batch), replaces the known one."""
         batch = len(prior.mean)
         scale = vector(self.system.scale, self.system.nx, "scale")[:, None]
         size = memory_size(self.trained.variant, self.system.ny, self.trained.width)
         if self.trained.variant == "gru":
-            fixed = scale, output_scale(self.system)[:, None], np.sqrt(variance)
+            fixed = scale, output_scale(self.system)[:, None], R
             return State(prior.mean, memory=(fixed, np.zeros((size, batch))))
-        Q, _ = self.tuning()
-        R = np.eye(self.system.ny)[..., None] * variance
-        return State(prior.mean, P=prior.cov, memory=((scale, Q, R), np.ones((size, batch))))
+        return State(prior.mean, P=prior.cov, memory=((scale, R), np.ones((size, batch))))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         if self.trained.variant == "gru":
             assert state.t is not None
             xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
             return State(xhat, state.t, state.u, memory=state.memory)
-        (_, Q, _), _ = state.memory
-        return predicted(self.system, state, covariances(state), Q, t, u)
+        return predicted(self.system, state, covariances(state), self.noise, t, u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         if self.trained.variant == "gru":
             return self._recurrent(state, t, y, u)
         fixed, memory = state.memory
-        scale, _, R = fixed
+        scale, R = fixed
+        R = self.noise.R(t, y) if R is None else R
         xhat, P = state.xhat, covariances(state)
         innovation, H = observe(self.system, t, xhat, y, u)
         x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
@@ -122,7 +120,8 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
     def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         """Apply `correct` with the recurrent network's gain, without a covariance."""
         fixed, memory = state.memory
-        scale, size, std = fixed
+        scale, size, R = fixed
+        std = np.sqrt(np.einsum("iib->ib", self.noise.R(t) if R is None else R))
         xhat = state.xhat
         innovation = np.where(np.isnan(y), 0.0, y - self.system.h(t, xhat, u))
         x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)

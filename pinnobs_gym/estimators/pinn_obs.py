@@ -295,7 +295,12 @@ class PinnObs(OfflineEstimator):
         """Train one network per row; see `trainers.pinn_obs.PinnObsTrainer.train_rows`."""
         trainer: Any = TRAINERS.resolve("pinn_obs")
         return trainer.train_rows(
-            self.system, self.config, record=record, noise_std=self.noise_std, folder=self.folder
+            self.system,
+            self.config,
+            record=record,
+            noise_std=self.noise_std,
+            process_noise=self.process_noise,
+            folder=self.folder,
         )
 
     def run(self, record: Record) -> Estimates:

@@ -21,8 +21,8 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
     the smoother does, too. Without process noise, P⁻ of a contracting plant becomes singular, and
     the backward recursion loses accuracy to rounding; least squares (`BatchLeastSquares`) do not.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
+    the known one with `assumed_noise` added.
     """
 
     name = "rts_smoother"
@@ -38,5 +38,5 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
     def run(self, record: Record) -> Estimates:
         record = replace(record, prior=checked(record.prior))
         with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
-            path = backward(forward(self.system, record, *self.tuning()))
+            path = backward(forward(self.system, record, self.noise))
         return Estimates(path.xhat.swapaxes(0, 1), path.P.transpose(3, 0, 1, 2))

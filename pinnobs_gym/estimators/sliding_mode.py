@@ -65,8 +65,7 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
     def reset(self, prior: Prior) -> State:
         rate = default_rate(self.system) if self.rate is None else self.rate
         L = settling_gain(self.system, rate, 1 + self.switching)
-        layer = self.layer * np.sqrt(self.output_variance)
-        return State(prior.mean.astype(float), memory=(L, layer, None))
+        return State(prior.mean.astype(float), memory=(L, None))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
@@ -74,7 +73,8 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         return State(xhat, state.t, state.u, memory=state.memory)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, (L, layer, last) = state.xhat, state.memory
+        xhat, (L, last) = state.xhat, state.memory
+        layer = self.layer * np.sqrt(np.einsum("iib->bi", self.noise.R(t)))
         missing = np.isnan(y)
         dt, last = time_since(last, t, missing)
         innovation = np.where(missing, 0.0, y - self.system.h(t, xhat, u))
@@ -82,4 +82,4 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
         H = np.asarray(self.system.h_jacobian(t, xhat, u))
         K = injection(L, H, dt * secant)
         xhat = xhat + (K @ innovation[..., None])[..., 0]
-        return State(xhat, t, u, innovation=innovation, memory=(L, layer, last))
+        return State(xhat, t, u, innovation=innovation, memory=(L, last))

@@ -17,7 +17,7 @@ from pinnobs_gym.estimation.gaussian import (
 from pinnobs_gym.estimation.kalman import cautious, observe
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
-from pinnobs_gym.simulation.matrices import inner
+from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -26,13 +26,13 @@ class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
     """The extended Kalman filter whose process noise grows with the innovation (Boutayeb & Aubry
     1999), so that its gain does not vanish on long records.
 
-    Q_k = (`gamma`·eᵀR⁻¹e/ny + `process_noise`²)·diag(scale²), with e the innovation at the previous
-    sample; optionally R_k = `output_factor`·HPHᵀ + R. The paper weights e with the identity instead
-    of R⁻¹, which requires outputs of one unit. The update has Joseph's form. The innovation of a
-    missing output is zero.
+    Q_k = Q + `gamma`·eᵀR⁻¹e/ny·diag(scale²), with e the innovation at the previous sample and Q of
+    the assumed process noise; optionally R_k = `output_factor`·HPHᵀ + R. The paper weights e with
+    the identity instead of R⁻¹, which requires outputs of one unit. The update has Joseph's form.
+    The innovation of a missing output is zero.
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), and the settings are the defaults below.
+    Default tuning is the same rule for all systems: P₀ is that of the prior, the noise is the known
+    one with `assumed_noise` added, and the settings are the defaults below.
     """
 
     gamma: float = 1e-6
@@ -43,7 +43,7 @@ class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
 
     name = "strong_tracking_ekf"
     equations = r"""
-Q_k &= \Bigl( \frac{\gamma}{n_y} e_{k-1}^\top R^{-1} e_{k-1} + q^2 \Bigr)
+Q_k &= Q + \frac{\gamma}{n_y} e_{k-1}^\top R^{-1} e_{k-1}
 \operatorname{diag}(\mathrm{scale}^2) \\
 P_k^- &= \Phi P_{k-1} \Phi^\top + Q_k \\
 R_k &= R + r\, H P_k^- H^\top \quad (r: \text{output\_factor}) \\
@@ -66,19 +66,19 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
-        memory = (*self.tuning(len(prior.mean)), self.output_variance, growth)
-        L = prior_root(self.system, prior, self.output_variance)
-        return State(prior.mean, P=prior.cov, memory=memory, root=L)
+        L = prior_root(self.system, prior, self.noise.R(0.0))
+        return State(prior.mean, P=prior.cov, memory=growth, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        Q, _, variance, growth = state.memory
+        growth: np.ndarray = state.memory
         assert state.innovation is not None
+        assert state.t is not None
         e = np.ascontiguousarray(state.innovation.T)
-        Q = Q + growth * inner(e / variance[:, None], e) / len(e)
-        return predicted(self.system, state, covariances(state), Q, t, u)
+        growth = growth * squared_size(state.innovation, self.noise.R(state.t)) / len(e)
+        return predicted(self.system, state, covariances(state), self.noise, t, u, growth)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        P, (_, R, _, _) = covariances(state), state.memory
+        P, R = covariances(state), self.noise.R(t, y)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         R = cautious(P, H, R, self.output_factor)
         return corrected(state, (t, u), P, innovation, H, R)

@@ -17,8 +17,8 @@ class UKF(SigmaPointFilter):
     of √P have the weights 1/(2(nx + κ)). This is van der Merwe's α = 1, for which no weight is
     negative. In covariances the weight of the centre is larger by β (van der Merwe 2004).
 
-    Default tuning is the same rule for all systems: P₀ is that of the prior, R follows from the
-    known noise level (`BaseEstimator.output_variance`), Q = diag(`process_noise`·scale)².
+    Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
+    the known one with `assumed_noise` added.
     """
 
     beta: float = 0.0

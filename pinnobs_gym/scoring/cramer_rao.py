@@ -5,14 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import joseph_update
 from pinnobs_gym.scoring.metrics import by_sample, window_nrmse, windows
 from pinnobs_gym.simulation.matrices import moments, sandwich
-from pinnobs_gym.simulation.model import model_step, model_step_jacobian
+from pinnobs_gym.simulation.model import model_step, model_step_moments
+from pinnobs_gym.simulation.noise import Noise, noise_std
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import Setup, System, vector
 
@@ -20,13 +21,18 @@ if TYPE_CHECKING:
     from pinnobs_gym.envs.game import Game
 
 
+Step: TypeAlias = tuple[np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]
+"""The Jacobian F (n, n, batch) of the step to a sample and the covariance Q (n, n, batch or 1) of
+its process noise, None and zero at the first; the Jacobian H (ny, n, batch) of the outputs and the
+covariance R (ny, ny, batch or 1) of their noise."""
+
+
 def cramer_rao(
     system: System,
     t: np.ndarray,
     x: np.ndarray,
     P0: np.ndarray,
-    R: np.ndarray,
-    Q: np.ndarray | None = None,
+    noise: Noise,
     missing: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the Cramér–Rao reference of each episode: the lower bound on the covariance of any
@@ -43,65 +49,60 @@ def cramer_rao(
         t: sample times in s, shape (num_samples,).
         x: true states, shape (batch, num_samples, nx).
         P0: covariance of the prior, shape (nx, nx).
-        R: covariance of the output noise, shape (ny, ny).
-        Q: covariance of the process noise per sample, shape (nx, nx); none if None.
+        noise: the noise of plant and outputs.
         missing: which outputs are missing, bool (batch, num_samples, ny); none if None.
 
     Returns:
         Covariances, shape (batch, num_samples, nx, nx).
     """
     batch, num_samples, nx = x.shape
-    noise = np.zeros((nx, nx)) if Q is None else Q
     bound = np.empty((num_samples, nx, nx, batch))
-    steps = _linearised(system, t, x, missing)
-    for k, P in enumerate(covariances(steps, P0, R, noise)):
+    steps = _linearised(system, noise, t, x, missing)
+    for k, P in enumerate(covariances(steps, P0)):
         bound[k] = P
     return bound.transpose(3, 0, 1, 2)
 
 
 def covariances(
-    steps: Iterable[tuple[np.ndarray | None, np.ndarray]],
+    steps: Iterable[Step],
     P0: np.ndarray,
-    R: np.ndarray,
-    Q: np.ndarray,
 ) -> Iterator[np.ndarray]:
     """Yield the covariances P (n, n, batch) after each sample: P⁻ = FPFᵀ + Q, then P = P⁻ −
     P⁻Hᵀ(HP⁻Hᵀ + R)⁻¹HP⁻, in Joseph's form.
 
     Args:
-        steps: for each sample, the Jacobian F (n, n, batch) of the step to it, which is None at the
-            first, and that of the outputs, H (ny, n, batch).
+        steps: one for each sample.
         P0: covariance of the prior, shape (n, n).
-        R: covariance of the output noise, shape (ny, ny).
-        Q: covariance of the process noise per sample, shape (n, n).
     """
     P = P0[..., None]
-    for F, H in steps:
+    for F, Q, H, R in steps:
         if F is not None:
-            P = sandwich(F, P) + Q[..., None]
+            P = sandwich(F, P) + Q
         ny, n, batch = H.shape
         P = np.broadcast_to(P, (n, n, batch))
         # The covariance does not depend on the estimate and the innovation.
-        _, P, _ = joseph_update(np.zeros((batch, n)), P, np.zeros((batch, ny)), H, R[..., None])
+        _, P, _ = joseph_update(np.zeros((batch, n)), P, np.zeros((batch, ny)), H, R)
         yield P
 
 
 def _linearised(
-    system: System, t: np.ndarray, x: np.ndarray, missing: np.ndarray | None
-) -> Iterator[tuple[np.ndarray | None, np.ndarray]]:
+    system: System, noise: Noise, t: np.ndarray, x: np.ndarray, missing: np.ndarray | None
+) -> Iterator[Step]:
     """Yield the steps of `covariances`, linearised at the true states; the arguments are those of
     `cramer_rao`."""
-    u, F = system.input(t), None
+    u, F, Q = system.input(t), None, np.zeros((system.nx, system.nx, 1))
     for k in range(len(t)):
         now = x[:, k]
         if k:
             times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
-            F = model_step_jacobian(system, *times, x[:, k - 1], *inputs)[1].transpose(1, 2, 0)
+            _, F, Q = model_step_moments(system, noise, *times, x[:, k - 1], *inputs)
         H = system.h_jacobian(t[k], now, u[k]).transpose(1, 2, 0)
+        R = noise.R(float(t[k]))
         if missing is not None:
             # A zero row of H carries no information.
             H = np.where(missing[:, k].T[:, None], 0.0, H)
-        yield F, H
+            R = noise.R(float(t[k]), np.where(missing[:, k], np.nan, 0.0))
+        yield F, Q, H, R
 
 
 def expected_nrmse(
@@ -266,16 +267,15 @@ def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None
         that is not in the model (`Condition.reference`).
     """
     source = game.source
-    std = vector(source.setup.noise_std, source.system.ny, "noise_std")
+    std = noise_std(source.setup.noise_std, source.system.ny, "noise_std")
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
         return None
-    Q = None if source.process_noise is None else np.diag(source.process_noise**2)
-    P0, R = record.prior.cov[0], np.diag(std**2)
-    P = cramer_rao(source.system, record.t, truth, P0, R, Q, np.isnan(record.y))
+    P0 = record.prior.cov[0]
+    P = cramer_rao(source.system, record.t, truth, P0, source.noise, np.isnan(record.y))
     counted = (source.system.scale, source.system.observable(truth))
     part = windows(record.t, source.setup.transient_end)["steady"]
     steady = expected_nrmse(P, source.system.scale, part, counted[1])
-    if Q is None:
+    if not source.noise.stochastic:
         # Discard references below the error of the model's own step.
         error = step_error(source.system, record.t, truth)
         squares = error[..., None] * error[..., None, :]

@@ -12,7 +12,6 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.provenance import canonical
-from pinnobs_gym.simulation.system import output_noise
 from pinnobs_gym.training.settings import ALWAYS_MAY_CHANGE
 
 _ASIDE = ("seed", *ALWAYS_MAY_CHANGE)
@@ -26,18 +25,29 @@ def deviations(estimator: BaseEstimator, game: Game) -> dict[str, Any]:
     trained = type(estimator).needs_training or type(estimator).trains_on_record
     found = _of_training(estimator) if trained else _of_options(estimator)
     if "noise" in estimator.knows:
-        known, played = (
-            output_noise(game.source.system, std)
-            for std in (estimator.noise_std, game.source.setup.noise_std)
-        )
-        if not np.allclose(known, played, rtol=1e-9, atol=0.0):
-            found["noise_std"] = canonical(known if len(known) > 1 else known[0])
+        system, setup = game.source.system, game.source.setup
+        known = system.noise(estimator.noise_std, estimator.process_noise)
+        played = system.noise(setup.noise_std, setup.process_noise)
+        for name, own, real in (
+            ("noise_std", known.output, played.output),
+            ("process_noise", known.process, played.process),
+        ):
+            if own.shape != real.shape or not np.allclose(own, real, rtol=1e-9, atol=0.0):
+                found[name] = canonical(_level(own))
     own, model = (canonical(each.parameters) for each in (estimator.system, game.source.system))
     found |= {name: value for name, value in own.items() if model.get(name) != value}
     trained_under = estimator.training.get("condition", "nominal")
     if trained_under not in ("nominal", game.name.condition):
         found["trained_under"] = trained_under
     return found
+
+
+def _level(root: np.ndarray) -> np.ndarray | float:
+    """Return a level of noise as a setup gives it: one number, one per component, or a matrix."""
+    std = np.sqrt((root * root).sum(axis=1))
+    if root.shape != (len(std), len(std)) or not np.array_equal(root, np.diag(std)):
+        return root
+    return std if len(std) > 1 else float(std[0])
 
 
 def _of_options(estimator: BaseEstimator) -> dict[str, Any]:

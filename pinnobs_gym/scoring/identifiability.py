@@ -4,19 +4,20 @@ told."""
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import kalman_gain, update_with
-from pinnobs_gym.scoring.cramer_rao import covariances
+from pinnobs_gym.scoring.cramer_rao import Step, covariances
 from pinnobs_gym.scoring.metrics import windows
 from pinnobs_gym.scoring.sensitivity import linearised
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.matrices import sandwich
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.noise import noise_std
+from pinnobs_gym.simulation.system import System
 
 if TYPE_CHECKING:
     from pinnobs_gym.envs.game import Game, GameName
@@ -82,32 +83,29 @@ def _computed(game: Game) -> Identifiability | None:
     source = game.source
     system, setup = source.system, source.setup
     unknowns = source.condition.unknowns(system, setup)
-    noise_std = vector(setup.noise_std, system.ny, "noise_std")
-    if not unknowns or source.fixed_x0 or not (noise_std > 0).all():
+    std = noise_std(setup.noise_std, system.ny, "noise_std")
+    if not unknowns or source.fixed_x0 or not (std > 0).all():
         return None
     # Trajectories of the nominal plant, and which of their outputs are missing.
     episodes = _without_unknowns(game).episodes(_SEEDS)
     t, x = source.times[:-1], episodes.x[:-1]
-    flow = linearised(system, t, x, unknowns)
+    flow = linearised(system, source.noise, t, x, unknowns)
     missing = np.isnan(episodes.y[:-1]).swapaxes(1, 2)
     H = np.where(missing[:, :, None], 0.0, flow.H)
     # The prior of the states is the game's, that of the unknowns is their law.
     nx, size = system.nx, flow.H.shape[2]
-    P0, Q, R = np.zeros((size, size)), np.zeros((size, size)), np.diag(noise_std**2)
+    P0 = np.zeros((size, size))
     P0[:nx, :nx] = source.record(episodes).prior.cov[0]
     P0[nx:, nx:] = np.diag(np.square([s for each in unknowns for s in each.std]))
-    if source.process_noise is not None:
-        Q[:nx, :nx] = np.diag(source.process_noise**2)
+    R = [source.noise.R(float(now), y) for now, y in zip(t, episodes.y, strict=False)]
+    nothing = np.zeros((size, size, 1))
+    steps = list(zip([None, *flow.F], [nothing, *flow.Q], H, R, strict=True))
+    own = [(None if F is None else F[:nx, :nx], Q[:nx, :nx], H[:, :nx], R) for F, Q, H, R in steps]
     # The filters that estimate the unknowns, that know them, and that ignore them.
     filters = (
-        covariances(zip([None, *flow.F], H, strict=True), P0, R, Q),
-        covariances(
-            zip([None, *flow.F[:, :nx, :nx]], H[:, :, :nx], strict=True),
-            P0[:nx, :nx],
-            R,
-            Q[:nx, :nx],
-        ),
-        _of_nominal_filter(nx, zip([None, *flow.F], H, strict=True), P0, R, Q),
+        covariances(steps, P0),
+        covariances(own, P0[:nx, :nx]),
+        _of_nominal_filter(nx, steps, P0),
     )
     part = windows(t, setup.transient_end)["steady"]
     counts = np.asarray(system.observable(x))[part]
@@ -121,13 +119,7 @@ def _computed(game: Game) -> Identifiability | None:
     return Identifiability(free / known, nominal / free)
 
 
-def _of_nominal_filter(
-    nx: int,
-    steps: Iterator[tuple[np.ndarray | None, np.ndarray]],
-    P0: np.ndarray,
-    R: np.ndarray,
-    Q: np.ndarray,
-) -> Iterator[np.ndarray]:
+def _of_nominal_filter(nx: int, steps: Iterable[Step], P0: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the covariances (n, n, batch) after each sample of states and unknowns where the gains
     are those of a Kalman filter of the nx states alone, which never corrects the unknowns.
 
@@ -135,19 +127,19 @@ def _of_nominal_filter(
     """
     own = P = P0[..., None]
     own = own[:nx, :nx]
-    for F, H in steps:
+    for F, Q, H, R in steps:
         ny, n, batch = H.shape
         if F is not None:
-            P = sandwich(F, P) + Q[..., None]
-            own = sandwich(F[:nx, :nx], own) + Q[:nx, :nx, None]
+            P = sandwich(F, P) + Q
+            own = sandwich(F[:nx, :nx], own) + Q[:nx, :nx]
         P, own = (np.broadcast_to(each, (*each.shape[:2], batch)) for each in (P, own))
         # The gain follows from the covariance that the filter believes in.
-        K, _ = kalman_gain(own, H[:, :nx], R[..., None])
+        K, _ = kalman_gain(own, H[:, :nx], R)
         zero = np.zeros((batch, nx)), np.zeros((batch, ny))
-        _, own = update_with(K, zero[0], own, zero[1], H[:, :nx], R[..., None])
+        _, own = update_with(K, zero[0], own, zero[1], H[:, :nx], R)
         # The covariance that this gain really leaves.
         whole = np.concatenate([K, np.zeros((n - nx, ny, batch))])
-        _, P = update_with(whole, np.zeros((batch, n)), P, zero[1], H, R[..., None])
+        _, P = update_with(whole, np.zeros((batch, n)), P, zero[1], H, R)
         yield P
 
 

@@ -81,6 +81,7 @@ def estimator_hash(estimator: BaseEstimator) -> str:
     parts = {
         "model": estimator.system,
         "noise_std": estimator.noise_std,
+        "process_noise": estimator.process_noise,
         "options": estimator.options,
         "training": training,
         "trained": {name: getattr(held, name) for name in names},

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.simulation.conditions.base import Unknowns
-from pinnobs_gym.simulation.model import model_step, model_step_jacobian
+from pinnobs_gym.simulation.model import model_step, model_step_moments
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import System
 
 _STEP = 1e-3
@@ -22,12 +23,15 @@ class Linearised:
     F: np.ndarray
     """Jacobians ∂z_{k+1}/∂z_k of the model's steps, shape (num_samples - 1, n, n, batch) with n =
     nx + num_unknowns."""
+    Q: np.ndarray
+    """Covariances of the process noise of z over the steps, shape (num_samples - 1, n, n,
+    batch)."""
     H: np.ndarray
     """Jacobians ∂y_k/∂z_k of the received outputs, shape (num_samples, ny, n, batch)."""
 
 
 def linearised(
-    system: System, t: np.ndarray, x: np.ndarray, unknowns: Sequence[Unknowns]
+    system: System, noise: Noise, t: np.ndarray, x: np.ndarray, unknowns: Sequence[Unknowns]
 ) -> Linearised:
     """Linearise the model's steps and the received outputs with respect to states and unknowns.
 
@@ -36,6 +40,7 @@ def linearised(
 
     Args:
         system: the model.
+        noise: its noise.
         t: sample times in s, shape (num_samples,).
         x: states at which to linearise, shape (num_samples, batch, nx).
         unknowns: what a condition changes, from `Condition.unknowns`.
@@ -49,8 +54,9 @@ def linearised(
         lambda plant: model_step(plant, *ends), system, unknowns, len(ends[0])
     )
     count = by_unknown.shape[-1]
-    F = np.zeros((len(ends[0]), nx + count, nx + count))
-    F[:, :nx, :nx] = model_step_jacobian(system, *ends)[1]
+    F, Q = np.zeros((2, len(ends[0]), nx + count, nx + count))
+    _, by_state, of_state = model_step_moments(system, noise, *ends)
+    F[:, :nx, :nx], Q[:, :nx, :nx] = by_state.transpose(2, 0, 1), of_state.transpose(2, 0, 1)
     F[:, :nx, nx:] = by_unknown
     F[:, nx:, nx:] = np.eye(count)  # unknowns are constant
     # Outputs change with the plant, and as a condition of the measurement says.
@@ -58,8 +64,8 @@ def linearised(
     own = [each.output_slopes(system, times, rows, u) for each in unknowns]
     by_state = system.h_jacobian(times, rows, u)
     H = np.concatenate([by_state, by_unknown + np.concatenate(own, axis=-1)], axis=-1)
-    F, H = (each.reshape(-1, batch, *each.shape[1:]) for each in (F, H))
-    return Linearised(np.moveaxis(F, 1, -1), np.moveaxis(H, 1, -1))
+    parts = (each.reshape(-1, batch, *each.shape[1:]) for each in (F, Q, H))
+    return Linearised(*(np.moveaxis(each, 1, -1) for each in parts))
 
 
 def _derivatives(

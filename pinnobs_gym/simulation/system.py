@@ -11,6 +11,8 @@ from typing import Any, ClassVar, Self, TypeAlias
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
+
 Array: TypeAlias = Any
 """An array of any library of the array API standard, such as numpy.ndarray or torch.Tensor."""
 
@@ -51,8 +53,14 @@ class Setup:
     """Length of an episode in s."""
     dt: float
     """Time between samples in s."""
-    noise_std: Sequence[float] | float = 0.0
-    """Standard deviation of the white Gaussian output noise, in output units."""
+    noise_std: Level = 0.0
+    """Standard deviation of the white Gaussian output noise, in output units: one number for all
+    outputs, one for each, or the rows of a square matrix G of the noise Gv with v standard normal
+    (a root of the covariance GGᵀ)."""
+    process_noise: Level = 0.0
+    """Standard deviation of the process noise after one second, in state units per √s: one number
+    for all states, one for each, or the rows of a matrix L of dx = f dt + L dw, where w is a Wiener
+    process. The unit of time of a map is its step."""
     xhat0: Sequence[float] | None = None
     """Initial estimate x̂₀, the mean of the prior, in state units. The mean of the law of the
     initial states if None."""
@@ -82,10 +90,8 @@ class Setup:
             raise ValueError(
                 f"duration={self.duration} s is shorter than one sample, dt={self.dt} s"
             )
-        noise = np.asarray(self.noise_std, dtype=float)
-        if not (np.isfinite(noise).all() and (noise >= 0).all()):
-            raise ValueError(f"noise_std={self.noise_std}; expected numbers of at least 0")
-
+        for name in ("noise_std", "process_noise"):
+            noise_root(getattr(self, name), None, name)
         if np.any(np.asarray(self.x0_low) > np.asarray(self.x0_high)):
             raise ValueError(f"x0_low={self.x0_low} is above x0_high={self.x0_high}")
         if self.P0 is not None:
@@ -237,7 +243,7 @@ class System(ABC):
         *,
         dt: float | None = None,
         duration: float | None = None,
-        noise_std: Sequence[float] | float | None = None,
+        noise_std: Level | None = None,
         parameters: Mapping[str, float] | None = None,
     ) -> tuple[Self, Setup]:
         """Return the system and the setup of that name, with some values replaced.
@@ -259,8 +265,34 @@ class System(ABC):
                 known = ", ".join(system.parameters) or "none"
                 raise ValueError(f"unknown parameter {name!r} of {cls.__name__}; it has {known}")
         system = replace(system, **wanted)
-        vector(chosen.noise_std, system.ny, f"noise_std of {cls.__name__}")
+        system.noise(chosen.noise_std, chosen.process_noise)
         return system, chosen
+
+    def noise(
+        self, noise_std: Level | SampledLevel | None = None, process_noise: Level | None = None
+    ) -> Noise:
+        """Return the noise of the plant and of its outputs, which truth, estimators, trainers and
+        references share.
+
+        Args:
+            noise_std: as `Setup.noise_std`, or by sample; that of the setup ``benchmark`` if None.
+            process_noise: as `Setup.process_noise`; that of the setup ``benchmark`` if None.
+
+        Raises:
+            ValueError: in one line, if a level is not of the right size, or not of finite numbers,
+                standard deviations at least 0.
+        """
+        own, name = self.setups["benchmark"], type(self).__name__
+        samples = noise_std if isinstance(noise_std, SampledLevel) else None
+        given = None if isinstance(noise_std, SampledLevel) else noise_std
+        level = own.noise_std if given is None else given
+        output = noise_root(level, self.ny, f"noise_std of {name}")
+        if output.shape != (self.ny, self.ny):
+            raise ValueError(
+                f"noise_std of {name} has shape {output.shape}; expected ({self.ny}, {self.ny})"
+            )
+        level = own.process_noise if process_noise is None else process_noise
+        return Noise(noise_root(level, self.nx, f"process_noise of {name}"), output, samples)
 
     @classmethod
     def validate(cls) -> None:
@@ -342,23 +374,6 @@ def vector(value: Sequence[float] | np.ndarray | float, size: int, name: str) ->
     return array
 
 
-def output_noise(system: System, noise_std: Sequence[float] | float | None) -> np.ndarray:
-    """Return the standard deviation of the output noise as an array (ny,), in output units; that of
-    the setup ``benchmark`` if None.
-
-    Raises:
-        ValueError: in one line, if it is not finite, negative or of another size.
-    """
-    known = system.setups["benchmark"].noise_std if noise_std is None else noise_std
-    try:
-        given = np.asarray(known, dtype=float)
-    except (TypeError, ValueError):
-        given = np.array(np.nan)
-    if not (np.isfinite(given).all() and (given >= 0).all()):
-        raise ValueError(f"noise_std={known}; expected numbers of at least 0")
-    return vector(given, system.ny, "noise_std")
-
-
 def stack(like: Array, *components: Array | float) -> Array:
     """Return the array (..., n) of n components, each a number or an array that broadcasts to the
     batch (...) of ``like`` (..., nx). In NumPy the result has the memory order of ``like``, so that
@@ -432,10 +447,6 @@ def _jacobian(system: System, name: str, t: Array, x: Array, u: Array) -> Array:
     columns = torch.func.jvp(lambda x: function(now, x, inputs), (repeated,), (tangents,))[1]
     jacobian = torch.movedim(columns, 0, -1)
     return jacobian if isinstance(x, torch.Tensor) else jacobian.numpy()
-
-
-NOISE_FLOOR = 1e-3
-"""Standard deviation that filters assume for outputs without noise, relative to their scale."""
 
 
 _TIMES = 9

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from pinnobs_gym.simulation import dop853
+from pinnobs_gym.simulation.noise import Noise, weighted
 from pinnobs_gym.simulation.system import System, vector
 
 TOLERANCE = 3e-11
@@ -82,23 +83,27 @@ def truth(
 
 def disturbed_truth(
     system: System,
+    noise: Noise,
     x0: np.ndarray,
     times: np.ndarray,
-    noise: np.ndarray,
+    draws: np.ndarray,
     max_step: float | None = None,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the trajectories of a plant with process noise at the samples: x(t) solves the
-    equations between samples, and noise is added to the state at every sample after the first.
+    """Return the trajectories of a plant with process noise, dx = f dt + L dw.
 
-    The solver is that of `truth` with equal steps of at most ``max_step`` between samples. Its
-    error is not controlled, as it is far below any relevant noise.
+    The law is that of `pinnobs_gym.simulation.model.noisy_model_step`: in each of equal parts of
+    the intervals between samples, white noise is replaced by its projection on linear functions of
+    time. The solver is that of `truth` with equal steps of at most ``max_step``. Its error is not
+    controlled, as it is far below any relevant noise.
 
     Args:
         system: as in `truth`.
+        noise: the noise of the plant.
         x0: initial states, shape (batch, nx), in state units.
         times: sample times in s, ascending, shape (num_samples,).
-        noise: noise in state units, shape (num_samples - 1, batch, nx).
+        draws: standard normal numbers, shape (num_samples - 1, num_parts, 2, batch, m), where m is
+            the number of columns of L.
         max_step: longest step of the solver in s; a hundredth of the time span if None.
         out: array for the result.
 
@@ -112,30 +117,66 @@ def disturbed_truth(
     x[0] = x0
     longest = max_step or float(times[-1] - times[0]) / 100
     stages = np.empty((1 + len(dop853.B), *x0.shape))
+    stages[0] = x0
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
-            start, end = float(times[k]), float(times[k + 1])
-            stages[0] = x[k]
-            # Restart the steps at each breakpoint inside the sample interval.
-            ends = [b for b in system.breakpoints() if start < b < end] + [end]
-            for part in ends:
-                steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
-                step = round((part - start) / steps, 15)
-                last = np.nextafter(part, start)  # f may jump at the end: use its left limit
-                for i in range(steps):
-                    _take_step(system, start + i * step, step, last, stages)
-                start = part
-            np.add(stages[0], noise[k], out=x[k + 1])
+            parts = np.linspace(times[k], times[k + 1], draws.shape[1] + 1)
+            for start, end, (even, odd) in zip(parts[:-1], parts[1:], draws[k], strict=True):
+                force = _Force(noise, float(start), float(end), even, odd)
+                _through_part(system, float(start), float(end), longest, force, stages)
+            x[k + 1] = stages[0]
     _check_finite(system, x0, x)
     return x
 
 
-def _take_step(system: System, start: float, step: float, last: float, stages: np.ndarray) -> None:
+@dataclass(frozen=True)
+class _Force:
+    """White noise projected on linear functions of time between two times in s."""
+
+    noise: Noise
+    start: float
+    end: float
+    even: np.ndarray
+    """Standard normal numbers of the constant function, shape (batch, m)."""
+    odd: np.ndarray
+    """Those of the linear function, shape (batch, m)."""
+
+    def at(self, t: float) -> np.ndarray:
+        """Return Lẇ, (batch, nx), at a time."""
+        length = self.end - self.start
+        s = np.sqrt(3) * (2 * (t - self.start) / length - 1)
+        w = (self.even + s * self.odd) / np.sqrt(length)
+        return weighted(self.noise.L(t)[..., 0], w)
+
+
+def _through_part(
+    system: System, start: float, end: float, longest: float, force: _Force, stages: np.ndarray
+) -> None:
+    """Advance the state in ``stages`` from one time to another, in steps no longer than ``longest``
+    (s) that begin anew at each breakpoint."""
+    ends = [b for b in system.breakpoints() if start < b < end] + [end]
+    for part in ends:
+        steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
+        step = round((part - start) / steps, 15)
+        last = np.nextafter(part, start)  # f may jump at the end: use its left limit
+        for i in range(steps):
+            _take_step(system, start + i * step, step, last, stages, force)
+        start = part
+
+
+def _take_step(
+    system: System,
+    start: float,
+    step: float,
+    last: float,
+    stages: np.ndarray,
+    force: _Force | None = None,
+) -> None:
     """Take one step of Dormand and Prince's method of order 8, in place.
 
     f is evaluated no later than at ``last``. ``stages`` (13, batch, nx) holds the state, followed
     by space for the slopes of the stages. The new state replaces the old one; the first slope
-    remains that of the old state.
+    remains that of the old state. A force, if given, is added to f.
     """
     flat = stages.reshape(len(stages), -1)
     t = np.minimum(start + step * dop853.C, last)
@@ -145,6 +186,8 @@ def _take_step(system: System, start: float, step: float, last: float, stages: n
     for i, row in enumerate(weights[:-1]):
         stage = _combined(row, flat[: i + 1]).reshape(stages.shape[1:])
         stages[i + 1] = system.f(t[i], stage, u[i])
+        if force is not None:
+            stages[i + 1] += force.at(float(t[i]))
     flat[0] = _combined(weights[-1], flat)[0]
 
 

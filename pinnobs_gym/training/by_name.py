@@ -39,7 +39,9 @@ def trainer_of(
     if config.records:
         record = game.record(range(first, first + config.records))
         data = {"record": record, "condition": game.name.condition}
-    return cls(source.system, config, noise_std=source.setup.noise_std, **data)
+    setup = source.setup
+    levels = {"noise_std": setup.noise_std, "process_noise": setup.process_noise}
+    return cls(source.system, config, **levels, **data)
 
 
 def train_by_name(
@@ -72,5 +74,7 @@ def load(cls: type[BaseEstimator], path: Path, game: Game) -> BaseEstimator:
         name = getattr(cls, "name", cls.__name__)
         raise ValueError(f"estimator {name!r} is not one that is trained first")
     estimator: Any = cls.load(path, game.source.system)
-    noise_std = game.source.setup.noise_std
-    return replace(estimator, noise_std=noise_std) if "noise" in cls.knows else estimator
+    setup = game.source.setup
+    if "noise" not in cls.knows:
+        return estimator
+    return replace(estimator, noise_std=setup.noise_std, process_noise=setup.process_noise)

@@ -70,8 +70,9 @@ def _identity(trainer: Trainer[Any, Any]) -> dict[str, Any]:
     facts = {**identity(trainer.system), "trainer": trainer.name}
     if not trainer.has_record:
         facts |= {"game": trainer.game.name._asdict(), "episode": trainer.episode}
-    noise_std = trainer.noise_std.tolist()
-    return {**facts, "noise_std": noise_std, "config": plain(config)}
+    noise = {"noise_std": trainer.noise.output, "process_noise": trainer.noise.process}
+    levels = {name: level.tolist() for name, level in noise.items()}
+    return {**facts, **levels, "config": plain(config)}
 
 
 def _record(trainer: Trainer[Any, Any]) -> Mapping[str, np.ndarray]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import numpy as np
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.trained import Ending, Trained
 from pinnobs_gym.estimation.learned.trained_file import plain
+from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System, output_noise
+from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.settings import TrainingConfig, changed
 
 if TYPE_CHECKING:
@@ -47,8 +50,9 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         config: the settings.
         record: the training samples and the prior; NaN marks a missing output. None for a trainer
             that plays episodes itself.
-        noise_std: standard deviation of the output noise in output units, shape (ny,) or one number
-            for all outputs; that of the benchmark setup if None.
+        noise_std: the output noise, as `Setup.noise_std`; that of the benchmark setup if None.
+        process_noise: the process noise, as `Setup.process_noise`; that of the benchmark setup if
+            None.
         game: source of the episodes, for a trainer that plays episodes itself.
         episode: seed of the first episode that such a trainer plays.
         condition: name of the condition of the record's episodes; a game has its own.
@@ -70,7 +74,8 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         config: ConfigT,
         *,
         record: Record | None = None,
-        noise_std: Sequence[float] | float | None = None,
+        noise_std: Level | None = None,
+        process_noise: Level | None = None,
         game: Game | None = None,
         episode: int = TRAINING_SEED,
         condition: str = "nominal",
@@ -79,7 +84,9 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
             raise ValueError(f"trainer {self.name!r} takes either a record or a game")
         config.check_shared()  # a Config with a __post_init__ of its own may have left it out
         self.system, self.config = system, config
-        self.noise_std = output_noise(system, noise_std)
+        self.levels = noise_std, process_noise
+        self.noise = system.noise(*self.levels)
+        self.noise_std = np.sqrt(np.einsum("iib->i", self.noise.R(0.0)))
         self.episode = episode
         self.condition = condition if game is None else game.name.condition
         self.iteration = 0

@@ -110,7 +110,8 @@ def filterpy_sigma_points(own: GaussianEstimator, record: Record) -> np.ndarray:
         filter = UnscentedKalmanFilter(2, 1, dt, output, step, points)
     else:
         filter = CubatureKalmanFilter(2, 1, dt, output, step)
-    Q, R = (matrix[..., 0] for matrix in own.tuning())
+    L, R = own.noise.L(0.0)[..., 0], own.noise.R(0.0)[..., 0]
+    Q = dt * L @ L.T
     filter.x, filter.P = record.prior.mean[0].copy(), record.prior.cov[0].copy()
     filter.Q, filter.R = np.zeros((2, 2)), R
     xhat = np.empty((record.num_samples, 2))
@@ -170,7 +171,7 @@ def do_mpc_horizon(record: Record, window: int) -> Iterator[np.ndarray]:
     peer.settings.n_horizon, peer.settings.t_step = window, dt
     peer.settings.meas_from_data = True
     peer.settings.supress_ipopt_output()
-    R = EKF(ReverseDuffing()).output_variance
+    R = np.diagonal(EKF(ReverseDuffing()).noise.R(0.0)[..., 0])
     peer.set_default_objective(P_x=np.linalg.inv(record.prior.cov[0]), P_v=np.diag(1 / R))
     peer.setup()
     peer.x0 = record.prior.mean[0]
@@ -184,11 +185,11 @@ def do_mpc_horizon(record: Record, window: int) -> Iterator[np.ndarray]:
 def false_locks() -> Iterator[Figure]:
     """Measure the EKF's rate of divergence on the motor with a large Q, without and with a gate."""
     for gate in (None, 0.9999):
-        options = {"process_noise": 1e-3, "gate": gate}
+        options = {"assumed_noise": 3e-2, "gate": gate}
         motor = "pinnobs/InductionMotor-v0"
         rows = evaluate("ekf", motor, episodes=100, condition=CONDITION, options=options)
         lost = float(np.mean([row["diverged"] for row in rows]))
-        what = f"EKF of the motor with Q = (1e-3·scale)², gate {gate}: diverged"
+        what = f"EKF of the motor with assumed_noise 0.03, gate {gate}: diverged"
         yield Figure(what, lost, "", "", None) if gate is None else at_most(what, lost, "", 0.0)
 
 
@@ -220,8 +221,7 @@ def over_the_reference() -> Iterator[Figure]:
     within = 0
     for name in SYSTEMS.classes():
         source, x, record = played(name, 100)
-        R = np.diag(EKF.for_setup(source.system, source.setup).output_variance)
-        bound = cramer_rao(source.system, record.t, x, record.prior.cov[0], R)
+        bound = cramer_rao(source.system, record.t, x, record.prior.cov[0], source.noise)
         scored = source.system.observable(x)
         end = source.setup.transient_end
         part = windows(record.t, end)["steady"]

@@ -136,8 +136,8 @@ def filterpy_ekf(ekf: EKF, record: Record, step: Step) -> np.ndarray:
     filter = Filter(dim_x=2, dim_z=1)
     filter.x = record.prior.mean[0].copy()
     filter.P = record.prior.cov[0].copy()
-    filter.Q = np.diag((ekf.process_noise * np.asarray(ekf.system.scale)) ** 2)
-    filter.R = np.diag(ekf.output_variance)
+    L = ekf.noise.L(0.0)[..., 0]
+    filter.Q, filter.R = dt * L @ L.T, ekf.noise.R(0.0)[..., 0]
     H = np.array([[1.0, 0.0]])
     xhat = np.empty((record.num_samples, 2))
     for k in range(record.num_samples):

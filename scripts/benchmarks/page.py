@@ -80,7 +80,7 @@ def _rows(
         "estimator": "ekf" if number == 1 else f"estimator_{number}",
         "track": "offline" if number % 5 == 4 else "online",
         "knows": ["model", "prior", "noise"],
-        "options": {"process_noise": 1e-4, "gate": None},
+        "options": {"assumed_noise": 3e-3, "gate": None},
         "settings": {},
         "game_hash": "0" * 12,
         "estimator_code": f"{number:012x}",

@@ -77,11 +77,11 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
     def start(self) -> None:
         config, system, record = self.config, self.system, self.record
         _check(system, record, config)
-        ekf = EKF(system, noise_std=tuple(self.noise_std.tolist()))
-        self.std = np.sqrt(ekf.output_variance)
+        ekf = EKF(system, *self.levels)
+        self.std = np.sqrt(np.einsum("iib->i", ekf.noise.R(0.0)))
         scale = torch.tensor(vector(system.scale, system.nx, "scale"))[:, None]
         size = torch.tensor(output_scale(system))[:, None]
-        self.model = Model(system, config.variant, scale, size, torch.tensor(ekf.tuning()[0]))
+        self.model = Model(system, config.variant, scale, size, ekf.noise)
         smoothed = smooth(record, ekf)
         usable = np.flatnonzero(smoothed.explained)
         self.usable = len(usable)

@@ -9,7 +9,6 @@ import numpy as np
 
 from pinnobs_gym.estimation.learned.gain_network import Variant, shapes
 from pinnobs_gym.estimation.learned.perceptron import Layers
-from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.simulation.record import Prior
 from trainers.pinn_gain.rollout import Model
@@ -32,7 +31,7 @@ class HeldOut:
 
     def __init__(self, model: Model, data: Data, facts: Mapping[str, Any]) -> None:
         self._model, self._data, self._facts = model, data, facts
-        std = np.sqrt(EKF(model.system, facts["noise_std"]).output_variance)
+        std = np.sqrt(np.einsum("iib->i", model.noise.R(0.0)))
         # Outputs of every record at every noise level.
         count = len(data.x)
         rows = np.tile(np.arange(count), len(LEVELS))
@@ -60,7 +59,8 @@ class HeldOut:
         data, rows = self._data, self._rows
         trained = TrainedGain(**self._facts, layers=layers, variant=variant)
         gain = PinnGain(self._model.system, trained.noise_std, trained=trained)
-        state = gain.begin(Prior(data.mean[rows], data.cov[rows]), self._std**2)
+        R = np.eye(len(self._std))[..., None] * self._std**2
+        state = gain.begin(Prior(data.mean[rows], data.cov[rows]), R)
         square = np.empty((len(data.t), len(rows)))
         with np.errstate(all="ignore"):
             for k, t in enumerate(data.t):

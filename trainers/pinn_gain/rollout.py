@@ -15,7 +15,8 @@ from pinnobs_gym.estimation.learned.gain_network import (
     update_with_network,
 )
 from pinnobs_gym.simulation.matrices import sandwich
-from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.model import model_step_moments
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import System
 
 Weights = Sequence[tuple[Tensor, Tensor]]
@@ -31,8 +32,8 @@ class Model:
     """The system's scale, shape (nx, 1)."""
     output_scale: Tensor
     """Scale of the outputs, shape (ny, 1)."""
-    Q: Tensor
-    """Covariance of the process noise per sample, shape (nx, nx, 1)."""
+    noise: Noise
+    """The noise that filters assume."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,12 @@ def predict(
     # The step and its Jacobian in NumPy.
     at = state.xhat.detach()
     x = np.ascontiguousarray(at.numpy().T)
-    after, F = model_step_jacobian(model.system, t[0], t[1], x, u[0], u[1])
-    flow = torch.from_numpy(np.ascontiguousarray(F.transpose(1, 2, 0)))
+    after, F, Q = model_step_moments(model.system, model.noise, t[0], t[1], x, u[0], u[1])
+    flow = torch.from_numpy(np.ascontiguousarray(F))
     # Zero in value; its gradient is the Jacobian.
     moved = (flow * (state.xhat - at)[None]).sum(1)
     xhat = torch.from_numpy(np.ascontiguousarray(after.T)) + moved
-    return FilterState(xhat, sandwich(flow, state.P) + model.Q, state.memory)
+    return FilterState(xhat, sandwich(flow, state.P) + torch.from_numpy(Q), state.memory)
 
 
 def update(

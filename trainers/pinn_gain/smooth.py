@@ -51,7 +51,7 @@ def smooth(record: Record, ekf: EKF) -> Smoothed:
         if not len(rows):
             break
         initial = points[rows] if level < PROCESS_NOISE[0] else None
-        loose = replace(ekf, process_noise=level * ekf.process_noise)
+        loose = replace(ekf, assumed_noise=level * ekf.assumed_noise)
         retried = smooth_once(record.rows(rows), loose, initial)
         points[rows] = retried.xhat
         better = rows[retried.explained]
@@ -71,7 +71,6 @@ def smooth_once(record: Record, ekf: EKF, points: np.ndarray | None = None) -> S
         points: states of the first linearisation, shape (batch, num_samples, nx); the EKF's own
             estimates if None.
     """
-    Q, R = ekf.tuning()
     count = max(1, _BLOCK // record.num_samples)  # rows that fit into memory
     parts = []
     with np.errstate(all="ignore"):
@@ -79,7 +78,7 @@ def smooth_once(record: Record, ekf: EKF, points: np.ndarray | None = None) -> S
             rows = slice(first, first + count)
             about = None if points is None else points[rows].swapaxes(0, 1)
             block = record.rows(rows)
-            path = iterated(ekf.system, block, [Q] * _PASSES, R, about, settled=_SETTLED)
+            path = iterated(ekf.system, block, [ekf.noise] * _PASSES, about, settled=_SETTLED)
             parts.append(path.xhat.swapaxes(0, 1))
         xhat = np.concatenate(parts)
         return Smoothed(xhat, _explains(ekf, record, xhat))
@@ -93,7 +92,7 @@ def _explains(ekf: EKF, record: Record, xhat: np.ndarray) -> np.ndarray:
     """
     present = ~np.isnan(record.y)
     error = record.y - ekf.system.h(record.t, xhat, record.u)
-    square = np.where(present, error**2 / ekf.output_variance, 0.0)
+    square = np.where(present, error**2 / np.einsum("iib->i", ekf.noise.R(0.0)), 0.0)
     window = min(_WINDOW, record.num_samples)
     consistent = np.isfinite(xhat).all(axis=(1, 2))
     for length in (window, record.num_samples):

@@ -7,7 +7,7 @@ Nonlinear Dynamical Systems". Equation numbers are the paper's.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import torch
 
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
+from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import Log
@@ -208,7 +209,8 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
         config: PinnObsConfig,
         *,
         record: Record,
-        noise_std: Sequence[float] | float | None = None,
+        noise_std: Level | None = None,
+        process_noise: Level | None = None,
         folder: Path | None = None,
     ) -> list[TrainedNetwork]:
         """Train one network per row of a record, each row being one episode.
@@ -224,6 +226,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             config: the settings; every row has their seed.
             record: the samples of all episodes.
             noise_std: see `Trainer`.
+            process_noise: see `Trainer`.
             folder: folder in which each row gets a folder ``row-<i>`` with its log, checkpoint and
                 trained network; nothing is written if None.
         """
@@ -233,7 +236,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
         device = _device(config)
 
         def new_trainer(row: Record) -> PinnObsTrainer:
-            return cls(system, config, record=row, noise_std=noise_std)
+            return cls(system, config, record=row, noise_std=noise_std, process_noise=process_noise)
 
         with deferred_interrupt() as interrupt:
             if folder is None and device != "cpu" and config.optimiser == "ssbroyden":

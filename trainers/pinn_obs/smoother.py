@@ -10,6 +10,7 @@ import numpy as np
 
 from pinnobs_gym.estimation import smoother
 from pinnobs_gym.estimation.smoother import Filtered, Path
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, vector
 
@@ -33,9 +34,9 @@ def smooth(system: System, record: Record, noise: np.ndarray, caution: float) ->
     """
     narrowed = _WIDE * _NARROWING ** np.arange(2 * _PASSES)
     drifts = (*[DRIFT] * (1 + _PASSES), *np.maximum(narrowed, DRIFT))
-    Q = [_process_noise(system, drift) for drift in drifts]
-    R = np.diag(noise**2)[..., None]
-    return smoother.iterated(system, record, Q, R, caution=caution, settled=_SETTLED)
+    noises = {drift: _noise(system, record, noise, drift) for drift in drifts}
+    passes = [noises[drift] for drift in drifts]
+    return smoother.iterated(system, record, passes, caution=caution, settled=_SETTLED)
 
 
 def forward(
@@ -57,10 +58,12 @@ def forward(
         drift: standard deviation of the process noise per sample, over the scale.
         caution: fraction of HPHᵀ that is added to the covariance of the output noise.
     """
-    Q, R = _process_noise(system, drift), np.diag(noise**2)[..., None]
-    return smoother.forward(system, record, Q, R, about, caution)
+    return smoother.forward(system, record, _noise(system, record, noise, drift), about, caution)
 
 
-def _process_noise(system: System, drift: float) -> np.ndarray:
-    """Return the covariance Q of the process noise per sample, (nx, nx, 1)."""
-    return np.diag((drift * vector(system.scale, system.nx, "scale")) ** 2)[..., None]
+def _noise(system: System, record: Record, std: np.ndarray, drift: float) -> Noise:
+    """Return the noise with these standard deviations of outputs, and with a drift from one sample
+    to the next, on average."""
+    step = (record.t[-1] - record.t[0]) / max(1, record.num_samples - 1)
+    scale = vector(system.scale, system.nx, "scale")
+    return Noise(np.diag(drift / np.sqrt(step or 1.0) * scale), np.diag(std))

@@ -31,7 +31,7 @@ class Estimate:
     estimator: str = "ekf"
     """Name or module:Class of the estimator."""
     set: tuple[str, ...] = ()
-    """Settings of the estimator, such as process_noise=1e-3."""
+    """Settings of the estimator, such as assumed_noise=0.1."""
     xhat0: tuple[float, ...] | None = None
     """Initial estimate; the benchmark's if not given."""
     P0_std: tuple[float, ...] | None = None

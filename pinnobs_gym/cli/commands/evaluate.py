@@ -36,7 +36,7 @@ class Evaluate:
     checkpoint: Path | None = None
     """Trained estimator to load."""
     set: tuple[str, ...] = ()
-    """Settings of the estimator, such as process_noise=1e-3."""
+    """Settings of the estimator, such as assumed_noise=0.1."""
     setup: str = "benchmark"
     """Setup to play."""
     condition: str = "nominal"

@@ -61,9 +61,8 @@ class Combined(Condition):
     def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
         return tuple(each for part in self.parts for each in part.unknowns(system, setup))
 
-    def process_noise(self, system: System) -> np.ndarray | None:
-        stds = [part.process_noise(system) for part in self.parts]
-        return next((std for std in stds if std is not None), None)
+    def process_noise(self, system: System, setup: Setup) -> np.ndarray:
+        return np.concatenate([part.process_noise(system, setup) for part in self.parts], axis=1)
 
     def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
         for part in self.parts:

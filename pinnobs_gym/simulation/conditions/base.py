@@ -8,14 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.noise import noise_std
+from pinnobs_gym.simulation.system import Setup, System
 
 
 def noise_scale(system: System, setup: Setup) -> np.ndarray:
     """Return the output noise (ny,) that conditions multiply: the setup's, or the benchmark's where
     the setup has none."""
-    own = vector(setup.noise_std, system.ny, "noise_std")
-    benchmark = vector(system.setups["benchmark"].noise_std, system.ny, "noise_std")
+    levels = setup.noise_std, system.setups["benchmark"].noise_std
+    own, benchmark = (noise_std(level, system.ny, "noise_std") for level in levels)
     return np.where(own > 0, own, benchmark)
 
 
@@ -107,10 +108,10 @@ class Condition:
         """
         return ()
 
-    def process_noise(self, system: System) -> np.ndarray | None:
-        """Return the standard deviations (nx,) of white noise added to the state at every sample
-        after the first, in state units; None for no noise."""
-        return None
+    def process_noise(self, system: System, setup: Setup) -> np.ndarray:
+        """Return L (nx, m), in state units per √s, of process noise of the plant beyond that of
+        the setup which is played; m is zero for none."""
+        return np.zeros((system.nx, 0))
 
     def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
         """Return the outputs as received: a new array of y's shape, in which NaN marks a missing

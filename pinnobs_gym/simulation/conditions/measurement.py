@@ -28,8 +28,11 @@ class Noise(Condition):
         return f"output noise × {self.factor:g}"
 
     def setup(self, system: System, setup: Setup) -> Setup:
-        std = self.factor * noise_scale(system, setup)
-        return replace(setup, noise_std=tuple(std.tolist()))
+        if np.ndim(setup.noise_std) < 2:
+            std = self.factor * noise_scale(system, setup)
+            return replace(setup, noise_std=tuple(std.tolist()))
+        G = self.factor * np.asarray(setup.noise_std, dtype=float)
+        return replace(setup, noise_std=tuple(map(tuple, G.tolist())))
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,8 @@ class _OtherTorque(Unknowns):
 
 @dataclass(frozen=True)
 class ProcessNoise(Condition):
-    """White Gaussian noise added to the state at every sample after the first, with a standard
-    deviation that is the same fraction of each state's scale."""
+    """Process noise, with a standard deviation after the time between two samples that is the same
+    fraction of each state's scale."""
 
     part: float
 
@@ -154,5 +154,5 @@ class ProcessNoise(Condition):
     def summary(self) -> str:
         return f"process noise of {self.part:g} of the scale per sample"
 
-    def process_noise(self, system: System) -> np.ndarray:
-        return self.part * vector(system.scale, system.nx, "scale")
+    def process_noise(self, system: System, setup: Setup) -> np.ndarray:
+        return np.diag(self.part / np.sqrt(setup.dt) * vector(system.scale, system.nx, "scale"))
