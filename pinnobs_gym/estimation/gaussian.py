@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -81,7 +81,6 @@ def predicted(
     noise: Noise,
     t: float,
     u: np.ndarray,
-    growth: np.ndarray | None = None,
 ) -> State:
     """Return the state with the prediction x̂(k|k−1) and its covariance ΦPΦᵀ + Q; see
     `RecursiveEstimator.predict`.
@@ -93,12 +92,9 @@ def predicted(
         noise: the noise, of which the process noise is used.
         t: time of the next sample in s.
         u: inputs at the next sample, shape (batch, nu).
-        growth: a covariance to be added to Q, shape (nx, nx, batch or 1); none if None.
     """
     assert state.t is not None  # no prediction precedes the first sample
     xhat, P, F, Q = predict(system, (state.t, t), state.xhat, P, noise, (state.u, u))
-    if growth is not None:
-        P, Q = P + growth, Q + growth
     covariance, L = P.transpose(2, 0, 1), state.root
     if L is not None:
         rows = square_root.carried(L)
@@ -108,6 +104,19 @@ def predicted(
         L[rows] = square_root.compressed(moved, square_root.root_of(added.transpose(2, 0, 1)))
         covariance[rows] = square_root.covariance(L[rows])
     return State(xhat, state.t, state.u, covariance, state.innovation, None, state.memory, L)
+
+
+def enlarged(state: State, growth: np.ndarray) -> State:
+    """Return the state with a covariance (nx, nx, batch) added to P and to its roots."""
+    assert state.P is not None
+    P, L = state.P + growth.transpose(2, 0, 1), state.root
+    if L is not None:
+        rows = square_root.carried(L)
+        L, P = L.copy(), P.copy()
+        added = square_root.root_of(growth[..., rows].transpose(2, 0, 1))
+        L[rows] = square_root.compressed(L[rows], added)
+        P[rows] = square_root.covariance(L[rows])
+    return replace(state, P=P, root=L)
 
 
 def corrected(

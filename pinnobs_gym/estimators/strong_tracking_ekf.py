@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from pinnobs_gym.estimation.gaussian import (
     checked,
     corrected,
     covariances,
+    enlarged,
     predicted,
 )
 from pinnobs_gym.estimation.kalman import cautious, observe
@@ -65,20 +66,19 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
-        growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
         L = prior_root(self.system, prior, self.noise.R(0.0))
-        return State(prior.mean, P=prior.cov, memory=growth, root=L)
+        return State(prior.mean, P=prior.cov, memory=np.zeros(len(prior.mean)), root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        growth: np.ndarray = state.memory
-        assert state.innovation is not None
-        assert state.t is not None
-        e = np.ascontiguousarray(state.innovation.T)
-        growth = growth * squared_size(state.innovation, self.noise.R(state.t)) / len(e)
-        return predicted(self.system, state, covariances(state), self.noise, t, u, growth)
+        return predicted(self.system, state, covariances(state), self.noise, t, u)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        P, R = covariances(state), self.noise.R(t, y)
+        # Rows without any output leave the growth to the next sample that has one.
+        seen, sizes, R = ~np.isnan(y).all(axis=1), state.memory, self.noise.R(t, y)
+        growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
+        state = enlarged(state, growth * np.where(seen, sizes, 0.0))
+        P = covariances(state)
         innovation, H = observe(self.system, t, state.xhat, y, u)
+        sizes = np.where(seen, squared_size(innovation, R) / self.system.ny, sizes)
         R = cautious(P, H, R, self.output_factor)
-        return corrected(state, (t, u), P, innovation, H, R)
+        return corrected(replace(state, memory=sizes), (t, u), P, innovation, H, R)
