@@ -20,7 +20,7 @@ from pinnobs_gym.estimation.square_root import (
     root_of,
 )
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
-from pinnobs_gym.simulation.model import model_step, model_step_moments
+from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -81,10 +81,10 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         L, memory = _factor(state, memory)
         points = unit @ L  # (nx, num_points, batch)
         points += state.xhat.T[:, None]
-        _, _, Q = model_step_moments(self.system, self.noise, state.t, t, state.xhat, state.u, u)
-        # Propagate each point through the model; then compute mean and covariance.
-        points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
-        points = np.ascontiguousarray(points.transpose(2, 0, 1))
+        # Propagate the estimate and each point through the model; then compute mean and covariance.
+        points = np.concatenate([state.xhat.T[:, None], points], axis=1).transpose(1, 2, 0)
+        points, _, Q = model_step_moments(self.system, self.noise, state.t, t, points, state.u, u)
+        points = np.ascontiguousarray(points[1:].transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
         P = (outer(X, X) + Q).transpose(2, 0, 1)

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.system import Array
+if TYPE_CHECKING:
+    from pinnobs_gym.simulation.system import Array
 
 JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
 """Relative amounts added to the variances, in turn, until a covariance has a Cholesky factor."""

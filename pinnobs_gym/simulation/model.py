@@ -125,29 +125,35 @@ def model_step_moments(
     u0: np.ndarray | None = None,
     u1: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `model_step` of x (batch, nx), its Jacobian F (nx, nx, batch), and the covariance Q of
-    the process noise over the step, (nx, nx, batch or 1), to first order about the trajectory.
+    """Return `model_step` of x, its Jacobian F (nx, nx, batch), and the covariance Q of the process
+    noise over the step, (nx, nx, batch or 1), to first order about the trajectory.
 
     Q = ∫Ψ L Lᵀ Ψᵀ ds, where Ψ(s) = ∂x(t1)/∂x(s), by Simpson's rule over each substep (Van Loan 1978
     for constant A). Ψ at the middle is the cubic Hermite polynomial through its values and slopes
     −ΨA at the ends, which costs no evaluation of f. Neither the number of substeps nor samples
     between without any output change Q beyond the error of the rule, of fourth order.
+
+    States x are (batch, nx), or (num_points, batch, nx); of several points, F and Q belong to the
+    first.
     """
-    F, Q = None, np.zeros((x.shape[1], x.shape[1], 1))
+    F, Q = None, None
     for end, flow, A, (t, h) in _linearised_steps(system, t0, t1, x, u0, u1):
         x, F = end, flow if F is None else product(flow, F)  # chain rule over the substeps
-        L = [noise.L(now if now.ndim else float(now)) for now in t]
-        if L[0].shape[1] == 0:
+        start, middle, last = t if t.ndim == 2 else t.tolist()
+        if noise.L(start).shape[1] == 0:
             continue
-        middle = flow - h / 4 * product(flow, A[0]) + h / 4 * A[3]
-        middle += identity(*flow.shape[1:])
-        middle *= 0.5
-        # Simpson's weights 1/6, 4/6 and 1/6.
-        parts = (product(flow, L[0]), 2 * product(middle, L[1]), L[2])
-        Q = sandwich(flow, Q) if Q.any() else Q
-        Q = Q + h / 6 * sum(outer(part, part) for part in parts)
+        # Simpson's weights are 1/6, 4/6 and 1/6; this is twice Ψ at the middle.
+        twice = A[3] - product(flow, A[0])
+        twice *= h / 4
+        twice += flow
+        twice += identity(*flow.shape[1:])
+        parts = np.concatenate([noise.mapped(flow, start), noise.mapped(twice, middle)], axis=1)
+        added = outer(parts, parts)
+        added += noise.density(last)
+        added *= h / 6
+        Q = added if Q is None else sandwich(flow, Q) + added
     assert F is not None  # there is at least one substep
-    return x, F, Q
+    return x, F, np.zeros((len(F), len(F), 1)) if Q is None else Q
 
 
 def _linearised_steps(
@@ -158,15 +164,19 @@ def _linearised_steps(
     u0: np.ndarray | None,
     u1: np.ndarray | None,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, Array]]]:
-    """Yield, for each substep of `model_step`, the state (batch, nx) at its end, the Jacobian (nx,
-    nx, batch) of the substep, those of f at its four stages (4, nx, nx, batch), and the times of
-    its start, middle and end, with its length."""
-    batch, nx = x.shape
-    x = np.ascontiguousarray(x.T)  # the batch is last here; the system gets transposed views
+    """Yield, for each substep of `model_step`, the states x at its end, the Jacobian (nx, nx,
+    batch) of the substep, those of f at its four stages (4, nx, nx, batch), and the times of its
+    start, middle and end, with its length. Jacobians are those along the first of several points.
+    """
+    batch, nx = x.shape[-2:]
+    inside, outside = ((1, 0), (1, 0)) if x.ndim == 2 else ((2, 0, 1), (1, 2, 0))
+    # The batch is last here; the system gets transposed views.
+    x = np.ascontiguousarray(x.transpose(inside))
     start = identity(nx, batch)
-    points = np.empty((4, nx, batch))
-    shown = points.transpose(0, 2, 1)
-    for t, step, u in substeps(system, t0, t1, x.T, u0, u1):
+    points = np.empty((4, *x.shape))
+    shown = [each.transpose(outside) for each in points]
+    linearised = (points if x.ndim == 2 else points[:, :, 0]).transpose(0, 2, 1)
+    for t, step, u in substeps(system, t0, t1, x.transpose(outside), u0, u1):
         by_row = t.ndim == 2
         h = step[:, 0] if by_row else step
         times, inputs = t[_STAGES], u[_STAGES]
@@ -175,19 +185,19 @@ def _linearised_steps(
             stage: int, at: np.ndarray, times: np.ndarray = times, inputs: np.ndarray = inputs
         ) -> np.ndarray:
             points[stage] = at
-            return system.f(times[stage], shown[stage], inputs[stage]).T
+            return system.f(times[stage], shown[stage], inputs[stage]).transpose(inside)
 
         x = runge_kutta(rate, x, h)
         # Jacobians A of f at the four stages.
         A = system.f_jacobian(
             times if by_row else times[:, None],
-            shown,
+            linearised,
             inputs[:, None] if u.ndim == 2 else inputs,
         )
         A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
         # Integrate the variational equation Φ' = A(t)Φ by the same method at the same stages.
         flow = runge_kutta(partial(_variation, A), start, h)
-        yield x.T, flow, A, (t, h)
+        yield x.transpose(outside), flow, A, (t, h)
 
 
 def _variation(A: np.ndarray, stage: int, flow: np.ndarray) -> np.ndarray:

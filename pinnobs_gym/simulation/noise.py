@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from pinnobs_gym.simulation.matrices import outer, product
 from pinnobs_gym.simulation.notices import say_once
 
 if TYPE_CHECKING:
@@ -65,6 +66,13 @@ def weighted(M: np.ndarray, w: np.ndarray) -> np.ndarray:
     return total
 
 
+def _scales(L: np.ndarray) -> np.ndarray:
+    """Return the diagonal (nx, batch or 1) of L (nx, m, batch or 1), an empty array if L is not
+    diagonal."""
+    scales = np.einsum("iib->ib", L) if L.shape[0] == L.shape[1] else L[:0, 0]
+    return scales if np.count_nonzero(L) == np.count_nonzero(scales) else scales[:0]
+
+
 @dataclass(frozen=True)
 class SampledLevel:
     """Output noise that differs from sample to sample, as a log may tell it."""
@@ -112,6 +120,16 @@ class Noise:
         Without process noise, m is zero."""
         return self._L
 
+    def density(self, t: float | np.ndarray) -> np.ndarray:
+        """Return LLᵀ at time t (s), shape (nx, nx, batch or 1)."""
+        return self._derived("density", self.L(t), lambda L: outer(L, L))
+
+    def mapped(self, M: np.ndarray, t: float | np.ndarray) -> np.ndarray:
+        """Return ML, (n, m, batch), for matrices M (n, nx, batch) and L at time t (s)."""
+        L = self.L(t)
+        scales = self._derived("scales", L, _scales)  # a diagonal L takes no matrix product
+        return M * scales if scales.size else product(M, L)
+
     def G(self, t: float) -> np.ndarray:
         """Return G at time t (s), shape (ny, m, batch or 1)."""
         std = None if self.samples is None else self.samples.at(t)
@@ -124,7 +142,7 @@ class Noise:
         """Return the covariance R = GGᵀ of the output noise at time t (s), shape (ny, ny, batch or
         1). Given outputs y (batch, ny), their covariances with missing ones, which are NaN, are
         zero, so that these do not count in an update."""
-        R = self._derived("R", self.G(t), lambda G: np.einsum("imb,jmb->ijb", G, G))
+        R = self._derived("R", self.G(t), lambda G: outer(G, G))
         if y is None or len(R) == 1 or not np.isnan(y).any() or not self._correlated(R):
             return R
         present = ~np.isnan(y.T)
@@ -238,7 +256,7 @@ class AssumedNoise(Noise):
             return L
         if L.shape[1] == 0:
             return np.diag(self.extra)[:, used, None]
-        density = np.einsum("imb,jmb->ijb", L, L)
+        density = outer(L, L)
         if L.shape[2] == 1 and not density[~np.eye(len(L), dtype=bool)].any():
             std = np.sqrt(np.einsum("iib->i", density) + self.extra**2)
             return np.diag(std)[:, std > 0, None]
