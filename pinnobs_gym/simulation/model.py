@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -169,8 +170,8 @@ def _linearised_steps(
     start, middle and end, with its length. Jacobians are those along the first of several points.
     """
     batch, nx = x.shape[-2:]
-    inside: tuple[int, ...] = (1, 0) if x.ndim == 2 else (2, 0, 1)
-    outside: tuple[int, ...] = (1, 0) if x.ndim == 2 else (1, 2, 0)
+    inside: Any = (1, 0) if x.ndim == 2 else (2, 0, 1)
+    outside: Any = (1, 0) if x.ndim == 2 else (1, 2, 0)
     # The batch is last here; the system gets transposed views.
     x = np.ascontiguousarray(x.transpose(inside))
     start = identity(nx, batch)
