@@ -47,7 +47,7 @@ class Orbit(System):
 def assumed_std(system, noise_std):
     """Standard deviations of the outputs that filters assume, where R is diagonal."""
     R = AssumedNoise.of(system, system.noise(noise_std)).R(0.0)[..., 0]
-    assert (R == np.diag(np.diag(R))).all()
+    np.testing.assert_array_equal(R, np.diag(np.diag(R)))
     return np.sqrt(np.diag(R))
 
 
