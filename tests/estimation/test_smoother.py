@@ -24,13 +24,11 @@ def test_blocks_and_other_rows_change_nothing(name):
     """All rows together are many more samples than a block holds, and one alone is far fewer."""
     ekf, record = short_record(name, 300)
     about = ekf.run(record).xhat.swapaxes(0, 1)
-    whole = [
-        backward(forward(ekf.system, record, *ekf.tuning(), points)) for points in (None, about)
-    ]
+    whole = [backward(forward(ekf.system, record, ekf.noise, points)) for points in (None, about)]
     for path, points in zip(whole, (None, about), strict=True):
         for row in (0, 1, 299):
             at = None if points is None else points[:, row : row + 1]
-            few = forward(ekf.system, record.rows(np.array([row])), *ekf.tuning(), at)
+            few = forward(ekf.system, record.rows(np.array([row])), ekf.noise, at)
             alone = backward(few)
             size = abs(path.P[..., row]).max(axis=0)
             np.testing.assert_allclose(alone.xhat[:, 0], path.xhat[:, row], rtol=1e-9, atol=1e-9)
@@ -40,16 +38,18 @@ def test_blocks_and_other_rows_change_nothing(name):
 def test_unless_told_states_it_is_the_extended_filter():
     ekf, record = short_record("ReverseDuffing", 2)
     own = ekf.run(record)
-    filtered = forward(ekf.system, record, *ekf.tuning())
+    filtered = forward(ekf.system, record, ekf.noise)
     np.testing.assert_allclose(filtered.xhat.swapaxes(0, 1), own.xhat, rtol=1e-12)
     np.testing.assert_allclose(filtered.P.transpose(3, 0, 1, 2), own.P, rtol=1e-12, atol=1e-18)
-    _, F = flows(ekf.system, record.t, filtered.xhat, record.u.swapaxes(0, 1))
+    _, F, Q = flows(ekf.system, ekf.noise, record.t, filtered.xhat, record.u.swapaxes(0, 1))
     np.testing.assert_allclose(F, filtered.F, rtol=1e-11, atol=1e-13)
+    assert Q.any()
+    np.testing.assert_allclose(Q, filtered.Q, rtol=1e-11, atol=1e-18)
 
 
 def test_caution_takes_smaller_steps():
     ekf, record = short_record("ReverseDuffing", 2)
-    bold, careful = (forward(ekf.system, record, *ekf.tuning(), caution=c) for c in (0.0, 0.5))
+    bold, careful = (forward(ekf.system, record, ekf.noise, caution=c) for c in (0.0, 0.5))
     taken = [np.einsum("pib,ipb->b", f.H[0], f.K[0]) for f in (bold, careful)]
     # 1 / HK = 1 + R / HPHᵀ, and caution adds itself to R / HPHᵀ
     np.testing.assert_allclose(1 / taken[1], 1 / taken[0] + 0.5, rtol=1e-12)

@@ -39,14 +39,14 @@ def constant_record(samples, missing=False):
 
 def test_an_unseen_constant_does_not_grow():
     """It had grown by 1.01 a sample, to 1e21 in 5,000 samples."""
-    found = EnKF(HalfSeen(), process_noise=0.0).run(constant_record(2000))
+    found = EnKF(HalfSeen(), assumed_noise=0.0).run(constant_record(2000))
     std = np.sqrt(np.einsum("kii->ki", found.P[0]))
     assert (abs(np.log(std[:, 1])) < np.log(2.5)).all()  # what the perturbed outputs do by chance
     assert abs(found.xhat[0, -1, 0] - 0.5) < 0.1
 
 
 def test_without_outputs_nothing_is_inflated():
-    found = EnKF(HalfSeen(), process_noise=0.0).run(constant_record(200, missing=True))
+    found = EnKF(HalfSeen(), assumed_noise=0.0).run(constant_record(200, missing=True))
     np.testing.assert_allclose(found.P[0], np.broadcast_to(found.P[0, 0], (200, 2, 2)), rtol=1e-9)
 
 
@@ -54,7 +54,7 @@ def test_the_inflation_keeps_the_spread_of_what_is_measured():
     """Without it the variance of a constant is R/n after n samples. An analysis that takes less
     than a factor λ of the standard deviation takes nothing in the end: σ²/R ≤ λ² − 1."""
     record, inflation = constant_record(400), 1.05
-    options = {"process_noise": 0.0, "members": 400}
+    options = {"assumed_noise": 0.0, "members": 400}
     variance = {
         factor: EnKF(HalfSeen(), inflation=factor, **options).run(record).P[0, -1, 0, 0] / 0.1**2
         for factor in (1.0, inflation)

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from kinds import untrained
-from linear import H, Linear, kalman_filter, linear_record, record_of, runge_kutta_matrix
+from linear import (
+    NOISE_OF_FILTERS,
+    H,
+    Linear,
+    kalman_filter,
+    linear_record,
+    process_covariance,
+    record_of,
+    runge_kutta_matrix,
+)
 from scipy.linalg import block_diag
 
 from pinnobs_gym.envs.episodes import EpisodeSource
@@ -16,24 +25,29 @@ from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.simulation.matrices import cholesky, divide
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
+ASSUMED = 3e-3 / np.sqrt(2.0)
+"""Process noise of `Linear` per √s that filters assume by default: 3e-3 of the scale over the
+benchmark's 2 s."""
 
-def test_on_a_linear_system_the_ekf_is_the_kalman_filter():
+
+@pytest.mark.parametrize(("process_noise", "noise_std", "atol"), NOISE_OF_FILTERS)
+def test_on_a_linear_system_the_ekf_is_the_kalman_filter(process_noise, noise_std, atol):
     record = linear_record()
-    ekf = EKF(Linear(), noise_std=(0.1, 0.2), process_noise=0.05)
-    estimates = ekf.run(record)
+    estimates = EKF(Linear(), noise_std, process_noise, assumed_noise=0.0).run(record)
     for i in range(record.batch):
-        for k, peer in enumerate(kalman_filter(record, i, 0.05, (0.1, 0.2))):
-            np.testing.assert_allclose(estimates.xhat[i, k], peer.x, atol=1e-12)
-            np.testing.assert_allclose(estimates.P[i, k], peer.P, atol=1e-12)
-            np.testing.assert_allclose(estimates.S[i, k], peer.S, atol=1e-12)
-            np.testing.assert_allclose(estimates.innovation[i, k], peer.y, atol=1e-12)
+        for k, peer in enumerate(kalman_filter(record, i, process_noise, noise_std)):
+            np.testing.assert_allclose(estimates.xhat[i, k], peer.x, atol=atol)
+            np.testing.assert_allclose(estimates.P[i, k], peer.P, atol=atol)
+            np.testing.assert_allclose(estimates.S[i, k], peer.S, atol=atol)
+            np.testing.assert_allclose(estimates.innovation[i, k], peer.y, atol=atol)
 
 
 def test_without_process_noise_it_is_weighted_least_squares():
     record = linear_record(1)
-    ekf = EKF(Linear(), noise_std=0.1, process_noise=0.0)
+    ekf = EKF(Linear(), noise_std=0.1, assumed_noise=0.0)
     estimates = ekf.run(record)
     P0_inverse = np.linalg.inv(record.prior.cov[0])
     F, Phi, rows = runge_kutta_matrix(0.1), np.eye(2), []
@@ -62,7 +76,7 @@ def test_a_missing_output_is_as_if_it_had_no_weight():
     for k in range(record.num_samples):
         if k:
             F = runge_kutta_matrix(0.1)
-            x, P = F @ x, F @ P @ F.T + np.eye(2) * 1e-8
+            x, P = F @ x, F @ P @ F.T + process_covariance(ASSUMED)
         R = np.diag(np.where(np.isnan(y[0, k]), 1e12, 0.01))
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
         x = x + K @ (np.nan_to_num(y[0, k]) - H @ x)
@@ -91,8 +105,8 @@ def test_the_gate_restarts_a_filter_that_is_wrong():
     plain = EKF(Linear(), noise_std=0.1).run(jump)
     np.testing.assert_array_equal(gated.xhat[0, :12], plain.xhat[0, :12])
     peer = KalmanFilter(dim_x=2, dim_z=2)
-    peer.x, peer.F, peer.H, peer.Q = plain.xhat[0, 11], runge_kutta_matrix(0.1), H, np.eye(2) * 1e-8
-    peer.R = np.eye(2) * 0.01
+    peer.x, peer.F, peer.H = plain.xhat[0, 11], runge_kutta_matrix(0.1), H
+    peer.Q, peer.R = process_covariance(ASSUMED), np.eye(2) * 0.01
     peer.predict()
     peer.P = record.prior.cov[0] + np.eye(2)
     peer.update(y[0, 12])
@@ -106,7 +120,9 @@ def test_the_gate_ends_false_locks_of_the_motor():
     source = EpisodeSource("InductionMotor", condition="poor_prior", duration=0.5)
     episodes = source.play(source.draw(source.streams(range(60))))
     record, speed = source.record(episodes), episodes.x[source.setup.num_steps - 1, :, 4]
-    ekfs = [EKF(source.system, process_noise=1e-3, gate=gate) for gate in (None, 0.9999)]
+    # 1e-3 of the scale per sample.
+    large = 1e-3 * np.sqrt(InductionMotor.setups["benchmark"].num_steps)
+    ekfs = [EKF(source.system, assumed_noise=large, gate=gate) for gate in (None, 0.9999)]
     wrong = [abs(ekf.run(record).xhat[:, -1, 4] - speed) > 30.0 for ekf in ekfs]
     assert wrong[0].sum() >= 4
     assert not wrong[1].any()
@@ -116,12 +132,12 @@ def test_hubers_weight_enlarges_the_variance_of_an_outlier_alone():
     record = linear_record(1)
     y = record.y.copy()
     y[0, 6, 0] += 4.0
-    robust = EKF(Linear(), noise_std=0.1, huber=2.0)
+    robust = EKF(Linear(), noise_std=0.1, assumed_noise=0.0, huber=2.0)
     wild = Record(record.t, y, record.u, record.prior)
     before, after = robust.run(wild).xhat[0, 5], robust.run(wild)
     P = robust.run(wild).P[0, 5]
     F = runge_kutta_matrix(0.1)
-    x, P = F @ before, F @ P @ F.T + np.eye(2) * 1e-8
+    x, P = F @ before, F @ P @ F.T
     e = y[0, 6] - H @ x
     size = abs(e) / np.sqrt(np.diag(H @ P @ H.T) + 0.01)
     assert size[0] > 10
@@ -136,7 +152,9 @@ def test_hubers_weight_enlarges_the_variance_of_an_outlier_alone():
         ({"gate": 1.0}, "gate=1.0; expected a probability"),
         ({"gate": 0.99, "patience": 0}, "patience=0; expected at least 1"),
         ({"huber": 0.0}, "huber=0.0; expected a positive number"),
-        ({"process_noise": -1.0}, "process_noise=-1.0; expected a number of at least 0"),
+        ({"assumed_noise": -1.0}, "assumed_noise=-1.0; expected a number of at least 0"),
+        ({"process_noise": -1.0}, "process_noise of Linear=-1.0; expected numbers of at least 0"),
+        ({"noise_std": -0.1}, "noise_std of Linear=-0.1; expected numbers of at least 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options, message):
@@ -144,15 +162,13 @@ def test_settings_out_of_range_are_refused(options, message):
         EKF(Linear(), **options)
 
 
-def test_an_indefinite_prior_and_a_negative_noise_are_refused():
+def test_an_indefinite_prior_is_refused():
     mean = np.zeros((2, 2))
     indefinite = np.stack([np.eye(2), np.diag([1.0, -0.5])])
     with pytest.raises(ValueError, match=r"P0 of row 1 has eigenvalue -0\.5"):
         EKF(Linear()).reset(Prior(mean, indefinite))
     with pytest.raises(ValueError, match="P0 is not symmetric"):
         EKF(Linear()).reset(Prior(mean, np.array([[[1.0, 0.5], [0.0, 1.0]]] * 2)))
-    with pytest.raises(ValueError, match=r"noise_std=-0\.1; expected"):
-        EKF(Linear(), noise_std=-0.1).reset(Prior(mean, np.stack([np.eye(2)] * 2)))
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
@@ -206,7 +222,7 @@ class FilterpyRow:
         self.filter = KalmanFilter(dim_x=2, dim_z=2)
         self.filter.x, self.filter.P = xhat0, P0
         self.filter.F, self.filter.H = runge_kutta_matrix(0.1), H
-        self.filter.Q, self.filter.R = np.eye(2) * 1e-8, np.eye(2) * 0.01
+        self.filter.Q, self.filter.R = np.zeros((2, 2)), np.eye(2) * 0.01
         self.first = True
 
     def update(self, t, y, u):
@@ -220,16 +236,16 @@ class FilterpyRow:
 def test_the_adapter_runs_single_episode_objects_row_by_row():
     record = linear_record()
     adapted = PerEpisode(Linear(), make=FilterpyRow, title="filterpy").run(record)
-    own = EKF(Linear(), noise_std=0.1).run(record)
+    own = EKF(Linear(), noise_std=0.1, assumed_noise=0.0).run(record)
     np.testing.assert_allclose(adapted.xhat, own.xhat, atol=1e-12)
 
 
 def test_noise_is_told_and_never_zero():
-    assert EKF(ReverseDuffing(), noise_std=0.3).output_variance == pytest.approx([0.09])
-    assert EKF(ReverseDuffing()).output_variance == pytest.approx([0.02**2])
-    assert EKF(ReverseDuffing(), noise_std=0.0).output_variance == pytest.approx([(1.3e-3) ** 2])
-    with pytest.raises(ValueError, match="noise_std has shape"):
-        EKF(ReverseDuffing(), noise_std=(0.1, 0.1)).output_variance  # noqa: B018
+    for level, expected in ((0.3, 0.3), (None, 0.02), (0.0, 1.3e-3)):
+        R = EKF(ReverseDuffing(), noise_std=level).noise.R(0.0)
+        np.testing.assert_allclose(R, np.full((1, 1, 1), expected**2), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"noise_std of ReverseDuffing has shape \(2,\); expected"):
+        EKF(ReverseDuffing(), noise_std=(0.1, 0.1))
 
 
 def test_a_singular_innovation_covariance_marks_its_row_alone():

@@ -14,6 +14,7 @@ from linear import (
     jacobians,
     kalman_filter,
     linear_record,
+    process_covariance,
     runge_kutta_matrix,
 )
 from small_trainings import constant_gain
@@ -34,6 +35,8 @@ from pinnobs_gym.simulation.system import System
 
 MEASURED = pytest.mark.parametrize("measured", [False, True], ids=["known", "measured"])
 STD = (0.1, 0.2)
+NOISE = pytest.mark.parametrize(("process_noise", "atol"), [(0.0, 1e-11), (0.15, 1e-6)])
+"""Process noise per √s, and the tolerance; see `linear.NOISE_OF_FILTERS`."""
 
 
 def modulated_record(measured):
@@ -61,7 +64,7 @@ def known_part(record):
 
 def smoothed(record, row, process_noise, C):
     """Rauch, Tung and Striebel's recursion of the linear system, from the last sample on."""
-    F, Q = runge_kutta_matrix(0.1), np.eye(2) * process_noise**2
+    F, Q = runge_kutta_matrix(0.1), process_covariance(process_noise)
     filtered = [
         (peer.x.copy(), peer.P.copy()) for peer in kalman_filter(record, row, process_noise, STD, C)
     ]
@@ -75,25 +78,26 @@ def smoothed(record, row, process_noise, C):
 
 
 @MEASURED
+@NOISE
 @pytest.mark.parametrize("kind", [EKF, UKF, CKF])
-def test_filters_are_the_kalman_filter_less_what_is_known(kind, measured):
+def test_filters_are_the_kalman_filter_less_what_is_known(kind, process_noise, atol, measured):
     system, record, _ = modulated_record(measured)
-    own = kind(system, noise_std=STD, process_noise=0.05).run(record)
+    own = kind(system, STD, process_noise, assumed_noise=0.0).run(record)
     plain = replace(record, y=record.y - known_part(record))
     for i in range(record.batch):
         C = jacobians(system, record.t, record.u[i])
-        for k, peer in enumerate(kalman_filter(plain, i, 0.05, STD, C)):
-            np.testing.assert_allclose(own.xhat[i, k], peer.x, atol=1e-11)
-            np.testing.assert_allclose(own.P[i, k], peer.P, atol=1e-11)
-            np.testing.assert_allclose(own.S[i, k], peer.S, atol=1e-11)
-            np.testing.assert_allclose(own.innovation[i, k], peer.y, atol=1e-11)
+        for k, peer in enumerate(kalman_filter(plain, i, process_noise, STD, C)):
+            np.testing.assert_allclose(own.xhat[i, k], peer.x, atol=atol)
+            np.testing.assert_allclose(own.P[i, k], peer.P, atol=atol)
+            np.testing.assert_allclose(own.S[i, k], peer.S, atol=atol)
+            np.testing.assert_allclose(own.innovation[i, k], peer.y, atol=atol)
 
 
 @MEASURED
 @pytest.mark.parametrize("window", [5, 1000])
 def test_moving_horizons_are_the_kalman_filter(window, measured):
     system, record, _ = modulated_record(measured)
-    own = MHE(system, noise_std=STD, process_noise=0.0, window=window).run(record)
+    own = MHE(system, noise_std=STD, assumed_noise=0.0, window=window).run(record)
     plain = replace(record, y=record.y - known_part(record))
     for i in range(record.batch):
         C = jacobians(system, record.t, record.u[i])
@@ -104,15 +108,16 @@ def test_moving_horizons_are_the_kalman_filter(window, measured):
 
 
 @MEASURED
-def test_the_smoother_is_the_textbooks(measured):
+@NOISE
+def test_the_smoother_is_the_textbooks(process_noise, atol, measured):
     system, record, _ = modulated_record(measured)
-    own = RTSSmoother(system, noise_std=STD, process_noise=0.05).run(record)
+    own = RTSSmoother(system, STD, process_noise, assumed_noise=0.0).run(record)
     plain = replace(record, y=record.y - known_part(record))
     for i in range(record.batch):
         C = jacobians(system, record.t, record.u[i])
-        for k, (x, P) in enumerate(smoothed(plain, i, 0.05, C)):
-            np.testing.assert_allclose(own.xhat[i, k], x, atol=1e-11)
-            np.testing.assert_allclose(own.P[i, k], P, atol=1e-11)
+        for k, (x, P) in enumerate(smoothed(plain, i, process_noise, C)):
+            np.testing.assert_allclose(own.xhat[i, k], x, atol=atol)
+            np.testing.assert_allclose(own.P[i, k], P, atol=atol)
 
 
 @MEASURED

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 
-from pinnobs_gym.estimation.notices import say_once
 from pinnobs_gym.estimators.particle import ParticleFilter
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent
 
@@ -58,7 +58,7 @@ class Explosive(LogSensor):
 @pytest.fixture
 def said(caplog):
     say_once.cache_clear()
-    caplog.set_level(logging.WARNING, "pinnobs_gym.estimation.notices")
+    caplog.set_level(logging.WARNING, "pinnobs_gym.simulation.notices")
     yield lambda: [record.getMessage() for record in caplog.records]
     say_once.cache_clear()
 

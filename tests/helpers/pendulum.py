@@ -15,11 +15,11 @@ DT = 0.0125
 @dataclass(frozen=True)
 class NoisyPendulum(System):
     """Särkkä's pendulum ("Bayesian Filtering and Smoothing", 2013, example 3.7): sin of the angle
-    is measured. The scale is the standard deviation of the process noise over a step."""
+    is measured, and the process noise acts on the rate with the spectral density 1."""
 
     state_names = ("angle", "rate")
     output_names = ("y1",)
-    scale = (np.sqrt(DT**3 / 3), np.sqrt(DT))
+    scale = (1.0, 1.0)
     setups = {
         "benchmark": Setup(
             (1.5, 0.0),
@@ -27,6 +27,7 @@ class NoisyPendulum(System):
             duration=2.0,
             dt=DT,
             noise_std=0.3,
+            process_noise=(0.0, 1.0),
             xhat0=(1.5, 0.0),
             P0=independent(0.1, 0.1),
         )
@@ -40,7 +41,8 @@ class NoisyPendulum(System):
 
 
 def pendulum_record(batch):
-    """Trajectories with process noise of spectral density 1, and their records."""
+    """Trajectories with the process noise of the book, whose Q leaves gravity within a step out,
+    and their records."""
     system, rng = NoisyPendulum(), np.random.default_rng(0)
     t = system.setups["benchmark"].times
     Q = np.array([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]])

@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from linear import A, FeedThrough, Linear, Modulated, jacobians
+from linear import A, FeedThrough, Linear, Modulated, jacobians, process_covariance
 from scipy.linalg import expm
 
 from pinnobs_gym import evaluate
@@ -104,10 +104,13 @@ def test_mismatch_leaves_out_what_the_system_is_sure_of():
 def test_process_noise_is_white_and_of_the_size_it_says():
     _, episodes = played(Linear, "process_noise1e-2", batch=200)
     disturbance = episodes.x[1:] - episodes.x[:-1] @ expm(0.1 * A).T
-    cov = np.cov(disturbance.reshape(-1, 2).T)
-    np.testing.assert_allclose(cov / 1e-4, np.eye(2), atol=5 * np.sqrt(2 / 4000))
-    lagged = (disturbance[1:] * disturbance[:-1]).mean() / 1e-4
-    across = (disturbance[:, 1:] * disturbance[:, :-1]).mean() / 1e-4
+    # 1e-2 of the scale after a sample of 0.1 s; whitened by a root of its covariance over the step.
+    Q = process_covariance(1e-2 / np.sqrt(0.1))
+    white = disturbance @ np.linalg.inv(np.linalg.cholesky(Q)).T
+    cov = np.cov(white.reshape(-1, 2).T)
+    np.testing.assert_allclose(cov, np.eye(2), atol=5 * np.sqrt(2 / 4000))
+    lagged = (white[1:] * white[:-1]).mean()
+    across = (white[:, 1:] * white[:, :-1]).mean()
     assert max(abs(lagged), abs(across)) < 5 / np.sqrt(7600)
 
 

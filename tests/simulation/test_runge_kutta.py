@@ -88,7 +88,7 @@ def test_an_oscillator_of_few_samples_a_period(samples: int) -> None:
     record = Record(
         t, x[:, :1] + noise, np.zeros((batch, len(t), 0)), Prior.of(system, setup, batch)
     )
-    found = EKF.for_setup(system, setup, process_noise=0.0).run(record)
+    found = EKF.for_setup(system, setup, assumed_noise=0.0).run(record)
     assert found.P is not None
     variances = np.diagonal(found.P, axis1=-2, axis2=-1)[:, 150:]
     assert np.mean((found.xhat - x)[:, 150:] ** 2 / variances) == pytest.approx(1.0, abs=0.25)

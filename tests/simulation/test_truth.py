@@ -489,15 +489,17 @@ def test_a_truth_disturbed_by_nothing_is_the_truth(condition):
     plant = source.condition.plant(source.system, rngs)
     x0 = np.random.default_rng(0).uniform(source.x0_low, source.x0_high, (3, 5))
     expected = truth(plant, x0, source.times, source.setup.truth_step)
-    noise = np.zeros((len(source.times) - 1, 3, 5))
-    found = disturbed_truth(plant, x0, source.times, noise, source.setup.truth_step)
+    noise = source.system.noise(process_noise=1.0)
+    draws = np.zeros((len(source.times) - 1, 2, 2, 3, 5))
+    found = disturbed_truth(plant, noise, x0, source.times, draws, source.setup.truth_step)
     assert abs((found - expected) / np.array(plant.scale)).max() < 1e-8
 
 
 def test_a_disturbance_that_leads_out_of_the_finite_numbers_is_told():
-    noise = np.full((10, 1, 2), 1e200)
+    system, draws = ReverseDuffing(), np.full((10, 1, 2, 1, 2), 1e200)
+    noise, t = system.noise(process_noise=1.0), np.arange(11) * 0.1
     with pytest.raises(FloatingPointError, match="leaves the finite numbers from x0="):
-        disturbed_truth(ReverseDuffing(), np.ones((1, 2)), np.arange(11) * 0.1, noise)
+        disturbed_truth(system, noise, np.ones((1, 2)), t, draws)
 
 
 @pytest.mark.parametrize("name", SYSTEMS.classes())

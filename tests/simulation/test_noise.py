@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from linear import Linear, linear_record
 
-from pinnobs_gym.estimation.noise import assumed_noise
-from pinnobs_gym.estimation.notices import say_once
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.simulation.noise import AssumedNoise
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent, stack
 from pinnobs_gym.systems import SYSTEMS
@@ -44,6 +44,13 @@ class Orbit(System):
         return x[..., :1]
 
 
+def assumed_std(system, noise_std):
+    """Standard deviations of the outputs that filters assume, where R is diagonal."""
+    R = AssumedNoise.of(system, system.noise(noise_std)).R(0.0)[..., 0]
+    np.testing.assert_array_equal(R, np.diag(np.diag(R)))
+    return np.sqrt(np.diag(R))
+
+
 def test_a_small_noise_is_taken_as_told():
     """The right filter, in closed form of the oscillation, knows the place to 0.56 m."""
     system, t = Orbit(), np.arange(600) * DT
@@ -64,7 +71,7 @@ def test_a_small_noise_is_taken_as_told():
         np.zeros((1, len(t), 0)),
         Prior.of(system, system.setups["benchmark"], 1),
     )
-    found = EKF(system, noise_std=10.0, process_noise=0.0).run(record)
+    found = EKF(system, noise_std=10.0, assumed_noise=0.0).run(record)
     # The Runge-Kutta steps of 10 s leave the closed form by less than a tenth of a metre.
     np.testing.assert_allclose(found.xhat[0, :, 0], means, rtol=0, atol=0.1)
     assert np.sqrt(found.P[0, -1, 0, 0]) == pytest.approx(np.sqrt(P[0, 0]), rel=1e-3)
@@ -72,12 +79,12 @@ def test_a_small_noise_is_taken_as_told():
 
 def test_the_floor_is_taken_for_zero_alone_and_said_once(caplog):
     say_once.cache_clear()
-    caplog.set_level(logging.WARNING, "pinnobs_gym.estimation.notices")
-    assert assumed_noise(ReverseDuffing(), 1e-9) == pytest.approx([1e-9])
-    assert assumed_noise(Linear(), (1e-9, 0.3)) == pytest.approx([1e-9, 0.3])
+    caplog.set_level(logging.WARNING, "pinnobs_gym.simulation.notices")
+    assert assumed_std(ReverseDuffing(), 1e-9) == pytest.approx([1e-9])
+    assert assumed_std(Linear(), (1e-9, 0.3)) == pytest.approx([1e-9, 0.3])
     assert caplog.records == []
     for _ in range(2):  # y2 = 2·x2, and x2 has the scale 1
-        assert assumed_noise(Linear(), (0.1, 0.0)) == pytest.approx([0.1, 2e-3])
+        assert assumed_std(Linear(), (0.1, 0.0)) == pytest.approx([0.1, 2e-3])
     line = "Linear: the output noise is zero; filters assume the standard deviations y2: 0.002"
     assert [record.getMessage() for record in caplog.records] == [line]
     say_once.cache_clear()
@@ -87,13 +94,14 @@ def test_the_benchmarks_are_told_their_noise_and_the_paper_a_thousandth_of_the_s
     for cls in SYSTEMS.classes().values():
         system, benchmark = cls.configured("benchmark")
         told = np.broadcast_to(benchmark.noise_std, (system.ny,))
-        np.testing.assert_array_equal(assumed_noise(system, benchmark.noise_std), told)
-        assert (assumed_noise(system, 0.0) < 0.25 * told).all()
+        found = assumed_std(system, benchmark.noise_std)
+        np.testing.assert_allclose(found, told, rtol=1e-15)  # the root of a square
+        assert (assumed_std(system, 0.0) < 0.25 * told).all()
 
 
 def test_a_tiny_noise_is_followed_to_the_last_digit():
     record = linear_record()
-    exact = EKF(Linear(), noise_std=1e-12, process_noise=0.0).run(record)
+    exact = EKF(Linear(), noise_std=1e-12, assumed_noise=0.0).run(record)
     # With both states measured without noise, the estimate is the measurement.
     measured = record.y / np.array([1.0, 2.0])
     np.testing.assert_allclose(exact.xhat[:, 0], measured[:, 0], atol=1e-12)
