@@ -74,6 +74,7 @@ def test_settings_noise_and_model_are_part_of_the_estimator():
         EKF(system),
         EKF(system, noise_std=0.1),
         EKF(system, process_noise=1e-3),
+        EKF(system, assumed_noise=1e-3),
         EKF(replace(system, measured_input=True)),
     ]
     assert len({estimator_hash(each) for each in estimators}) == len(estimators)
