@@ -79,6 +79,10 @@ def test_settings_noise_and_model_are_part_of_the_estimator():
     ]
     assert len({estimator_hash(each) for each in estimators}) == len(estimators)
     assert estimator_hash(EKF(system)) == estimator_hash(EKF(ReverseDuffing()))
+    # The same noise in other words: that of the benchmark is 0.02, and none of the plant.
+    assert estimator_hash(EKF(system)) == estimator_hash(
+        EKF(system, (0.02,), [[0.0, 0.0], [0.0, 0.0]])
+    )
 
 
 class Copied:
