@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 from array_api_compat import array_namespace
 from filterpy.kalman import KalmanFilter
+from scipy.linalg import expm
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.simulation.system import Setup, System, independent, stack
@@ -46,6 +47,28 @@ def runge_kutta_matrix(dt):
     """What the classical Runge-Kutta method does to a linear system."""
     h = dt * A
     return np.eye(2) + h + h @ h / 2 + h @ h @ h / 6 + h @ h @ h @ h / 24
+
+
+def noise_matrix(level):
+    """The matrix M of a noise Mw, from M or from its standard deviations."""
+    return np.asarray(level) if np.ndim(level) == 2 else np.diag(np.broadcast_to(level, 2))
+
+
+def process_covariance(process_noise, dt=0.1, drift=A):
+    """Q = ∫exp(As)LLᵀexp(Aᵀs)ds over dt, by the matrix exponential of Van Loan ("Computing
+    integrals involving the matrix exponential", 1978, theorem 1)."""
+    L, size = noise_matrix(process_noise), len(drift)
+    blocks = expm(dt * np.block([[-drift, L @ L.T], [np.zeros((size, size)), drift.T]]))
+    return blocks[size:, size:].T @ blocks[:size, size:]
+
+
+NOISE_OF_FILTERS = [
+    (0.0, (0.1, 0.2), 1e-12),
+    (0.15, (0.1, 0.2), 1e-6),
+    (((0.1, 0.05), (0.0, 0.2)), ((0.1, 0.0), (0.15, 0.2)), 1e-6),
+]
+"""Process noise, output noise, and the tolerance of estimates and covariances. Simpson's rule, by
+which estimators compute Q, is off by 2e-6 of Q over a sample of `Linear`."""
 
 
 def record_of(source, batch):
@@ -118,12 +141,14 @@ def fed_through(record, measured, seed=0):
 
 
 def kalman_filter(record, row, process_noise, noise_std, C=None):
-    """filterpy's Kalman filter on an episode of the linear system, yielded after every sample. The
-    output matrix C (num_samples, 2, 2) is `H` if None."""
+    """filterpy's Kalman filter on an episode of the linear system, yielded after every sample.
+    Process noise is per √s, and each noise is given by standard deviations or a matrix. The output
+    matrix C (num_samples, 2, 2) is `H` if None."""
     peer = KalmanFilter(dim_x=2, dim_z=2)
     peer.x, peer.P = record.prior.mean[row].copy(), record.prior.cov[row].copy()
     peer.F, peer.H = runge_kutta_matrix(0.1), H
-    peer.Q, peer.R = np.eye(2) * process_noise**2, np.diag(np.square(noise_std))
+    G = noise_matrix(noise_std)
+    peer.Q, peer.R = process_covariance(process_noise), G @ G.T
     for k in range(record.num_samples):
         if k:
             peer.predict()

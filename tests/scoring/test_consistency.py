@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linear import A, H, Linear, runge_kutta_matrix
+from linear import H, Linear, process_covariance, runge_kutta_matrix
 from scipy.stats import chi2
-from van_loan import noise_covariance
 
 from pinnobs_gym import evaluate
 from pinnobs_gym.estimation.estimator import Estimates
@@ -27,7 +26,7 @@ def gaussian():
     record; a fifth of the outputs are missing."""
     rng = np.random.default_rng(0)
     mean, P0 = np.array([0.3, -0.2]), np.array([[0.6, 0.2], [0.2, 0.3]])
-    F, Q = runge_kutta_matrix(0.1), noise_covariance(A, PROCESS_NOISE * np.eye(2), 0.1)
+    F, Q = runge_kutta_matrix(0.1), process_covariance(PROCESS_NOISE)
     x = np.empty((BATCH, SAMPLES, 2))
     x[:, 0] = rng.multivariate_normal(mean, P0, BATCH)
     for k in range(1, SAMPLES):

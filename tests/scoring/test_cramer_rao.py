@@ -11,11 +11,11 @@ from linear import (
     Modulated,
     jacobians,
     linear_record,
+    process_covariance,
     record_of,
     runge_kutta_matrix,
 )
 from scipy.linalg import expm
-from van_loan import noise_covariance
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
@@ -83,7 +83,7 @@ def test_missing_outputs_tell_nothing_and_process_noise_is_added():
     missing = np.zeros((1, 3, 2), dtype=bool)
     missing[0, 0], missing[0, 1, 1] = True, True
     found = cramer_rao(Linear(), t, x, P0, noise, missing)[0]
-    F, Q = runge_kutta_matrix(0.1), noise_covariance(A, L, 0.1)
+    F, Q = runge_kutta_matrix(0.1), process_covariance(L)
     np.testing.assert_allclose(found[0], P0, rtol=1e-14)
     P = F @ P0 @ F.T + Q
     P = np.linalg.inv(np.linalg.inv(P) + H[:1].T @ H[:1] / 0.1)
