@@ -287,6 +287,22 @@ def test_training_is_not_worse_than_the_ekf_on_the_records_held_out():
     assert train(system, wild, record=record.rows(slice(10))).loss <= 1
 
 
+def test_records_held_out_are_filtered_with_the_process_noise_told(monkeypatch):
+    gains = []
+
+    def spy(*told, **options):
+        gains.append(PinnGain(*told, **options))
+        return gains[-1]
+
+    monkeypatch.setattr("trainers.pinn_gain.held_out.PinnGain", spy)
+    system, record = short_record()
+    PinnGainTrainer(system, SMALL, record=record, process_noise=(0.0, 0.3))
+    expected = EKF(system, process_noise=(0.0, 0.3)).noise.L(0.0)
+    assert len(gains) > 1
+    for gain in gains:
+        np.testing.assert_array_equal(gain.noise.L(0.0), expected)
+
+
 def test_training_sees_a_record_alone(monkeypatch):
     """Whoever trains gets outputs, inputs, times and the prior; the truth is computed before."""
     game = Game.of("ReverseDuffing")
