@@ -128,7 +128,18 @@ class BaseEstimator(ABC):
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:
-        """Return the estimator for a model, with a setup's noise and the given settings."""
+        """Return the estimator for a model, with a setup's noise and the given settings.
+
+        Raises:
+            ValueError: in one line, if a setting is unknown or a value is not allowed.
+        """
+        shared = {f.name for f in fields(BaseEstimator)}
+        taken = {f.name for f in fields(cls) if f.init} - shared
+        for name in options:
+            if name not in taken:
+                known = sorted(f.name for f in cls.setting_fields() if f.init)
+                expected = f"one of {', '.join(known)}" if known else "no settings"
+                raise ValueError(f"setting {name!r}; expected {expected}")
         return cls(system, setup.noise_std, setup.process_noise, **options)
 
     @classmethod

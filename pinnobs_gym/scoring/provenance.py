@@ -70,7 +70,8 @@ def training_code(trainer: type, source: EpisodeSource) -> str:
 
 
 def estimator_hash(estimator: BaseEstimator) -> str:
-    """Return the hash of an estimator: its code, its settings, its model and what was trained.
+    """Return the hash of an estimator: its code, its settings, its model, the noise that it is
+    told, and what was trained.
 
     If a part cannot be read, such as a lambda among the settings, the hash is another each time, so
     that its scores are never taken for those of another estimator.
@@ -80,8 +81,7 @@ def estimator_hash(estimator: BaseEstimator) -> str:
     training = {name: value for name, value in estimator.training.items() if name != "seconds"}
     parts = {
         "model": estimator.system,
-        "noise_std": estimator.noise_std,
-        "process_noise": estimator.process_noise,
+        "noise": estimator.system.noise(estimator.noise_std, estimator.process_noise),
         "options": estimator.options,
         "training": training,
         "trained": {name: getattr(held, name) for name in names},

@@ -73,7 +73,7 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
     assert (
         run(*common, "--xhat0", 0, 0, "--P0-std", 2, 2, "--noise-std", 0.1, "--out", "a.csv") == 0
     )
-    assert run(*common, "--set", "process_noise=0.1", "--out", "b.csv") == 0
+    assert run(*common, "--set", "assumed_noise=1", "--out", "b.csv") == 0
     assert run(*common, "--estimator", "open_loop", "--out", "c.csv") == 0
     first = [(folder / name).read_text().splitlines() for name in ("a.csv", "b.csv", "c.csv")]
     assert first[0][-1] != first[1][-1]
@@ -120,8 +120,12 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
         (["estimate", "--system", "Academic", "--log", "none_at_all.csv"], "no output at all"),
         (["estimate", "--system", "Academic", "--log", "twice.csv"], "has column y1 twice"),
         (["evaluate", "--system", "failing_plug_in:X"], "'failing_plug_in:X': SyntaxError"),
-        (["evaluate", "--system", "Academic", "--set", "process_noise=a"], "expected a number"),
-        (["evaluate", "--system", "Academic", "--set", "process_noise=-1"], "process_noise=-1"),
+        (["evaluate", "--system", "Academic", "--set", "assumed_noise=a"], "expected a number"),
+        (["evaluate", "--system", "Academic", "--set", "assumed_noise=-1"], "assumed_noise=-1"),
+        (
+            ["evaluate", "--system", "Academic", "--set", "process_noise=1e-3"],
+            "setting 'process_noise=1e-3'; expected name=value with a name of: assumed_noise, gate",
+        ),
         (["dance"], "unknown command 'dance'; known are estimate, estimators, evaluate"),
         (["train", "pinn_obs", "--system", "Academic", "--budget", "-1"], "budget=-1.0; expected"),
         (["evaluate", "--systm", "Academic"], "Missing from pinnobs evaluate: --system"),

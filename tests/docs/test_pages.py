@@ -93,7 +93,7 @@ def test_an_estimators_page_has_its_settings_and_equations(generated):
     _, texts = generated
     text = texts["estimators/ekf.md"]
     assert "| `patience` | `15` | How many samples in a row may be beyond the gate. |" in text
-    assert "| `process_noise` | `0.0001` | Standard deviation" in text  # inherited
+    assert "| `assumed_noise` | `0.003` | Standard deviation" in text  # inherited
     assert "model, prior, noise" in text
     for name, cls in ESTIMATORS.classes().items():
         assert cls.equations.strip() in texts[f"estimators/{name}.md"]

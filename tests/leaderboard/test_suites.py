@@ -85,7 +85,7 @@ def test_a_file_is_read_and_options_change_it(write):
         ),
         (
             'estimators = [{name = "ekf", settings = {huuber = 1}}]',
-            "estimators: settings of 'ekf': setting 'huuber'; expected one of gate, huber, pat",
+            "estimators: settings of 'ekf': setting 'huuber'; expected one of assumed_noise, ",
         ),
         (
             'estimators = [{name = "ekf", settings = {huber = -1}}]',

@@ -11,6 +11,7 @@ from linear import (
     Modulated,
     jacobians,
     linear_record,
+    process_covariance,
     record_of,
     runge_kutta_matrix,
 )
@@ -37,8 +38,9 @@ def test_it_is_the_information_of_all_outputs(name):
     """Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ at sample 40."""
     source, x, record = played(name, 2)
     system, t, u = source.system, record.t, record.u
-    P0, R = record.prior.cov[0], np.diag(EKF(system).output_variance)
-    found = cramer_rao(system, t[:41], x[:, :41], P0, R)
+    P0, noise_std = record.prior.cov[0], np.broadcast_to(source.setup.noise_std, system.ny)
+    R = np.diag(noise_std**2)
+    found = cramer_rao(system, t[:41], x[:, :41], P0, source.noise)
     for row in range(2):
         Phi, information = np.eye(system.nx), np.linalg.inv(P0)
         for k in range(41):
@@ -61,7 +63,7 @@ def test_outputs_that_change_with_time_and_input_tell_what_they_do_then():
     """Φ(P₀⁻¹ + ΣΦᵀC(t, u)ᵀR⁻¹C(t, u)Φ)⁻¹Φᵀ of a linear system, sample by sample."""
     t, P0, R = 0.3 + np.arange(20) * 0.1, np.diag([2.0, 3.0]), np.diag([0.1, 0.2])
     x = np.random.default_rng(0).standard_normal((2, 20, 2))
-    found = cramer_rao(Modulated(), t, x, P0, R)
+    found = cramer_rao(Modulated(), t, x, P0, Modulated().noise(np.sqrt((0.1, 0.2))))
     C = jacobians(Modulated(), t, np.cos(5 * t)[:, None] + 0.3)
     assert np.ptp(C[:, 0, 0]) > 0.3
     Phi, information = np.eye(2), np.linalg.inv(P0)
@@ -76,26 +78,26 @@ def test_outputs_that_change_with_time_and_input_tell_what_they_do_then():
 def test_missing_outputs_tell_nothing_and_process_noise_is_added():
     t = np.arange(3) * 0.1
     x = np.zeros((1, 3, 2))
-    P0, R, Q = np.diag([2.0, 3.0]), np.diag([0.1, 0.2]), np.diag([0.3, 0.4])
+    P0, R, L = np.diag([2.0, 3.0]), np.array([[0.1, 0.05], [0.05, 0.2]]), [[0.5, 1.0], [-0.3, 0.7]]
+    noise = Linear().noise(np.linalg.cholesky(R), L)
     missing = np.zeros((1, 3, 2), dtype=bool)
     missing[0, 0], missing[0, 1, 1] = True, True
-    found = cramer_rao(Linear(), t, x, P0, R, Q, missing)[0]
-    F = runge_kutta_matrix(0.1)
+    found = cramer_rao(Linear(), t, x, P0, noise, missing)[0]
+    F, Q = runge_kutta_matrix(0.1), process_covariance(L)
     np.testing.assert_allclose(found[0], P0, rtol=1e-14)
     P = F @ P0 @ F.T + Q
     P = np.linalg.inv(np.linalg.inv(P) + H[:1].T @ H[:1] / 0.1)
-    np.testing.assert_allclose(found[1], P, rtol=1e-12)
+    np.testing.assert_allclose(found[1], P, rtol=1e-5)  # the error of Simpson's rule
     P = F @ P @ F.T + Q
     P = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
-    np.testing.assert_allclose(found[2], P, rtol=1e-12)
+    np.testing.assert_allclose(found[2], P, rtol=1e-5)
 
 
 def test_on_a_linear_system_the_kalman_filters_covariance_is_the_reference():
     record = linear_record(1)
-    P = EKF(Linear(), noise_std=0.1, process_noise=0.05).run(record).P
+    P = EKF(Linear(), 0.1, 0.15, assumed_noise=0.0).run(record).P
     x = np.random.default_rng(0).standard_normal((1, record.num_samples, 2))  # any trajectory
-    R, Q = np.eye(2) * 0.01, np.eye(2) * 0.05**2
-    found = cramer_rao(Linear(), record.t, x, record.prior.cov[0], R, Q)
+    found = cramer_rao(Linear(), record.t, x, record.prior.cov[0], Linear().noise(0.1, 0.15))
     np.testing.assert_allclose(found, P, rtol=1e-10)
 
 

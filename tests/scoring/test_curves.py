@@ -98,8 +98,7 @@ def test_scored_episodes_leave_their_errors_and_the_reference(tmp_path):
     expected = np.sqrt((scaled[..., 0] ** 2 + scaled[..., 1] ** 2) / 2)
     np.testing.assert_allclose(own.error, expected[:, k], rtol=3e-4)
 
-    R = np.diag(estimator.output_variance)
-    P = cramer_rao(source.system, record.t, x, record.prior.cov[0], R)
+    P = cramer_rao(source.system, record.t, x, record.prior.cov[0], source.noise)
     variance = (
         P[..., 0, 0] / source.system.scale[0] ** 2 + P[..., 1, 1] / source.system.scale[1] ** 2
     )

@@ -20,10 +20,13 @@ DUFFING = Game.of("ReverseDuffing")
     [
         ({}, {}),
         ({"gate": 0.9}, {"gate": 0.9}),
-        ({"process_noise": 1e-4}, {}),  # the default
-        ({"process_noise": 0.1, "huber": 1.5}, {"huber": 1.5, "process_noise": 0.1}),
+        ({"assumed_noise": 3e-3}, {}),  # the default
+        ({"assumed_noise": 0.1, "huber": 1.5}, {"huber": 1.5, "assumed_noise": 0.1}),
         ({"noise_std": 1.0}, {"noise_std": 1.0}),
         ({"noise_std": 0.02}, {}),  # that of the setup
+        ({"process_noise": 0.0}, {}),  # that of the setup
+        ({"process_noise": 0.1}, {"process_noise": [0.1, 0.1]}),
+        ({"process_noise": [[0.1], [0.2]]}, {"process_noise": [[0.1], [0.2]]}),
     ],
 )
 def test_options_and_noise(options, expected):

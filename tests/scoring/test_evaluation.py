@@ -73,10 +73,10 @@ def test_instance_class_and_name_give_the_same_scores():
 
 def test_options_are_settings_and_part_of_the_identity():
     default = evaluate("ekf", ENV, episodes=1)
-    tuned = evaluate("ekf", ENV, episodes=1, options={"process_noise": 1e-2})
+    tuned = evaluate("ekf", ENV, episodes=1, options={"assumed_noise": 0.3})
     assert tuned[0]["estimator_hash"] != default[0]["estimator_hash"]
     assert tuned[0]["nrmse"] != default[0]["nrmse"]
-    assert tuned[0]["options"]["process_noise"] == 1e-2
+    assert tuned[0]["options"]["assumed_noise"] == 0.3
 
 
 def test_resuming_runs_only_what_is_missing(tmp_path):
@@ -139,7 +139,15 @@ def test_tensorboard_has_scalars_a_figure_and_hparams(tmp_path):
         ({"episodes": 1.5}, "episodes=1.5; expected a whole number"),
         ({"seed": -1}, "seed=-1; expected at least 0"),
         ({"estimator": PerEpisode(ReverseDuffing(), make=list, title=" mine")}, 'estimator=" mine'),
-        ({"options": {"gain": 1.0}}, "estimator 'ekf': .*unexpected keyword argument 'gain'"),
+        ({"options": {"gain": 1.0}}, "^setting 'gain'; expected one of assumed_noise, gate, "),
+        (
+            {"options": {"process_noise": 1e-3}},
+            "^setting 'process_noise'; expected one of assumed_noise, gate, huber, patience$",
+        ),
+        (
+            {"estimator": "open_loop", "options": {"noise_std": 0.1}},
+            "^setting 'noise_std'; expected no settings$",
+        ),
         ({"estimator": EKF(Academic())}, "model is Academic .*; the env plays ReverseDuffing"),
         ({"estimator": "pinn_obs_replay"}, "has to be trained first: pinnobs train pinn_obs"),
     ],
@@ -161,13 +169,19 @@ def test_the_reference_is_that_of_the_same_episodes():
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.25)
 
 
+def per_duration(system, per_sample):
+    """Return the standard deviation that process noise reaches over an episode: variances add."""
+    setup = system.setups["benchmark"]
+    return per_sample * np.sqrt(setup.duration / setup.dt)
+
+
 def test_the_reference_knows_of_noise_gaps_and_process_noise():
     """More noise, missing outputs and a disturbed state leave a filter that knows of it as near to
     the reference as it was; one whose condition is not in the model has none."""
     for condition, options in (
         ("noise5", {}),
         ("dropout50", {}),
-        ("process_noise1e-3", {"process_noise": 1e-3}),
+        ("process_noise1e-3", {"assumed_noise": per_duration(Academic, 1e-3)}),
     ):
         scored = evaluate(
             "ekf", "pinnobs/Academic-v0", episodes=40, condition=condition, options=options
@@ -193,6 +207,9 @@ def test_a_reference_below_the_error_of_a_step_is_none():
     """The motor forgets its past: without process noise the reference of its tail is 1e-8."""
     (row,) = evaluate("ekf", Game.of(LateMotor).system, episodes=1)
     assert row["reference_steady"] is None
-    known = {"condition": "process_noise1e-3", "options": {"process_noise": 1e-3}}
+    known = {
+        "condition": "process_noise1e-3",
+        "options": {"assumed_noise": per_duration(LateMotor, 1e-3)},
+    }
     (row,) = evaluate("ekf", Game.of(LateMotor).system, episodes=1, **known)
     assert row["nrmse_steady"] / row["reference_steady"] == pytest.approx(1, abs=0.4)

@@ -139,7 +139,7 @@ def test_it_is_the_inverse_of_the_information_of_all_outputs(system, condition):
     unknowns = source.condition.unknowns(source.system, source.setup)
     episodes = game.nominal.episodes(range(10))
     t, x = source.times[:-1], episodes.x[:-1]
-    flow = linearised(source.system, t, x, unknowns)
+    flow = linearised(source.system, source.noise, t, x, unknowns)
     std0 = np.sqrt(np.diag(source.record(episodes).prior.cov[0]))
     std = np.concatenate([std0, *[each.std for each in unknowns]])
     late, counts = t > source.setup.transient_end + 1e-9, source.system.observable(x)
@@ -195,7 +195,8 @@ def test_outputs_depend_on_unknowns_as_those_of_the_true_plant(
     system, setup = cls(), replace(cls.setups["benchmark"], duration=seconds)
     unknowns = parse_condition(condition).unknowns(system, setup)
     t, x0 = setup.times, np.array([np.add(setup.x0_low, setup.x0_high)]) / 2 + 0.3
-    flow = linearised(system, t, truth(system, x0, t, setup.truth_step), unknowns)
+    x = truth(system, x0, t, setup.truth_step)
+    flow = linearised(system, system.noise(), t, x, unknowns)
     effects = []
     for i, std in enumerate([s for each in unknowns for s in each.std]):
         d = 1e-3 * std * np.array([1.0, -1.0])
@@ -222,7 +223,7 @@ def test_late_outputs_are_those_of_earlier_states():
     (unknown,) = parse_condition("delay3").unknowns(system, setup)
     assert unknown.std == (3e-3,)
     t, x0, late = setup.times, np.array([[1.0, 2.0, 0.3, -0.2, 90.0]]), 1e-6
-    flow = linearised(system, t, truth(system, x0, t), (unknown,))
+    flow = linearised(system, system.noise(), t, truth(system, x0, t), (unknown,))
     earlier, later = (
         truth(system, x0, np.append(0.0, t[1:] + sign * late))[1:, 0, :2] for sign in (-1, 1)
     )

@@ -74,10 +74,15 @@ def test_settings_noise_and_model_are_part_of_the_estimator():
         EKF(system),
         EKF(system, noise_std=0.1),
         EKF(system, process_noise=1e-3),
+        EKF(system, assumed_noise=1e-3),
         EKF(replace(system, measured_input=True)),
     ]
     assert len({estimator_hash(each) for each in estimators}) == len(estimators)
     assert estimator_hash(EKF(system)) == estimator_hash(EKF(ReverseDuffing()))
+    # The same noise in other words: that of the benchmark is 0.02, and none of the plant.
+    assert estimator_hash(EKF(system)) == estimator_hash(
+        EKF(system, (0.02,), [[0.0, 0.0], [0.0, 0.0]])
+    )
 
 
 class Copied:

@@ -126,14 +126,14 @@ def test_the_table_has_every_estimators_settings_and_medians(played):
 def test_other_settings_of_one_estimator_are_other_lines(tmp_path):
     where = ["--system", "ReverseDuffing", "--condition", "dt5", "--out", str(tmp_path)]
     for noise, seed in ((0.01, 4), (0.1, 6)):
-        chosen = ["--set", f"process_noise={noise}", "--seed", f"{seed}"]
+        chosen = ["--set", f"assumed_noise={noise}", "--seed", f"{seed}"]
         assert main(["evaluate", *where, *chosen, "--episodes", "1"]) == 0
     # One more episode than there was: its picture is that of the one that is run now.
     assert main(["evaluate", *where, *chosen, "--episodes", "2"]) == 0
     shown = Shown(tmp_path / "tensorboard")
-    first, second = sorted(shown.runs, key=lambda run: shown.settings(run)["process_noise"])
-    assert shown.settings(first)["process_noise"] == 0.01
-    assert shown.settings(second)["process_noise"] == 0.1
+    first, second = sorted(shown.runs, key=lambda run: shown.settings(run)["assumed_noise"])
+    assert shown.settings(first)["assumed_noise"] == 0.01
+    assert shown.settings(second)["assumed_noise"] == 0.1
     stored = rows.read(tmp_path / "rows.jsonl")
     assert [rows.seed_of(row) for row in stored] == [4, 6, 7]
     assert shown.scalars(first, "episode/nrmse") == {4: pytest.approx(stored[0]["nrmse"])}

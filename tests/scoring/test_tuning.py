@@ -4,6 +4,7 @@ import sys
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+import numpy as np
 import pytest
 from linear import Linear
 from waiting import PATIENCE, heed_ctrl_c, until
@@ -74,7 +75,8 @@ def test_it_finds_the_best_and_passes_over_what_is_not_taken(tmp_path):
 def test_its_process_noise_is_that_of_the_plant(tmp_path):
     one = search(tmp_path, estimator=EKF, condition="process_noise1e-2", episodes=32)
     one.run(15, lambda tried: None)
-    assert 1 / 5 < one.best().settings["process_noise"] / 1e-2 < 5
+    # Over the duration of 20 samples, the variance of the plant's noise is 20 times as large.
+    assert 1 / 5 < one.best().settings["assumed_noise"] / (1e-2 * np.sqrt(20)) < 5
 
 
 def test_it_goes_on_with_what_was_tried(tmp_path):
@@ -177,7 +179,7 @@ def test_the_command_prints_settings_that_evaluate_takes(tmp_path, monkeypatch, 
     (line,) = (line for line in printed.splitlines() if line.startswith("--set "))
     assert main(["evaluate", *where, "--episodes", "1", "--out", "ev", *line.split()]) == 0
     (row,) = rows.read(tmp_path / "ev" / "rows.jsonl")
-    assert f"process_noise={row['options']['process_noise']:.4g}" in line
+    assert f"assumed_noise={row['options']['assumed_noise']:.4g}" in line
 
 
 def test_ctrl_c_keeps_what_was_tried_and_the_next_run_goes_on(tmp_path, monkeypatch):

@@ -106,8 +106,8 @@ def test_online_and_training_compute_the_same(name, variant):
     found = gain.run(record)
     ekf = EKF(system, gain.noise_std)
     scale, size = (torch.tensor(a)[:, None] for a in (np.array(system.scale), output_scale(system)))
-    Q, R = (torch.tensor(a) for a in ekf.tuning())
-    model = Model(system, variant, scale, size, Q)
+    R = torch.tensor(ekf.noise.R(0.0))
+    model = Model(system, variant, scale, size, ekf.noise)
     weights = [(torch.tensor(W), torch.tensor(b)) for W, b in gain.trained.layers]
     count = memory_size(variant, system.ny, 8)
     memory = torch.full((count, 4), 1.0 if variant == "kalman" else 0.0, dtype=torch.float64)
@@ -179,8 +179,8 @@ def test_the_gradient_is_that_of_the_linearised_rollout():
     """Where the model is linear, nothing is left out of the gradient."""
     system, count = Linear(), 3
     scale, one = torch.ones(2, 1, dtype=torch.float64), torch.ones(2, 1, dtype=torch.float64)
-    Q, R = (torch.tensor(a) for a in EKF(system, 0.1).tuning())
-    model = Model(system, "kalman", scale, one, Q)
+    noise = EKF(system, 0.1).noise
+    R, model = torch.tensor(noise.R(0.0)), Model(system, "kalman", scale, one, noise)
     rng = np.random.default_rng(0)
     y = torch.tensor(rng.standard_normal((6, 2, count)))
     last, way = (torch.tensor(0.1 * rng.standard_normal((8, 8))) for _ in range(2))
@@ -220,7 +220,7 @@ def test_on_a_linear_system_P_is_the_covariance_of_any_gain(monkeypatch):
     source, record, _ = played(Linear, range(1))
     system = source.system
     gain = gain_of(system, 1.0, noise_std=(0.1, 0.1))
-    gain = replace(gain, process_noise=0.0)
+    gain = replace(gain, assumed_noise=0.0)
     found = gain.run(record)
     H = system.h_jacobian(0.0, np.zeros(2), np.empty(0))
     F = model_step_jacobian(system, 0.0, 0.1, np.zeros((1, 2)))[1][0]
@@ -285,6 +285,22 @@ def test_training_is_not_worse_than_the_ekf_on_the_records_held_out():
     assert trained.noise_std == (0.02,)
     wild = replace(SMALL, learning_rate=50.0)
     assert train(system, wild, record=record.rows(slice(10))).loss <= 1
+
+
+def test_records_held_out_are_filtered_with_the_process_noise_told(monkeypatch):
+    gains = []
+
+    def spy(*told, **options):
+        gains.append(PinnGain(*told, **options))
+        return gains[-1]
+
+    monkeypatch.setattr("trainers.pinn_gain.held_out.PinnGain", spy)
+    system, record = short_record()
+    PinnGainTrainer(system, SMALL, record=record, process_noise=(0.0, 0.3))
+    expected = EKF(system, process_noise=(0.0, 0.3)).noise.L(0.0)
+    assert len(gains) > 1
+    for gain in gains:
+        np.testing.assert_array_equal(gain.noise.L(0.0), expected)
 
 
 def test_training_sees_a_record_alone(monkeypatch):

@@ -75,7 +75,7 @@ def test_a_list_is_as_good_as_a_tuple():
         ("luenberger", {"gain": "ab"}, "gain='ab'; expected None or a list of lists of numbers"),
         ("sliding_mode", {"layer": None}, "layer=None; expected a number"),
         ("batch_least_squares", {"shortest": 2.0}, "shortest=2.0; expected a whole number"),
-        ("ukf", {"process_noise": "1"}, "process_noise='1'; expected a number"),
+        ("ukf", {"assumed_noise": "1"}, "assumed_noise='1'; expected a number"),
     ],
 )
 def test_settings_of_estimators_have_the_types_of_their_fields(estimator, options, message):
@@ -86,7 +86,7 @@ def test_settings_of_estimators_have_the_types_of_their_fields(estimator, option
 @pytest.mark.parametrize("noise", [-1.0, np.nan, np.inf, "ab", (0.1, 0.2)])
 def test_a_trainer_refuses_a_noise_level_that_is_none(noise):
     trainer, game = TRAINERS.resolve("pinn_obs"), Game.of("Academic")
-    with pytest.raises(ValueError, match=r"^noise_std(=| has shape).*; expected"):
+    with pytest.raises(ValueError, match=r"^noise_std of Academic(=| has shape).*; expected"):
         trainer(
             game.source.system, trainer.configured({}), record=game.record([0]), noise_std=noise
         )

@@ -94,7 +94,8 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
             )
         self.data = Data.of(system, record, smoothed, learned)
         facts = self.facts(loss=1.0, seed=config.seed)
-        self.held_out = HeldOut(self.model, Data.of(system, record, smoothed, held), facts)
+        held_out = Data.of(system, record, smoothed, held)
+        self.held_out = HeldOut(self.model, held_out, facts, self.levels[1])
         self.best: BestGain | None = None
         self.stuck = False
         self.loss, self.gradient, self.latest = math.nan, math.nan, math.nan

@@ -10,6 +10,7 @@ import numpy as np
 from pinnobs_gym.estimation.learned.gain_network import Variant, shapes
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
+from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Prior
 from trainers.pinn_gain.rollout import Model
 from trainers.pinn_gain.streams import Data
@@ -27,10 +28,14 @@ class HeldOut:
         model: the model and the variant of the network.
         data: the smoothed records.
         facts: training metadata; their noise is that of level one.
+        process_noise: the process noise given to the trainer.
     """
 
-    def __init__(self, model: Model, data: Data, facts: Mapping[str, Any]) -> None:
+    def __init__(
+        self, model: Model, data: Data, facts: Mapping[str, Any], process_noise: Level | None
+    ) -> None:
         self._model, self._data, self._facts = model, data, facts
+        self._process_noise = process_noise
         std = np.sqrt(np.einsum("iib->i", model.noise.R(0.0)))
         # Outputs of every record at every noise level.
         count = len(data.x)
@@ -58,7 +63,8 @@ class HeldOut:
         """Return the root mean square scaled errors (windows, rows)."""
         data, rows = self._data, self._rows
         trained = TrainedGain(**self._facts, layers=layers, variant=variant)
-        gain = PinnGain(self._model.system, trained.noise_std, trained=trained)
+        told = trained.noise_std, self._process_noise
+        gain = PinnGain(self._model.system, *told, trained=trained)
         R = np.eye(len(self._std))[..., None] * self._std**2
         state = gain.begin(Prior(data.mean[rows], data.cov[rows]), R)
         square = np.empty((len(data.t), len(rows)))

@@ -187,10 +187,6 @@ def _check_settings(
         if cls.needs_training or cls.trains_on_record:
             cls.trainer_config(training)
             return
-        known = sorted(f.name for f in cls.setting_fields() if f.init)
-        for setting in entry.settings:
-            if setting not in known:
-                raise ValueError(f"setting {setting!r}; expected one of {', '.join(known)}")
         cls.for_setup(game.source.system, game.source.setup, **entry.settings)
     except (ValueError, TypeError) as error:
         message = f"settings of {entry.name!r}: {error}"

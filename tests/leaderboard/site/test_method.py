@@ -21,11 +21,11 @@ def test_commands_name_what_was_played():
 
 
 def test_methods_name_settings_and_dates():
-    options = {"gate": None, "process_noise": 1e-4, "config": {"layers": 3}}
+    options = {"gate": None, "assumed_noise": 3e-3, "config": {"layers": 3}}
     group = [row(0, options=options), row(1, options=options, date="2030-01-05T00:00:00")]
     (contender,) = contenders(runs_of(group))
     found = method.estimator_method(contender)
-    assert found.settings == "process_noise=0.0001, config: layers=3"
+    assert found.settings == "assumed_noise=0.003, config: layers=3"
     assert (found.episodes, found.dates) == (2, "2030-01-02 to 2030-01-05")
     versions = method.versions([*group, row(versions={"numpy": "1", "torch": "3"})])
     assert versions == {"numpy": "1, 2", "torch": "3"}

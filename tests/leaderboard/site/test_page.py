@@ -69,7 +69,7 @@ def test_the_page_tells_how_scores_were_made(site):
         "--systems ReverseDuffing --estimators ekf strong_tracking_ekf --condition noise5" in text
     )
     assert f"python {sys.version.split()[0]}" in text
-    assert "process_noise=0.0001" in text
+    assert "assumed_noise=0.003" in text
     assert "A conservative oscillator" in text
 
 
