@@ -33,16 +33,27 @@ def jacobian(system: System, name: str, t: Array, x: Array, u: Array) -> Array:
     At a jump or a kink the derivative in NumPy is that of one side, or for `maximum` and `minimum`
     the mean of both sides; a jump itself contributes nothing. Where the function cannot be traced,
     because it branches on numbers or calls functions that are not in
-    `pinnobs_gym.simulation.symbolic.FUNCTIONS`, the log says so once, and the derivative is found
+    `pinnobs_gym.simulation.expressions.FUNCTIONS`, the log says so once, and the derivative is found
     by `central_differences`.
     """
-    if is_torch_array(x):
-        return _by_torch(system, name, t, x, u)
-    x = np.asarray(x)
+    if not isinstance(x, np.ndarray):
+        if is_torch_array(x):
+            return _by_torch(system, name, t, x, u)
+        x = np.asarray(x)
     if x.dtype.kind != "f":
         x = x.astype(float)
     with np.errstate(all="ignore"):  # both branches of a choice are evaluated
         return _function(system, name, t, x, u)(system, t, x, u)
+
+
+def traced_jacobian(system: System, name: str, t: Array, x: np.ndarray, u: Array) -> Any:
+    """Return the Jacobian of the traced equations of ``f`` or ``h``, (..., m, nx), whether the
+    system has one of its own or not, or None if they cannot be traced."""
+    with np.errstate(all="ignore"):
+        try:
+            return _traced(system, name, t, x, u)(system, t, x, u)
+        except ValueError:
+            return None
 
 
 def central_differences(
@@ -65,7 +76,7 @@ def central_differences(
     """
     chosen = list(range(x.shape[-1]) if columns is None else columns)
     count, size = len(chosen), np.asarray(scale, dtype=float)
-    points = np.repeat(x[None], 2 * count, axis=0)
+    points = np.repeat(x[None].astype(float), 2 * count, axis=0)
     for i, j in enumerate(chosen):
         step = _STEP * np.maximum(abs(x[..., j]), size[j])
         points[i, ..., j] += step
@@ -74,7 +85,7 @@ def central_differences(
     # The distance between the points as they were rounded
     width = [points[i, ..., j] - points[count + i, ..., j] for i, j in enumerate(chosen)]
     slopes = (value[:count] - value[count:]) / np.stack(width)[..., None]
-    return np.moveaxis(slopes, 0, -1)
+    return np.moveaxis(slopes, 0, -1).astype(x.dtype, copy=False)
 
 
 _latest: dict[tuple[int, str], tuple[weakref.ref[System], Function]] = {}
@@ -112,15 +123,23 @@ def _traced(system: System, name: str, t: Array, x: np.ndarray, u: Array) -> Fun
 
     code = traced_code(system, name)
     own = np.asarray(getattr(system, name)(t, x, u))
-    value, slopes = code.value(system, t, x, u), abs(code.jacobian(system, t, x, u))
+    try:
+        value, slopes = code.value(system, t, x, u), abs(code.jacobian(system, t, x, u))
+    except Exception as error:  # such as Python's own division by zero
+        raise ValueError(f"{type(error).__name__}: {error}") from error
     scale = vector(system.scale, system.nx, "scale")
     # Rounding errors are relative to the terms of a value, of which the value may be a difference.
     terms = (slopes * np.maximum(abs(x), scale)[..., None, :]).sum(axis=-1)
     allowed = np.sqrt(np.finfo(x.dtype).eps) * (abs(own) + terms)
-    same = (own == value) | ~(abs(own - value) > allowed)
-    if own.shape != value.shape or not (same & (np.isnan(own) == np.isnan(value))).all():
+    if own.shape != value.shape or not _same(own, value, allowed):
         raise ValueError("the traced equations give other values")
     return code.jacobian
+
+
+def _same(a: np.ndarray, b: np.ndarray, allowed: np.ndarray) -> bool:
+    """Return whether the differences are at most those allowed; NaN and infinities are equal."""
+    both_nan = np.isnan(a) & np.isnan(b)
+    return bool((both_nan | (a == b) | (abs(a - b) <= allowed) | np.isnan(allowed)).all())
 
 
 def _by_differences(name: str) -> Function:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -60,7 +61,8 @@ class Printer:
             return str(e)
         if e.is_Number or e.is_NumberSymbol:
             value = float(e)
-            return repr(value) if value >= 0 else f"({value!r})"
+            text = repr(value) if math.isfinite(value) else f"float('{value!r}')"
+            return f"({text})" if value < 0 else text
         for kind, method in _METHODS.items():
             if isinstance(e, kind):
                 return method(self, e)

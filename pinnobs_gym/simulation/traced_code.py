@@ -81,9 +81,10 @@ class Trace:
         self.tape = Tape(self.x)
         kind = self.tape.kind()
         plant = with_symbols(system, parameters, properties, kind)
-        given = (as_array(part, kind) for part in (self.t, self.x, self.u))
-        size = {"f": system.nx, "h": system.ny}[name]
-        self.values = list(column(getattr(plant, name)(*given), size))
+        # One row rather than none, so that sums over the states are arrays, too.
+        given = (as_array(part, kind) for part in (self.t, [self.x], [self.u]))
+        (value,), size = getattr(plant, name)(*given), {"f": system.nx, "h": system.ny}[name]
+        self.values = list(column(value, size))
         """The components."""
 
     def jacobian(self) -> list[list[sympy.Expr]]:

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 from pinnobs_gym.cli import main
 from pinnobs_gym.envs.game import Game
@@ -246,18 +247,19 @@ def test_a_model_in_numpy_runs_the_estimators_that_need_no_torch() -> None:
     probe(NumPyOnly)
     system, setup = NumPyOnly.configured()
     given = record(system, setup)
-    for kind in (UKF, ParticleFilter):
+    for kind in (UKF, ParticleFilter, EKF):
         assert np.isfinite(kind.for_setup(system, setup).run(given).xhat).all()
     assert np.isfinite(EKF.for_setup(WithJacobian(), setup).run(given).xhat).all()
 
 
 def test_what_needs_torch_says_so_in_one_line() -> None:
-    system, setup = NumPyOnly.configured()
+    """Trainers differentiate torch tensors."""
     where = rf"^NumPyOnly\.f \(test_probe\.py, line {line_of(NumPyOnly)}\) raises .*"
+    x, t, u = torch.ones(3, 2, requires_grad=True), torch.zeros(3), torch.zeros(3, 0)
     with pytest.raises(
         ModelError, match=f"{where}torch tensors, which f_jacobian needs; "
     ) as caught:
-        EKF.for_setup(system, setup).run(record(system, setup))
+        NumPyOnly().f_jacobian(t, x, u)
     assert "\n" not in str(caught.value)
 
 
