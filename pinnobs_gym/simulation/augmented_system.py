@@ -12,6 +12,7 @@ from array_api_compat import array_namespace
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.system import Array, System, is_number, stack
 
+
 @dataclass(frozen=True)
 class Unknown:
     """A constant of which only a mean and a standard deviation are known."""

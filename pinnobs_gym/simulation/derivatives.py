@@ -33,8 +33,8 @@ def jacobian(system: System, name: str, t: Array, x: Array, u: Array) -> Array:
     At a jump or a kink the derivative in NumPy is that of one side, or for `maximum` and `minimum`
     the mean of both sides; a jump itself contributes nothing. Where the function cannot be traced,
     because it branches on numbers or calls functions that are not in
-    `pinnobs_gym.simulation.expressions.FUNCTIONS`, the log says so once, and the derivative is found
-    by `central_differences`.
+    `pinnobs_gym.simulation.expressions.FUNCTIONS`, the log says so once, and the derivative is
+    found by `central_differences`.
     """
     if not isinstance(x, np.ndarray):
         if is_torch_array(x):

@@ -9,7 +9,6 @@ import numpy as np
 import sympy
 from sympy.logic.boolalg import BooleanAtom, BooleanFunction
 
-
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(sympy, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
     **{name: getattr(sympy, name) for name in ("exp", "log", "sqrt", "sign", "floor")},

@@ -79,7 +79,7 @@ class Printer:
             args = [f"np.{name}({args[0]}, {args[1]})", *args[2:]]
         return f"np.{name}({', '.join(args)})"
 
-    def _sum(self, e: sympy.Add) -> str:
+    def _sum(self, e: Any) -> str:
         text = ""
         for term in self._scalars_first(e.args):
             negative = term.could_extract_minus_sign()
@@ -87,7 +87,7 @@ class Printer:
             text += f" {'-' if negative else '+'} {part}" if text else f"{'-' * negative}{part}"
         return f"({text})"
 
-    def _product(self, e: sympy.Mul) -> str:
+    def _product(self, e: Any) -> str:
         sign = ""
         if e.args[0] == -1:
             sign, e = "-", -e
@@ -110,7 +110,7 @@ class Printer:
             text += f" / ({under})"
         return f"({text})"
 
-    def _power(self, e: sympy.Pow) -> str:
+    def _power(self, e: Any) -> str:
         base, exponent = e.args
         if exponent.is_Number and exponent.is_negative:
             return f"(1.0 / {self.code(1 / e)})"
@@ -130,7 +130,7 @@ class Printer:
         half = self._named(self._whole_power(name, n // 2))
         return f"{half} * {half}"
 
-    def _piecewise(self, e: sympy.Piecewise) -> str:
+    def _piecewise(self, e: Any) -> str:
         text = "np.nan"
         for value, condition in reversed(e.args):
             part = self.code(value)
@@ -141,11 +141,11 @@ class Printer:
             )
         return text
 
-    def _pieces(self, e: Pieces) -> str:
+    def _pieces(self, e: Any) -> str:
         x, number, order = e.args
         return f"table{number}_{order}({self.code(x)})"
 
-    def _step(self, e: sympy.Heaviside) -> str:
+    def _step(self, e: Any) -> str:
         return f"np.heaviside({self.code(e.args[0])}, 0.5)"
 
     def _named(self, code: str) -> str:
@@ -168,10 +168,11 @@ class Printer:
         if e.is_Mul:
             return any(map(self._is_gate, e.args))
         if isinstance(e, sympy.Piecewise):
-            return any(value == 0 for value, _ in e.args)
+            branches: Any = e.args
+            return any(value == 0 for value, _ in branches)
         if isinstance(e, Choice):
             return 0 in e.args[1:]
-        return isinstance(e, sympy.Heaviside) or e in self._gates
+        return e in self._gates or isinstance(e, sympy.Heaviside)
 
 
 _METHODS: dict[Any, Callable[[Printer, Any], str]] = {

@@ -8,7 +8,7 @@ that all expressions stay small.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import sympy
@@ -19,71 +19,78 @@ _LARGEST = 12
 """Number of operations of an expression without a name."""
 
 
-class RealAbs(sympy.Function):
+class _Real(sympy.Function):
+    """A function of real numbers."""
+
+    if TYPE_CHECKING:
+        args: Any  # pyright: ignore  # expressions, not of the base class alone
+
+
+class RealAbs(_Real):
     """The size of a real number. SymPy's own allows complex ones, even in its derivative."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         return RealSign(*self.args)
 
 
-class RealSign(sympy.Function):
+class RealSign(_Real):
     """The sign of a real number. The derivative of SymPy's own has an impulse at the jump."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         return sympy.Integer(0)
 
 
-class RealFloor(sympy.Function):
+class RealFloor(_Real):
     """The largest whole number that is not above a real one."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         return sympy.Integer(0)
 
 
-class Maximum(sympy.Function):
+class Maximum(_Real):
     """The larger of two numbers; where they are equal, its derivative is the mean of theirs."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         first, second = self.args if argindex == 1 else self.args[::-1]
         return sympy.Heaviside(first - second)
 
 
-class Minimum(sympy.Function):
+class Minimum(_Real):
     """The smaller of two numbers, with a derivative as that of `Maximum`."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         first, second = self.args if argindex == 1 else self.args[::-1]
         return sympy.Heaviside(second - first)
 
 
-class Power(sympy.Function):
+class Power(_Real):
     """A power whose exponent is no number. SymPy's own derivative divides by the base, which may be
     zero."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         base, exponent = self.args
         if argindex == 1:
             return exponent * Power(base, exponent - 1)
         return Power(base, exponent) * sympy.log(base)
 
 
-class Choice(sympy.Function):
+class Choice(_Real):
     """One of two expressions, by a condition."""
 
 
-class Pieces(sympy.Function):
+class Pieces(_Real):
     """A derivative of a table at x: arguments x, the table's number, and the order."""
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> Any:
         x, number, order = self.args
         return Pieces(x, number, order + 1)
 
 
-def _power(a: Any, b: Any) -> sympy.Expr:
+def _power(a: Any, b: Any) -> Any:
     return Power(a, b) if getattr(b, "free_symbols", None) else a**b
 
 
-_REAL = FUNCTIONS | {
+_FUNCTIONS = FUNCTIONS | {
     "absolute": RealAbs,
     "sign": RealSign,
     "floor": RealFloor,
@@ -104,13 +111,13 @@ class Tape:
 
     def __init__(self, x: Sequence[sympy.Symbol]) -> None:
         self.x = list(x)
-        self.definitions: dict[sympy.Symbol, sympy.Expr] = {}
+        self.definitions: dict[sympy.Symbol, Any] = {}
         """Expressions by name, in an order in which they can be computed."""
         self.tables: list[tuple[np.ndarray, np.ndarray]] = []
         """Knots and coefficients, (n + 1,) and (degree + 1, n + 1), of the tables."""
-        self._names: dict[sympy.Expr, sympy.Symbol] = {}
-        self._partials: dict[tuple[Any, Any], sympy.Expr] = {}
-        self._slopes: dict[tuple[sympy.Symbol, sympy.Symbol], sympy.Expr] = {}
+        self._names: dict[Any, sympy.Symbol] = {}
+        self._partials: dict[tuple[Any, Any], Any] = {}
+        self._slopes: dict[tuple[Any, Any], Any] = {}
         for symbol in self.x:
             self._slopes[symbol, symbol] = sympy.Integer(1)
 
@@ -120,11 +127,11 @@ class Tape:
 
         class Traced(Expressions):
             functions: ClassVar[Mapping[str, Callable[..., Any]]] = {
-                name: tape._naming(function) for name, function in _REAL.items()
+                name: tape._naming(function) for name, function in _FUNCTIONS.items()
             }
 
             @classmethod
-            def choice(cls, condition: Any, yes: Any, no: Any) -> sympy.Expr:
+            def choice(cls, condition: Any, yes: Any, no: Any) -> Any:
                 return tape.named(Choice(condition, yes, no))
 
             @classmethod
@@ -144,7 +151,7 @@ class Tape:
             return self.named(expression)
         return expression
 
-    def named(self, expression: sympy.Expr) -> sympy.Expr:
+    def named(self, expression: Any) -> Any:
         """Return the name of an expression; conditions, numbers and symbols need none."""
         if isinstance(expression, TRUTHS) or expression.is_Atom:
             return expression
@@ -155,7 +162,7 @@ class Tape:
             self._differentiate(symbol, expression)
         return self._names[expression]
 
-    def slope(self, expression: sympy.Expr, x: sympy.Symbol) -> sympy.Expr:
+    def slope(self, expression: Any, x: sympy.Symbol) -> Any:
         """Return the total derivative of an expression by a component of the state."""
         if isinstance(expression, Choice):
             condition, *values = expression.args
@@ -170,7 +177,7 @@ class Tape:
                 terms.append(self._partials[expression, symbol] * inner)
         return sympy.Add(*terms)
 
-    def _differentiate(self, symbol: sympy.Symbol, expression: sympy.Expr) -> None:
+    def _differentiate(self, symbol: sympy.Symbol, expression: Any) -> None:
         """Define the derivatives of a name that are not zero."""
         for i, x in enumerate(self.x):
             slope = self.slope(expression, x)
@@ -193,7 +200,7 @@ class Tape:
         return len(self.tables) - 1
 
 
-def _real(expression: sympy.Expr) -> sympy.Expr:
+def _real(expression: Any) -> Any:
     """Return an expression without SymPy's functions of complex numbers, which may come about when
     it simplifies, as in √a²."""
     for theirs, own in ((sympy.Abs, RealAbs), (sympy.sign, RealSign)):

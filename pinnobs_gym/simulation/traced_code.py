@@ -74,7 +74,8 @@ class Trace:
         self.u = [_symbol(f"u{i}") for i in range(system.nu)]
         numbers = [n for n, value in system.parameters.items() if is_number(value)]
         parameters, properties = (
-            {n: _symbol(f"of_{n}") for n in names} for names in (numbers, numeric_properties(system))
+            {n: _symbol(f"of_{n}") for n in names}
+            for names in (numbers, numeric_properties(system))
         )
         self.numbers = parameters | properties
         """Symbols of numbers of the system, by the attribute's name."""
@@ -84,14 +85,14 @@ class Trace:
         # One row rather than none, so that sums over the states are arrays, too.
         given = (as_array(part, kind) for part in (self.t, [self.x], [self.u]))
         (value,), size = getattr(plant, name)(*given), {"f": system.nx, "h": system.ny}[name]
-        self.values = list(column(value, size))
+        self.values: list[Any] = column(value, size).flat()
         """The components."""
 
-    def jacobian(self) -> list[list[sympy.Expr]]:
+    def jacobian(self) -> list[list[Any]]:
         """Return the derivatives of the components by the state, as rows."""
         return [[self.tape.slope(value, x) for x in self.x] for value in self.values]
 
-    def compiled(self, rows: list[list[sympy.Expr]], kind: str) -> Callable[..., Any]:
+    def compiled(self, rows: list[list[Any]], kind: str) -> Callable[..., Any]:
         """Return the function of `source`."""
         names: dict[str, Any] = {"np": np, "matrix": matrix, "stack": stack}
         for i, (knots, coefficients) in enumerate(self.tape.tables):
@@ -101,7 +102,7 @@ class Trace:
         exec(compile(self.source(rows, kind), "<traced>", "exec"), names)
         return names["function"]
 
-    def source(self, rows: list[list[sympy.Expr]], kind: str) -> str:
+    def source(self, rows: list[list[Any]], kind: str) -> str:
         """Return the code of a function of the system, t, x and u, whose value is a matrix of these
         rows or, if ``kind`` is ``vector``, of the components of the only one."""
         steps, flat = self._shared([entry for row in rows for entry in row])
@@ -118,12 +119,12 @@ class Trace:
         lines = [f"{s} = {value}" for s, value in given if s in used] + printer.lines
         width = len(rows[0])
         made = [", ".join(entries[i : i + width]) for i in range(0, len(entries), width)]
-        result = f"stack(x, {made[0]})" if kind == "vector" else f"matrix(x, [[{'], ['.join(made)}]])"
+        result = (
+            f"stack(x, {made[0]})" if kind == "vector" else f"matrix(x, [[{'], ['.join(made)}]])"
+        )
         return "\n    ".join(["def function(system, t, x, u):", *lines, f"return {result}"])
 
-    def _shared(
-        self, wanted: list[sympy.Expr]
-    ) -> tuple[dict[sympy.Symbol, sympy.Expr], list[sympy.Expr]]:
+    def _shared(self, wanted: list[Any]) -> tuple[dict[sympy.Symbol, Any], list[Any]]:
         """Return the steps that some expressions need, in the order in which they can be computed,
         and the expressions, all with common subexpressions taken out."""
         needed, steps = _symbols_of(wanted), []
@@ -132,12 +133,14 @@ class Trace:
                 steps.append((symbol, expression))
                 needed |= expression.free_symbols
         steps.reverse()
-        common, reduced = sympy.cse(
+        taken: Any = sympy.cse(
             [e for _, e in steps] + wanted, sympy.numbered_symbols("c", real=True)
         )
-        waiting, ordered = dict(common), {}
+        common, reduced = taken
+        waiting: dict[sympy.Symbol, Any] = dict(common)
+        ordered: dict[sympy.Symbol, Any] = {}
 
-        def define(expression: sympy.Expr) -> None:
+        def define(expression: Any) -> None:
             """Define the common subexpressions in an expression before it."""
             for symbol in sorted(expression.free_symbols & waiting.keys(), key=str):
                 part = waiting.pop(symbol, None)
@@ -153,7 +156,7 @@ class Trace:
         return ordered, reduced[len(steps) :]
 
 
-def _symbols_of(expressions: list[sympy.Expr]) -> set[Any]:
+def _symbols_of(expressions: list[Any]) -> set[Any]:
     return {symbol for expression in expressions for symbol in expression.free_symbols}
 
 

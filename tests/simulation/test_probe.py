@@ -269,5 +269,5 @@ def test_the_scale_of_an_output_in_numpy() -> None:
         Sound.setups["benchmark"], x0_low=(0.0, 0.0), x0_high=(0.0, 0.0), noise_std=0.0
     )
     cls = type("AtZero", (HInNumPy,), {"setups": {"benchmark": at_zero}})
-    std = np.sqrt(UKF.for_setup(cls(), at_zero).output_variance)
+    std = np.sqrt(UKF.for_setup(cls(), at_zero).noise.R(0.0)[0, 0])
     assert std == pytest.approx([2e-3], rel=1e-8)
