@@ -287,6 +287,9 @@ def _home_of(base: str, name: str) -> str:
     """Return the module that ``from base import name`` takes the name from."""
     if base == _FACE and name in pinnobs_gym.__all__:
         return getattr(getattr(pinnobs_gym, name), "__module__", base)
+    spec = _spec(base)
+    if spec is None or spec.submodule_search_locations is None:
+        return base  # no package; asking for a module in it would import it
     return f"{base}.{name}" if name and _spec(f"{base}.{name}") else base
 
 

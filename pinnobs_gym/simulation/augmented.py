@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknown, is_number
+from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknown
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
-from pinnobs_gym.simulation.system import PoorPrior, Setup, System, vector
+from pinnobs_gym.simulation.system import PoorPrior, Setup, System, is_number, vector
 
 
 def augmented(

@@ -9,15 +9,8 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.system import Array, System, stack
-
-_STEP = float(np.cbrt(np.finfo(float).eps))
-"""Relative step of the differences; the cube root of the rounding error minimises their error."""
-
-
-def is_number(value: object) -> bool:
-    """Return whether a value is a number, truth values aside."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+from pinnobs_gym.simulation.derivatives import central_differences
+from pinnobs_gym.simulation.system import Array, System, is_number, stack
 
 
 @dataclass(frozen=True)
@@ -121,20 +114,17 @@ class Augmented(System):
         """Return the derivatives of the plant's rates or outputs, (..., m, nx): its own Jacobian
         (..., m, n), central differences by each parameter, and zero by the other constants.
 
-        The error of the differences is about 1e-10 of the function's value, relative to the larger
-        of the parameter and its standard deviation.
+        For the error of the differences see `central_differences`.
         """
         size, n = np.shape(own)[-2], self.plant.nx
         result = np.zeros_like(own, shape=(*x.shape[:-1], size, self.nx))
         result[..., :n] = own
-        for j in range(n, n + len(self.constants[_PARAMETER])):
-            step = _STEP * np.maximum(abs(x[..., j]), self.scale[j])
-            ends = []
-            for sign in (1, -1):
-                shifted = x.copy(order="K")
-                shifted[..., j] += sign * step
-                ends.append(function(t, shifted, u)[..., :size])
-            result[..., j] = (ends[0] - ends[1]) / (2 * step)[..., None]
+        columns = range(n, n + len(self.constants[_PARAMETER]))
+        if columns:
+            slopes = central_differences(
+                lambda x: function(t, x, u)[..., :size], x, self.scale, columns
+            )
+            result[..., columns] = slopes
         return result
 
     def admissible(self, x0: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Self, TypeAlias
 
@@ -196,14 +196,18 @@ class System(ABC):
         return xp.zeros((*t.shape, self.nu), dtype=t.dtype)
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
-        """Return ∂f/∂x, (..., nx, nx), by forward-mode automatic differentiation unless
-        overridden."""
-        return _jacobian(self, "f", t, x, u)
+        """Return ∂f/∂x, (..., nx, nx); unless overridden, that of
+        `pinnobs_gym.simulation.derivatives.jacobian`."""
+        from pinnobs_gym.simulation.derivatives import jacobian
+
+        return jacobian(self, "f", t, x, u)
 
     def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
-        """Return ∂h/∂x, (..., ny, nx), by forward-mode automatic differentiation unless
-        overridden."""
-        return _jacobian(self, "h", t, x, u)
+        """Return ∂h/∂x, (..., ny, nx); unless overridden, that of
+        `pinnobs_gym.simulation.derivatives.jacobian`."""
+        from pinnobs_gym.simulation.derivatives import jacobian
+
+        return jacobian(self, "h", t, x, u)
 
     def admissible(self, x0: Array) -> Array:
         """Return which states (..., nx) of a setup's box are valid initial states: bool (...)."""
@@ -374,6 +378,11 @@ def vector(value: Sequence[float] | np.ndarray | float, size: int, name: str) ->
     return array
 
 
+def is_number(value: object) -> bool:
+    """Return whether a value is a number, truth values aside."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
 def stack(like: Array, *components: Array | float) -> Array:
     """Return the array (..., n) of n components, each a number or an array that broadcasts to the
     batch (...) of ``like`` (..., nx). In NumPy the result has the memory order of ``like``, so that
@@ -422,33 +431,6 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
     )
 
 
-def _jacobian(system: System, name: str, t: Array, x: Array, u: Array) -> Array:
-    """Return ∂f/∂x or ∂h/∂x, (..., m, nx), by forward-mode differentiation in torch, as an array of
-    the library of x."""
-    import torch
-
-    from pinnobs_gym.simulation.probe import probe_torch
-
-    probe_torch(type(system), name)
-    function: Callable[..., Array] = getattr(system, name)
-    given = torch.as_tensor(x)
-    now, inputs = [
-        other
-        if isinstance(other, torch.Tensor)
-        else torch.tensor(other, dtype=given.dtype, device=given.device)
-        for other in (t, u)
-    ]
-    nx = given.shape[-1]
-    # One forward derivative per unit vector, all in one batch.
-    directions = torch.eye(nx, dtype=given.dtype, device=given.device)
-    directions = directions.reshape(nx, *([1] * (given.ndim - 1)), nx)
-    repeated = given.expand(nx, *given.shape).clone()
-    tangents = directions.expand(repeated.shape).clone()
-    columns = torch.func.jvp(lambda x: function(now, x, inputs), (repeated,), (tangents,))[1]
-    jacobian = torch.movedim(columns, 0, -1)
-    return jacobian if isinstance(x, torch.Tensor) else jacobian.numpy()
-
-
 _TIMES = 9
 """Number of times, evenly spread over an episode, at which `output_scale` evaluates the output."""
 _MOST_DRAWS = 100
@@ -469,10 +451,11 @@ def output_scale(system: System) -> np.ndarray:
     x = np.tile(initial_states(system, setup, _STATES), (_TIMES, 1))
     u = np.asarray(system.input(t))
     if type(system).h_jacobian is System.h_jacobian:
-        # Central differences: h may be written in NumPy only, and importing torch takes long.
-        steps = 6e-6 * np.diag(scale)
-        pairs = [(np.asarray(system.h(t, x + s, u)), system.h(t, x - s, u)) for s in steps]
-        changes = np.stack([(ahead - behind) / 1.2e-5 for ahead, behind in pairs], axis=-1)
+        from pinnobs_gym.simulation.derivatives import central_differences
+
+        # Few evaluations: differences take less time than it takes to import SymPy.
+        slopes = central_differences(lambda x: system.h(t, x, u), x, scale)
+        changes = slopes * scale
     else:
         changes = system.h_jacobian(t, x, u) * scale
     size = abs(changes).max(axis=(0, -1))

@@ -48,7 +48,8 @@ def table(
     parts: tuple[Any, Any] = _pieces(_numbers(points, "points"), _numbers(values, "values"), method)
     knots, coefficients = parts
     if isinstance(x, np.ndarray) and x.dtype == object:
-        return _of_symbols(x, knots, coefficients)
+        symbols: Any = x
+        return symbols.pieces(knots, coefficients)
     if isinstance(x, np.ndarray | np.generic | int | float):
         xp, x = np, np.asarray(x)
         piece = np.searchsorted(knots[1:], x, side="right")
@@ -61,25 +62,24 @@ def table(
         )
         # Count the points that are not above x. torch's search warns of views such as x[..., 0].
         piece = xp.sum(xp.astype(x[..., None] >= knots[1:], xp.int64), axis=-1)
+    return pieces(x, knots, coefficients, piece)
+
+
+def pieces(x: Any, knots: Any, coefficients: Any, piece: Any) -> Any:
+    """Return piecewise polynomials at x.
+
+    Args:
+        x: any shape.
+        knots: as from `_pieces`, of the array library of x.
+        coefficients: as from `_pieces`, of the array library of x.
+        piece: the number of points that are not above x, of its shape.
+    """
     # An index without axes would be read as a number, which torch.func.vmap does not allow.
     at = piece[None]
     s = x - knots[at][0]
     *lower, y = (part[at][0] for part in coefficients)
     for part in reversed(lower):  # Horner's scheme
         y = part + s * y
-    return y
-
-
-def _of_symbols(x: Array, knots: np.ndarray, coefficients: np.ndarray) -> Array:
-    """Return y(x) of symbols, by a choice between the pieces from the last to the first."""
-    starts = knots.tolist()
-    pieces = [
-        sum(factor * (x - start) ** power for power, factor in enumerate(row) if factor)
-        for start, row in zip(starts, coefficients.T.tolist(), strict=True)
-    ]
-    y = pieces[-1]
-    for end, piece in zip(starts[:0:-1], pieces[-2::-1], strict=True):
-        y = np.where(x < end, piece, y)
     return y
 
 

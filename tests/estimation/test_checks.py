@@ -93,6 +93,15 @@ class WrongJacobian(Pendulum):
 
 
 @dataclass(frozen=True)
+class SlightlyWrongJacobian(Pendulum):
+    """The error is within that of central differences, whose size is that of the row."""
+
+    def f_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        damping = self.damping * (1 + 2e-6)
+        return matrix(x, [[0.0, 1.0], [-np.cos(x[..., 0]), -damping]])
+
+
+@dataclass(frozen=True)
 class WrongOutputJacobian(Pendulum):
     def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[1.0, 0.0]])
@@ -274,6 +283,7 @@ def test_a_prior_mean_without_derivative_is_warned_of() -> None:
     ("cls", "check", "says"),
     [
         (WrongJacobian, "f_jacobian", r"entry \[1, 1\] .* central differences"),
+        (SlightlyWrongJacobian, "f_jacobian", r"entry \[1, 1\] .* the traced equations"),
         (WrongOutputJacobian, "h_jacobian", r"entry \[0, 0\]"),
         (BlindToTime, "h_jacobian", r"entry \[0, 0\]"),
         (BlindToInput, "h_jacobian", r"entry \[0, 0\]"),

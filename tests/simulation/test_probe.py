@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 from pinnobs_gym.cli import main
 from pinnobs_gym.envs.game import Game
@@ -246,18 +247,19 @@ def test_a_model_in_numpy_runs_the_estimators_that_need_no_torch() -> None:
     probe(NumPyOnly)
     system, setup = NumPyOnly.configured()
     given = record(system, setup)
-    for kind in (UKF, ParticleFilter):
+    for kind in (UKF, ParticleFilter, EKF):
         assert np.isfinite(kind.for_setup(system, setup).run(given).xhat).all()
     assert np.isfinite(EKF.for_setup(WithJacobian(), setup).run(given).xhat).all()
 
 
 def test_what_needs_torch_says_so_in_one_line() -> None:
-    system, setup = NumPyOnly.configured()
+    """Trainers differentiate torch tensors."""
     where = rf"^NumPyOnly\.f \(test_probe\.py, line {line_of(NumPyOnly)}\) raises .*"
+    x, t, u = torch.ones(3, 2, requires_grad=True), torch.zeros(3), torch.zeros(3, 0)
     with pytest.raises(
         ModelError, match=f"{where}torch tensors, which f_jacobian needs; "
     ) as caught:
-        EKF.for_setup(system, setup).run(record(system, setup))
+        NumPyOnly().f_jacobian(t, x, u)
     assert "\n" not in str(caught.value)
 
 
@@ -267,5 +269,5 @@ def test_the_scale_of_an_output_in_numpy() -> None:
         Sound.setups["benchmark"], x0_low=(0.0, 0.0), x0_high=(0.0, 0.0), noise_std=0.0
     )
     cls = type("AtZero", (HInNumPy,), {"setups": {"benchmark": at_zero}})
-    std = np.sqrt(UKF.for_setup(cls(), at_zero).noise.R(0.0))
-    assert std == pytest.approx(np.full((1, 1, 1), 2e-3), rel=1e-8)
+    std = np.sqrt(UKF.for_setup(cls(), at_zero).noise.R(0.0)[0, 0])
+    assert std == pytest.approx([2e-3], rel=1e-8)
