@@ -9,6 +9,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.residual import Periods, residual
 from pinnobs_gym.simulation.system import Array, System, stack
 
 _STEP = float(np.cbrt(np.finfo(float).eps))
@@ -95,7 +96,7 @@ class Augmented(System):
         if not isinstance(x, np.ndarray):
             return super().f_jacobian(t, x, u)
         plant, state = self._parts(x)
-        above = self._jacobian(self.f, plant.f_jacobian(t, state, u), t, x, u)
+        above = self._jacobian(self.f, None, plant.f_jacobian(t, state, u), t, x, u)
         _set_ones(above, self._columns(_DISTURBANCE, plant.state_names))
         F = np.zeros_like(above, shape=(*x.shape, self.nx))
         F[..., : plant.nx, :] = above
@@ -106,13 +107,15 @@ class Augmented(System):
         if not isinstance(x, np.ndarray):
             return super().h_jacobian(t, x, u)
         plant, state = self._parts(x)
-        H = self._jacobian(self.h, plant.h_jacobian(t, state, u), t, x, u)
+        own = plant.h_jacobian(t, state, u)
+        H = self._jacobian(self.h, self.output_period, own, t, x, u)
         _set_ones(H, self._columns(_BIAS, plant.output_names))
         return H
 
     def _jacobian(
         self,
         function: Callable[[Array, np.ndarray, Array], Any],
+        periods: Periods | None,
         own: Array,
         t: Array,
         x: np.ndarray,
@@ -134,7 +137,7 @@ class Augmented(System):
                 shifted = x.copy(order="K")
                 shifted[..., j] += sign * step
                 ends.append(function(t, shifted, u)[..., :size])
-            result[..., j] = (ends[0] - ends[1]) / (2 * step)[..., None]
+            result[..., j] = residual(ends[0], ends[1], periods) / (2 * step)[..., None]
         return result
 
     def admissible(self, x0: Array) -> Array:

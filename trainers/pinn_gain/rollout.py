@@ -96,7 +96,8 @@ def update(
     H = np.broadcast_to(model.system.h_jacobian(t, x, u), (len(x), len(y), len(xhat)))
     H = torch.from_numpy(np.array(H.transpose(1, 2, 0), order="C"))
     predicted = torch.from_numpy(np.array(model.system.h(t, x, u).T, order="C"))
-    innovation = y - predicted - (H * (xhat - at)[None]).sum(1)
+    innovation = model.system.output_residual(y.T, predicted.T).T
+    innovation = innovation - (H * (xhat - at)[None]).sum(1)
     if model.variant == "gru":
         std = torch.diagonal(R).T.sqrt()
         sizes = model.scale, model.output_scale
