@@ -20,6 +20,7 @@ from pinnobs_gym.simulation.conformance import (
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.probe import ModelError, probe
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
@@ -30,6 +31,8 @@ JACOBIAN_TOLERANCE = 1e-6
 """Largest error of a Jacobian, relative to scale; that of central differences is below 1e-9."""
 TRUTH_TOLERANCE = 1e-8
 """Largest relative change of a conserved quantity along the truth."""
+PERIOD_TOLERANCE = 1e-9
+"""Largest difference, relative to their size, of values one period of a state apart."""
 STEP_WARNING = 1e-5
 """Largest error of the model over a sample, relative to scale, without a warning. By default steps
 have a local error of at most `pinnobs_gym.simulation.runge_kutta.STEP_TOLERANCE`."""
@@ -244,7 +247,7 @@ def _system_f_jacobian(cls: type[System]) -> None:
     system = cls()
     t, x, u = _points(system, 20)
     jacobian = system.f_jacobian(t, x, u)
-    _check_jacobian(system, lambda x: system.f(t, x, u), jacobian, x, "f_jacobian")
+    _check_jacobian(system, lambda x: system.f(t, x, u), np.subtract, jacobian, x)
 
 
 @add_check(SYSTEM_CHECKS, "h_jacobian")
@@ -253,14 +256,18 @@ def _system_h_jacobian(cls: type[System]) -> None:
     system = cls()
     t, x, u = _points(system, 20)
     jacobian = system.h_jacobian(t, x, u)
-    _check_jacobian(system, lambda x: system.h(t, x, u), jacobian, x, "h_jacobian")
+    _check_jacobian(system, lambda x: system.h(t, x, u), system.output_residual, jacobian, x)
 
 
 def _check_jacobian(
-    system: System, function: Callable[[Any], Any], jacobian: Any, x: np.ndarray, name: str
+    system: System,
+    function: Callable[[Any], Any],
+    residual: Callable[[Any, Any], Any],
+    jacobian: Any,
+    x: np.ndarray,
 ) -> None:
     """Compare the entries ∂f_i/∂x_j·scale_j with central differences, relative to the size of row
-    i."""
+    i; the residual is the difference of two values of the function."""
     scale = vector(system.scale, system.nx, "scale")
     step = 6e-6 * scale  # the cube root of the rounding error minimises the total error
     columns = []
@@ -268,10 +275,10 @@ def _check_jacobian(
         shift = np.zeros(system.nx)
         shift[j] = step[j]
         ahead, behind = np.asarray(function(x + shift)), np.asarray(function(x - shift))
-        columns.append((ahead - behind) / (2 * step[j]) * scale[j])
+        columns.append(residual(ahead, behind) / (2 * step[j]) * scale[j])
     expected = np.stack(columns, axis=-1)
     given = np.asarray(jacobian) * scale
-    require_shape(given, expected.shape, name)
+    require_shape(given, expected.shape, "the Jacobian")
     # Size of a row: its largest entry or the function's value, and at least the largest over the
     # batch.
     size = np.maximum(abs(expected).max(axis=-1), abs(np.asarray(function(x))))
@@ -349,7 +356,7 @@ def _model_error(system: System, setup: Setup) -> float:
         if not any(t0 <= b <= t1 for b in system.breakpoints()):
             with np.errstate(all="ignore"):
                 size = np.maximum(abs(end), vector(system.scale, system.nx, "scale"))
-                error = abs(model_step(system, t0, t1, path[k]) - end) / size
+                error = abs(system.state_residual(model_step(system, t0, t1, path[k]), end)) / size
             off = np.maximum(off, error.max())  # NaN stays
     return float(off)
 
@@ -377,4 +384,25 @@ def _system_indistinguishable(cls: type[System]) -> None:
             _, y = _trajectories(system, setup, x0)
             _, like = _trajectories(system, setup, np.asarray(other))
             what = f"outputs of indistinguishable states of setup {name!r}"
+            like = nearest(like, y, system.output_period)
             require_close(like, y, TRUTH_TOLERANCE, abs(y).max(), what)
+
+
+@add_check(SYSTEM_CHECKS, "periods")
+def _system_periods(cls: type[System]) -> None:
+    """A state moved by its period has the same rates of change and the same outputs."""
+    system = cls()
+    t, x, u = _points(system, 4)
+    f, y = np.asarray(system.f(t, x, u)), np.asarray(system.h(t, x, u))
+    for i, period in enumerate(system.state_period or ()):
+        if period is None:
+            continue
+        other = x + period * np.eye(system.nx)[i]
+        name = system.state_names[i]
+        for what, found, expected in (
+            ("f", system.f(t, other, u), f),
+            ("h", nearest(np.asarray(system.h(t, other, u)), y, system.output_period), y),
+        ):
+            size = np.maximum(abs(expected).max(), 1e-300)
+            said = f"{what} at {name} and at {name} + {period:g}, the period of {name},"
+            require_close(found, expected, PERIOD_TOLERANCE, size, said)

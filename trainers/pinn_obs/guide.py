@@ -103,7 +103,7 @@ def guide_of(
     rate = (1 - decay) * np.gradient(target, t, axis=0) + decay / tau * (target - points.xhat0)
     # In the initial layer add the gain of least norm that cancels the residual, regularised.
     innovation = system.output_residual(points.y, system.h(t, xhat, points.u))
-    innovation *= points.present / y_scale
+    innovation = innovation * points.present / y_scale
     residual = rate - system.f(t, xhat, points.u)
     residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
     floor = max(_CLEAR, float((noise / y_scale).max()))
