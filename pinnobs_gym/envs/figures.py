@@ -64,12 +64,14 @@ def state_figure(
             panel.plot(t, x[:, i], color=TRUE, lw=1.5, label="true")
         estimate = _drawable(xhat[:, i])
         kept = np.isfinite(estimate)
-        line = _broken(t[kept], estimate[kept], None if x is None else x[kept, i], periods[i])
+        breaks = _breaks(estimate[kept], None if x is None else x[kept, i], periods[i])
+        line = _broken(breaks, t[kept], estimate[kept])
         panel.plot(*line, "--", color=ESTIMATE, lw=1.3, label="estimate")
         if P is not None:
             band = 2 * np.sqrt(_drawable(np.maximum(P[:, i, i], 0)))
-            low, high = estimate - band, estimate + band
-            panel.fill_between(t, low, high, color=ESTIMATE, alpha=0.15, lw=0)
+            breaks = _breaks(estimate, None if x is None else x[:, i], periods[i])
+            area = _broken(breaks, t, estimate - band, estimate + band)
+            panel.fill_between(*area, color=ESTIMATE, alpha=0.15, lw=0)
         seen = x[:, i] if x is not None else estimate[kept]
         if len(seen):
             panel.set_ylim(*_limits(seen, float(system.scale[i])))
@@ -92,15 +94,17 @@ def drawn_outputs(system: System, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return y
 
 
-def _broken(
-    t: np.ndarray, estimate: np.ndarray, x: np.ndarray | None, period: float | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve (num_samples,) with gaps where the estimate of an angle x passes its opposite,
-    and the nearest value jumps by a period."""
+def _breaks(estimate: np.ndarray, x: np.ndarray | None, period: float | None) -> np.ndarray:
+    """Return the samples at which the nearest value of an estimate (num_samples,) of an angle x
+    jumps by a period, since it has passed the angle's opposite."""
     if period is None or x is None:
-        return t, estimate
-    jumps = 1 + np.flatnonzero(abs(np.diff(estimate - x)) > period / 2)
-    return np.insert(t, jumps, t[jumps]), np.insert(estimate, jumps, np.nan)
+        return np.empty(0, dtype=int)
+    return 1 + np.flatnonzero(abs(np.diff(estimate - x)) > period / 2)
+
+
+def _broken(breaks: np.ndarray, t: np.ndarray, *curves: np.ndarray) -> list[np.ndarray]:
+    """Return times and curves (num_samples,) with gaps before the samples ``breaks``."""
+    return [np.insert(t, breaks, t[breaks]), *(np.insert(c, breaks, np.nan) for c in curves)]
 
 
 def measured_states(system: System) -> dict[int, int]:
@@ -113,7 +117,7 @@ def measured_states(system: System) -> dict[int, int]:
     y, H = np.asarray(system.h(t, x, u)), np.asarray(system.h_jacobian(t, x, u))
     measured = {}
     for output in range(system.ny):
-        period = system.output_period and system.output_period[output]
+        period = (system.output_period or [None] * system.ny)[output]
         error = 0.0 if period is None else _ROUNDING * period
         state = int(np.argmax(abs(H[0, output]) > error))
         off = residual(y[:, [output]], x[:, [state]], (period,))
@@ -171,10 +175,9 @@ class EpisodePicture:
             panel.draw_artist(dots)
         curves = {"true": self._x, "estimate": self._xhat}
         for panel, state, label, line in self._lines:
-            curve = self._times[shown], curves[label][shown, state]
-            if label == "estimate":
-                curve = _broken(*curve, self._x[shown, state], self._periods[state])
-            line.set_data(*curve)
+            curve = curves[label][shown, state]
+            breaks = _breaks(curve, self._x[shown, state], self._periods[state])
+            line.set_data(*_broken(breaks, self._times[shown], curve))
             panel.draw_artist(line)
         image = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
         if self._mode == "human":
