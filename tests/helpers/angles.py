@@ -1,4 +1,4 @@
-"""Systems with angles: a compass, and a radar."""
+"""A compass, whose readings are angles, and records of it."""
 
 from dataclasses import dataclass
 
