@@ -1,6 +1,6 @@
 """Trainings on outputs that are angles: as on those of a sensor that counts turns."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -21,6 +21,13 @@ from trainers.pinn_obs.points import continuous
 
 SETUP = Compass.setups["benchmark"]
 BOTH = (Compass(), Unwrapped())
+
+
+@dataclass(frozen=True)
+class Counted(Compass):
+    """Its heading counts turns; the readings do not."""
+
+    state_period = None
 
 
 def rolled(system, record, variant):
@@ -58,11 +65,24 @@ def test_the_rollout_of_learned_gains_takes_angles_the_shorter_way(variant):
     _, *records = north_record(Compass())
     records = [record.rows(slice(0, 2)).first_samples(40) for record in records]
     assert abs(records[0].y - records[1].y).max() > 6  # some readings jump
+    systems = Counted(), Unwrapped()
     (found, slope), (expected, same) = (
-        rolled(system, record, variant) for system, record in zip(BOTH, records, strict=True)
+        rolled(system, record, variant) for system, record in zip(systems, records, strict=True)
     )
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(slope, same, rtol=1e-9)
+
+
+@pytest.mark.parametrize("variant", get_args(Variant))
+def test_a_network_does_not_see_whole_turns(variant):
+    _, record, _ = north_record(Compass())
+    record = record.rows(slice(0, 2)).first_samples(40)
+    mean = record.prior.mean + np.array([[0.0, 0.0], [20 * TURN, 0.0]])
+    moved = replace(record, prior=replace(record.prior, mean=mean))
+    (expected, slope), (found, same) = (rolled(Compass(), r, variant) for r in (record, moved))
+    turns = np.array([[0.0, 20 * TURN], [0.0, 0.0]])
+    np.testing.assert_allclose(found - turns, expected, atol=1e-9)
+    np.testing.assert_allclose(same, slope, rtol=1e-8)
 
 
 def test_smoothed_trajectories_of_a_compass_are_explained():
