@@ -38,6 +38,9 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     which the outputs tell nothing is not inflated. An ensemble with no more members than states is
     allowed; its covariance is singular.
 
+    Members that differ by whole turns of an angle are the same states: they are taken within half a
+    turn of their circular mean, and so are their outputs.
+
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
     in its batch. The numbers have mean zero and unit variance over the ensemble.

@@ -66,6 +66,9 @@ class ParticleFilter(RecursiveEstimator):
     this holds for all particles of an episode, they stay where they are, or the sample counts as
     missing, and the log says so once.
 
+    Particles that differ by whole turns of an angle are the same states: they are taken within half
+    a turn of their circular mean, and so are their outputs.
+
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
     in its batch.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from linear import Linear, linear_record
+
 from pinnobs_gym.estimation.noise import assumed_noise
 from pinnobs_gym.estimation.notices import say_once
-
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent, stack

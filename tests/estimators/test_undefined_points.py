@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from array_api_compat import array_namespace
-from pinnobs_gym.estimation.notices import say_once
 
+from pinnobs_gym.estimation.notices import say_once
 from pinnobs_gym.estimators.particle import ParticleFilter
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent
