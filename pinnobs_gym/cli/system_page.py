@@ -13,6 +13,7 @@ from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.noise import noise_std
+from pinnobs_gym.simulation.residual import Periods
 from pinnobs_gym.simulation.system import System, vector
 
 
@@ -36,6 +37,7 @@ def page(cls: type[System], env_id: str) -> str:
                 )
             ],
         ),
+        *_repeating(system, system.state_names, system.state_period),
         "\n## Observation Space\n",
         f"`Box(({system.ny + system.nu + 1},), float32)`: the outputs, the inputs, then time.\n",
         _table(
@@ -45,6 +47,7 @@ def page(cls: type[System], env_id: str) -> str:
                 for i, name in enumerate((*system.output_names, *system.input_names, "t/T"))
             ],
         ),
+        *_repeating(system, system.output_names, system.output_period),
         "\n## Reward\n",
         "−mean(((x̂ − x)/scale)²) of the true state behind the observation that the action answers; "
         f"{NOT_FINITE_REWARD:g} for an action that is not finite.\n",
@@ -79,6 +82,16 @@ def _bound(system: System) -> Sequence[float]:
 
 def _unit(cls: type[System], name: str) -> str:
     return cls.units.get(name, "")
+
+
+def _repeating(system: System, names: Sequence[str], periods: Periods | None) -> list[str]:
+    """Return a line about the states or outputs that repeat, if there are any."""
+    found = [
+        f"`{name}` repeats every {period:.6g} {_unit(type(system), name)}".rstrip()
+        for name, period in zip(names, periods or [None] * len(names), strict=True)
+        if period is not None
+    ]
+    return [f"\n{'; '.join(found)}: whole periods do not count."] if found else []
 
 
 def _setups(cls: type[System]) -> str:

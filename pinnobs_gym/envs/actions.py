@@ -20,6 +20,7 @@ from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.noise import AssumedNoise
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import Setup, System, vector
 
 LARGEST_REWARD = 10.0
@@ -238,19 +239,23 @@ class PredictionForm(Form):
     def predict(self, memory: AgentMemory, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         xhat = model_step(self.system, memory.t, t, memory.xhat, memory.u, u)
         y = memory.y[:, 0]
-        surprise = (y - self.system.h(t, xhat, u)) / self.root_S[self._samples(t, memory)]
+        innovation = self.system.output_residual(y, self.system.h(t, xhat, u))
+        surprise = innovation / self.root_S[self._samples(t, memory)]
         return replace(memory, xhat=xhat, surprise=np.where(np.isnan(y), 0.0, surprise))
 
     def features(self, memory: AgentMemory) -> np.ndarray:
         k = np.minimum((memory.t - memory.start) / self.setup.dt, self.setup.num_steps)
         time = np.log1p(k) / np.log1p(self.setup.num_steps)
-        parts = (np.arcsinh(memory.surprise), memory.xhat / self.scale, memory.u / self.u_scale)
+        xhat = nearest(memory.xhat, 0.0, self.system.state_period) / self.scale
+        parts = (np.arcsinh(memory.surprise), xhat, memory.u / self.u_scale)
         return np.concatenate([*parts, time[:, None]], axis=1)
 
     def corrected(self, memory: AgentMemory, share: np.ndarray) -> AgentMemory:
         """Return the predictions corrected by a fraction (batch, nx) of the typical error, within
         bounds."""
-        largest = OUTSIDE * self.bound
+        periods = self.system.state_period or [None] * self.system.nx
+        repeats = np.array([period is not None for period in periods])
+        largest = np.where(repeats, np.inf, OUTSIDE * self.bound)
         xhat = memory.xhat + share * self.sigma[self._samples(memory.t, memory)]
         return replace(memory, xhat=np.clip(xhat, -largest, largest))
 
@@ -264,7 +269,8 @@ class PredictionForm(Form):
         """
         nis = (memory.surprise**2).sum(axis=1) / self.system.ny
         with np.errstate(all="ignore"):
-            less = (memory.xhat - x) ** 2 - (xhat - x) ** 2
+            residual = self.system.state_residual
+            less = residual(memory.xhat, x) ** 2 - residual(xhat, x) ** 2
             less /= self.sigma[self._samples(memory.t, memory)] ** 2
             return np.clip(less.mean(axis=1) / (1 + nis), -LARGEST_REWARD, LARGEST_REWARD)
 

@@ -119,7 +119,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         elif estimate.shape != x.shape:
             raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
         with np.errstate(over="ignore", invalid="ignore"):
-            error = estimate - x
+            error = self.source.system.state_residual(estimate, x)
             reward = -float((error * error).dot(self._weights))
         if self.agent.improves:
             reward = float(self.agent.improvement(estimate[None], x[None])[0])

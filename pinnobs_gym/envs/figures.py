@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.residual import nearest, residual
 from pinnobs_gym.simulation.system import System, initial_states
 
 if TYPE_CHECKING:
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
 TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
 """Colours of true states, estimates and measured outputs."""
+_ROUNDING = 1e-9
+"""Largest difference, over its period, of an angle and an output that measures it."""
 _LARGEST = 1e100
 """Largest absolute estimate that is drawn, since an axis cannot span all numbers."""
 
@@ -29,6 +32,9 @@ def state_figure(
 ) -> Figure:
     """Return a figure of estimates over time, with a panel per state.
 
+    Angles are drawn without jumps: true states as they are, outputs and estimates by whole periods
+    nearest to them.
+
     Args:
         system: names and units.
         t: times in s, shape (num_samples,).
@@ -43,6 +49,11 @@ def state_figure(
     figure = Figure(figsize=(8, 1.0 + 1.6 * system.nx), layout="constrained")
     panels = figure.subplots(system.nx, 1, sharex=True, squeeze=False)[:, 0]
     measured = measured_states(system)
+    if y is not None:
+        y = drawn_outputs(system, xhat if x is None else x, y)
+    if x is not None:
+        xhat = nearest(xhat, x, system.state_period)
+    periods = system.state_period or [None] * system.nx
     for i, (panel, name) in enumerate(zip(panels, system.state_names, strict=True)):
         unit = system.units.get(name)
         panel.set_ylabel(f"{name} ({unit})" if unit else name)
@@ -53,11 +64,14 @@ def state_figure(
             panel.plot(t, x[:, i], color=TRUE, lw=1.5, label="true")
         estimate = _drawable(xhat[:, i])
         kept = np.isfinite(estimate)
-        panel.plot(t[kept], estimate[kept], "--", color=ESTIMATE, lw=1.3, label="estimate")
+        breaks = _breaks(estimate[kept], None if x is None else x[kept, i], periods[i])
+        line = _broken(breaks, t[kept], estimate[kept])
+        panel.plot(*line, "--", color=ESTIMATE, lw=1.3, label="estimate")
         if P is not None:
             band = 2 * np.sqrt(_drawable(np.maximum(P[:, i, i], 0)))
-            low, high = estimate - band, estimate + band
-            panel.fill_between(t, low, high, color=ESTIMATE, alpha=0.15, lw=0)
+            breaks = _breaks(estimate, None if x is None else x[:, i], periods[i])
+            area = _broken(breaks, t, estimate - band, estimate + band)
+            panel.fill_between(*area, color=ESTIMATE, alpha=0.15, lw=0)
         seen = x[:, i] if x is not None else estimate[kept]
         if len(seen):
             panel.set_ylim(*_limits(seen, float(system.scale[i])))
@@ -68,9 +82,34 @@ def state_figure(
     return figure
 
 
+def drawn_outputs(system: System, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return outputs (..., ny), in which those that measure a state of x (..., nx), and repeat, are
+    moved by whole periods to the values nearest to it."""
+    if system.output_period is None:
+        return y
+    y = y.copy()
+    for state, output in measured_states(system).items():
+        period = (system.output_period[output],)
+        y[..., [output]] = nearest(y[..., [output]], x[..., [state]], period)
+    return y
+
+
+def _breaks(estimate: np.ndarray, x: np.ndarray | None, period: float | None) -> np.ndarray:
+    """Return the samples at which the nearest value of an estimate (num_samples,) of an angle x
+    jumps by a period, since it has passed the angle's opposite."""
+    if period is None or x is None:
+        return np.empty(0, dtype=int)
+    return 1 + np.flatnonzero(abs(np.diff(estimate - x)) > period / 2)
+
+
+def _broken(breaks: np.ndarray, t: np.ndarray, *curves: np.ndarray) -> list[np.ndarray]:
+    """Return times and curves (num_samples,) with gaps before the samples ``breaks``."""
+    return [np.insert(t, breaks, t[breaks]), *(np.insert(c, breaks, np.nan) for c in curves)]
+
+
 def measured_states(system: System) -> dict[int, int]:
     """Return the index of each directly measured state, with the index of its output: an output
-    that equals the state at any time and input."""
+    that equals the state at any time and input, up to whole periods and their rounding error."""
     setup = system.setups["benchmark"]
     t = setup.duration * np.array([0.0, 0.37])
     x = initial_states(system, setup, 2)
@@ -78,8 +117,13 @@ def measured_states(system: System) -> dict[int, int]:
     y, H = np.asarray(system.h(t, x, u)), np.asarray(system.h_jacobian(t, x, u))
     measured = {}
     for output in range(system.ny):
-        state = int(np.argmax(H[0, output] != 0))
-        if (H[:, output] == np.eye(system.nx)[state]).all() and (y[:, output] == x[:, state]).all():
+        period = (system.output_period or [None] * system.ny)[output]
+        error = 0.0 if period is None else _ROUNDING * period
+        state = int(np.argmax(abs(H[0, output]) > error))
+        off = residual(y[:, [output]], x[:, [state]], (period,))
+        if (abs(H[:, output] - np.eye(system.nx)[state]) <= error).all() and (
+            abs(off) <= error
+        ).all():
             measured[state] = output
     return measured
 
@@ -103,6 +147,7 @@ class EpisodePicture:
 
     def __init__(self, system: System, mode: str) -> None:
         self._system = system
+        self._periods = system.state_period or [None] * system.nx
         self._mode = mode
         self._canvas: Any = None
         self._window: Any = None
@@ -110,13 +155,13 @@ class EpisodePicture:
     def begin(self, times: np.ndarray, x: np.ndarray, observations: np.ndarray) -> None:
         """Start an episode, given its sample times (num_samples,), true states and observations."""
         self._times, self._x = times, x
-        self._y = observations[:, : self._system.ny]
+        self._y = drawn_outputs(self._system, x, observations[:, : self._system.ny])
         self._xhat = np.full_like(x, np.nan)
         self._background: Any = None
 
     def add(self, k: int, estimate: np.ndarray) -> None:
         """Store the estimate (nx,) of sample k."""
-        self._xhat[k] = estimate
+        self._xhat[k] = nearest(estimate, self._x[k], self._system.state_period)
 
     def draw(self, k: int) -> np.ndarray | None:
         """Draw the episode up to sample k, as an image (height, width, 3) of bytes or in the
@@ -130,7 +175,9 @@ class EpisodePicture:
             panel.draw_artist(dots)
         curves = {"true": self._x, "estimate": self._xhat}
         for panel, state, label, line in self._lines:
-            line.set_data(self._times[shown], curves[label][shown, state])
+            curve = curves[label][shown, state]
+            breaks = _breaks(curve, self._x[shown, state], self._periods[state])
+            line.set_data(*_broken(breaks, self._times[shown], curve))
             panel.draw_artist(line)
         image = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
         if self._mode == "human":

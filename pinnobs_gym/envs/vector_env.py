@@ -116,7 +116,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             estimates = self.agent.act(estimates)
         over = self._over
         with np.errstate(over="ignore", invalid="ignore"):
-            error = estimates - self._state
+            error = self.source.system.state_residual(estimates, self._state)
             rewards = -((error * error) @ self._weights)
         if self.agent.improves:
             rewards = self.agent.improvement(estimates, self._state)

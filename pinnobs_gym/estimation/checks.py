@@ -34,6 +34,8 @@ differently in batches of different sizes, and ill-conditioned covariances ampli
 to 3e-12 for the EKF of the induction motor."""
 MODEL_STEP = 1e-6
 """Largest difference, over scale, between an estimator's own integration of the model and ours."""
+PERIODS = 1e-9
+"""Largest difference, over scale, between estimates from outputs that differ by whole periods."""
 NUM_SAMPLES = 40
 """Number of samples of the records on which estimators are checked."""
 
@@ -335,6 +337,25 @@ def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
         _require_same(
             estimator, estimator.run(record), looped, ROUNDING, "run and of looped updates"
         )
+
+
+@add_check(ESTIMATOR_CHECKS, "periods")
+def _estimator_periods(estimator: BaseEstimator) -> None:
+    """An output moved by whole periods changes no estimate, for a system that declares periods."""
+    system, record = estimator.system, _record(estimator)
+    rng = np.random.default_rng(4)
+    run, scale = estimator.run(record), vector(system.scale, system.nx, "scale")
+    for i, period in enumerate(system.output_period or ()):
+        if period is None:
+            continue
+        moved = _copy(record)
+        moved.y[..., i] += period * rng.integers(-2, 3, moved.y.shape[:2])
+        found = estimator.run(moved)
+        what = f"with {system.output_names[i]} moved by whole periods and without"
+        off = system.state_residual(found.xhat, run.xhat)
+        require_close(off, np.zeros_like(off), PERIODS, scale, f"xhat {what}")
+        if run.P is not None:
+            require_close(found.P, run.P, PERIODS, abs(run.P).max(), f"P {what}")
 
 
 @add_check(ESTIMATOR_CHECKS, "diverging_row")

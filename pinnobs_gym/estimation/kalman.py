@@ -55,7 +55,7 @@ def observe(
         y: outputs, shape (batch, ny); NaN marks a missing output.
         u: inputs at the sample, shape (batch, nu).
     """
-    innovation = y - system.h(t, xhat, u)
+    innovation = system.output_residual(y, system.h(t, xhat, u))
     H = system.h_jacobian(t, xhat, u).transpose(1, 2, 0)
     missing = np.isnan(y)
     if np.count_nonzero(missing):  # several times faster than any() for small arrays

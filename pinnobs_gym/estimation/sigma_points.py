@@ -22,6 +22,7 @@ from pinnobs_gym.estimation.square_root import (
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.residual import nearest
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,9 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     any K (Arasaratnam & Haykin 2009, the square-root form of section VII). If a covariance has no
     Cholesky factor, its variances are enlarged (`pinnobs_gym.simulation.matrices.JITTER`), and the
     relative amount is reported in the state's memory.
+
+    Of an angle, the points' values are taken within half a turn of that at x̂, so that their mean
+    and deviations are those of numbers.
     """
 
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -84,7 +88,8 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         # Propagate the estimate and each point through the model; then compute mean and covariance.
         points = np.concatenate([state.xhat.T[:, None], points], axis=1).transpose(1, 2, 0)
         points, _, Q = model_step_moments(self.system, self.noise, state.t, t, points, state.u, u)
-        points = np.ascontiguousarray(points[1:].transpose(2, 0, 1))
+        points = nearest(points[1:], points[0], self.system.state_period)
+        points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
         P = (outer(X, X) + Q).transpose(2, 0, 1)
@@ -100,10 +105,12 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         X = unit @ L  # (nx, num_points, batch)
         points = X + xhat.T[:, None]
         outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
+        if (period := self.system.output_period) is not None:  # angles near that of the centre
+            outputs = nearest(outputs, self.system.h(t, xhat, u), period)
         outputs = outputs.transpose(2, 0, 1)
         mean = product(outputs, mean_weights)[:, 0]
         X, Y = X * roots, (outputs - mean[:, None]) * roots
-        innovation, missing = y - mean.T, np.isnan(y)
+        innovation, missing = self.system.output_residual(y, mean.T), np.isnan(y)
         if np.count_nonzero(missing):
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)

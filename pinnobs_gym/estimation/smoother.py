@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -88,14 +89,14 @@ def forward(
             times, inputs = (t[k - 1], t[k]), (u[k - 1], u[k])
             x, P, F[k - 1], Q[k - 1] = predict(system, times, x, P, noise, inputs)
         elif k and about is not None:
-            x = ends[k - 1] + mapped(F[k - 1], x - about[k - 1])
+            x = ends[k - 1] + mapped(F[k - 1], system.state_residual(x, about[k - 1]))
             P = sandwich(F[k - 1], P) + Q[k - 1]
         before.xhat[k], before.P[k] = x, P
         # Innovation, with h linearised about the same states.
         at = x if about is None else about[k]
         innovation, H[k] = observe(system, float(t[k]), at, y[k], u[k])
         if about is not None:
-            innovation = innovation - mapped(H[k], x - about[k])
+            innovation = innovation - mapped(H[k], system.state_residual(x, about[k]))
         # Update.
         R = cautious(P, H[k], noise.R(float(t[k]), y[k]), caution)
         K[k], _ = kalman_gain(P, H[k], R)
@@ -162,7 +163,9 @@ def iterated(
         remaining = record if len(rows) == batch else record.rows(rows)
         # One Gauss-Newton step: filter and smooth the model linearised at the last trajectory.
         path = backward(forward(system, remaining, noise, at, caution if first else 0.0))
-        moved = np.inf if at is None else (abs(path.xhat - at) / scale).max(axis=(0, 2))
+        moved: Any = np.inf
+        if at is not None:
+            moved = (abs(system.state_residual(path.xhat, at)) / scale).max(axis=(0, 2))
         x[:, rows], P[..., rows] = path.xhat, path.P
         # Drop the rows that have converged or diverged.
         last = noise is noises[-1]

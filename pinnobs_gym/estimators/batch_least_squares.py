@@ -12,6 +12,10 @@ from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
 from pinnobs_gym.simulation.matrices import inner, mapped, sandwich
 from pinnobs_gym.simulation.record import Record
 
+_ROUNDING = 1e-12
+"""Largest relative increase of the cost that counts as none, so that rounding errors do not decide
+on the last step."""
+
 
 @dataclass(frozen=True)
 class BatchLeastSquares(OfflineEstimator):
@@ -100,8 +104,9 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
             step = solved(information + damping * (np.eye(len(z))[..., None] * diagonal), right)
             trial = z[:, rows] + step
             fit = self._evaluated(record, L, trial, rows, length)
-            # Accept the step and reduce the damping where the cost decreases; else increase it.
-            accepted = fit.cost < cost
+            # Accept the step and reduce the damping where the cost does not increase; else increase
+            # the damping.
+            accepted = fit.cost <= (1 + _ROUNDING) * cost
             gain = inner(step, right)
             z[:, rows] = np.where(accepted, trial, z[:, rows])
             cost = np.where(accepted, fit.cost, cost)

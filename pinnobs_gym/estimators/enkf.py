@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pinnobs_gym.estimation.circular import gathered
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
@@ -36,6 +37,9 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     state by state, as the relaxation to prior spread does (Whitaker & Hamill 2012). A state of
     which the outputs tell nothing is not inflated. An ensemble with no more members than states is
     allowed; its covariance is singular.
+
+    Members that differ by whole turns of an angle are the same states: they are taken within half a
+    turn of their circular mean, and so are their outputs.
 
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
@@ -79,6 +83,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         prior = checked(prior)
         L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + spread(L, self._normal(0)(self.system.nx))
+        members = gathered(members, self.system.state_period)
         return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
@@ -95,6 +100,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             u,
             lambda size: normal(size)[:, None],
         )
+        members = gathered(members, self.system.state_period)
         memory = replace(memory, members=members)
         return State(total(members) / self.members, state.t, state.u, memory=memory)
 
@@ -102,6 +108,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         memory: EnsembleMemory = state.memory
         members = memory.members
         mean, outputs = total(members) / self.members, np.asarray(self.system.h(t, members, u))
+        outputs = gathered(outputs, self.system.output_period)
         yhat = total(outputs) / self.members
         # v = Gw with G of R, for each member.
         G = self.noise.G(t)
@@ -114,13 +121,16 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         Y = np.where(missing.T[:, None], 0.0, Y)
         K, S = gain_of_deviations(X, Y, self.noise.R(t, y))
         # Correct each member with its own perturbed output.
-        errors = np.where(missing, 0.0, y + noise - outputs)
+        errors = self.system.output_residual(y + noise, outputs)
+        errors = np.where(missing, 0.0, errors)
         for p, column in enumerate(K.transpose(1, 2, 0)):
             members = members + errors[..., p, None] * column
+        members = gathered(members, self.system.state_period)
         xhat = total(members) / self.members
         deviations = self._inflation(X, Y, K) * (members - xhat)
         members, X = xhat + deviations, weight * deviations.transpose(2, 0, 1)
-        P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
+        P, innovation = outer(X, X).transpose(2, 0, 1), self.system.output_residual(y, yhat)
+        innovation = np.where(missing, 0.0, innovation)
         memory = replace(memory, members=members, sample=memory.sample + 1)
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
 

@@ -86,11 +86,11 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         fit = self._fit(memory, start)
         # The trajectory from the previous first state ends at the prediction of this sample.
         innovation, H = observe(self.system, t, fit.x[-1], y, u)
-        step, P = _step(fit, memory.P, memory.arrival - start)
+        step, P = _step(fit, memory.P, self.system.state_residual(memory.arrival, start))
         for _ in range(self.steps - 1):
             start = start + step
             fit = self._fit(memory, start)
-            step, P = _step(fit, memory.P, memory.arrival - start)
+            step, P = _step(fit, memory.P, self.system.state_residual(memory.arrival, start))
         # Map the last step to the latest sample to first order, without a new trajectory.
         start = start + step
         xhat = fit.x[-1] + mapped(fit.X[-1], step)
@@ -113,7 +113,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         start = memory.start
         innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])
         # Update x̄ − x and P̄ with the sample, with the output linearised about x.
-        offset = memory.arrival - start
+        offset = self.system.state_residual(memory.arrival, start)
         innovation = innovation - mapped(H, offset)
         R = self.noise.R(memory.t[0], memory.y[0])
         offset, P, _ = joseph_update(offset, memory.P, innovation, H, R)

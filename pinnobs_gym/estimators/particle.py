@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pinnobs_gym.estimation.circular import gathered
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
@@ -64,6 +65,9 @@ class ParticleFilter(RecursiveEstimator):
     A particle that overflows, or at which the output is not defined, has the weight zero. Where
     this holds for all particles of an episode, they stay where they are, or the sample counts as
     missing, and the log says so once.
+
+    Particles that differ by whole turns of an angle are the same states: they are taken within half
+    a turn of their circular mean, and so are their outputs.
 
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
@@ -131,7 +135,9 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         lost: np.ndarray = np.logical_not((abs(x) < _LARGEST).all(axis=-1))
         if lost.any():
             x, log_weights = self._without(lost, x, memory)
-        xhat = weighted_mean(np.exp(log_weights), x)
+        weights = np.exp(log_weights)
+        x = gathered(x, self.system.state_period, weights)
+        xhat = weighted_mean(weights, x)
         memory = replace(memory, particles=x, log_weights=log_weights)
         return State(xhat, state.t, state.u, memory=memory)
 
@@ -156,10 +162,13 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         missing = np.isnan(y)
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
-        yhat, S = _predicted_output(np.exp(log_weights), outputs)
+        weights = np.exp(log_weights)
+        outputs = gathered(outputs, self.system.output_period, weights)
+        yhat, S = _predicted_output(weights, outputs)
         S = S + self.noise.R(t, y).transpose(2, 0, 1)
         x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
         weights = np.exp(log_weights)
+        x = gathered(x, self.system.state_period, weights)
         xhat, P = moments(weights, x)
         # Resample the episodes whose effective number of particles, 1/Σw², is below half.
         rows = np.flatnonzero(total(weights**2) > 2 / self.particles)
@@ -169,7 +178,8 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             stream = memory.sample, _ROUNDS
             x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
         memory = ParticleMemory(x, log_weights, memory.sample + 1)
-        innovation = np.where(missing | np.isnan(yhat), 0.0, y - yhat)
+        innovation = self.system.output_residual(y, yhat)
+        innovation = np.where(missing | np.isnan(yhat), 0.0, innovation)
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 
     def _tempered(
@@ -204,7 +214,8 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
         t, y, u = seen
-        errors = np.where(np.isnan(y), 0.0, y - np.asarray(self.system.h(t, x, u)))
+        errors = self.system.output_residual(y, np.asarray(self.system.h(t, x, u)))
+        errors = np.where(np.isnan(y), 0.0, errors)
         log_likelihood = -0.5 * _squared_sizes(errors, self.noise.R(t, y))
         if math.isfinite(log_likelihood.sum()):
             return log_likelihood
@@ -228,6 +239,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         rng = np.random.default_rng([self.seed, 1, *stream])
         # `take` keeps the order in memory, on which that of sums depends; indexing changes it.
         old, weights, count = x.take(rows, 1), np.exp(log_weights.take(rows, 1)), self.particles
+        old = gathered(old, self.system.state_period, weights)
         shrinkage = (3 * discount - 1) / (2 * discount)
         mean, P = moments(weights, old)
         # Systematic resampling: the number of copies of each particle.

@@ -25,6 +25,7 @@ from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import mapped
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System, output_scale, vector
 
 
@@ -59,8 +60,9 @@ class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
     scales and shifts the Kalman gain within bounds that shrink with P
     (`pinnobs_gym.estimation.learned.gain_network.corrected_gain`), and P is updated in Joseph's
     form with the corrected gain. The noise level enters through R, so that the network can be used
-    at another noise level than that of its training. The form resembles that of Recursive KalmanNet
-    (Mortada et al. 2025) and KalmanNet (Revach et al. 2022), which learn from true states.
+    at another noise level than that of its training. It sees angles within half a period about
+    zero. The form resembles that of Recursive KalmanNet (Mortada et al. 2025) and KalmanNet (Revach
+    et al. 2022), which learn from true states.
 
     The variant ``gru`` is a recurrent network for the gain in x̂ = x̂⁻ + K(y − h(t, x̂⁻, u)), without
     a covariance.
@@ -110,12 +112,14 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         R = self.noise.R(t, y) if R is None else R
         xhat, P = state.xhat, covariances(state)
         innovation, H = observe(self.system, t, xhat, y, u)
-        x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
+        seen = nearest(xhat, 0.0, self.system.state_period)  # angles within a period
+        x, e = np.ascontiguousarray(seen.T), np.ascontiguousarray(innovation.T)
         x, P, S, memory = update_with_network(
             self.trained.layers, scale, x, P, e, H, R, memory, ~np.isnan(y).T
         )
         P, S = P.transpose(2, 0, 1), S.transpose(2, 0, 1)
-        return State(x.T, t, u, P, innovation, S, (fixed, memory))
+        xhat = x.T if seen is xhat else x.T + (xhat - seen)
+        return State(xhat, t, u, P, innovation, S, (fixed, memory))
 
     def _recurrent(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         """Apply `correct` with the recurrent network's gain, without a covariance."""
@@ -123,8 +127,10 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         scale, size, R = fixed
         std = np.sqrt(np.einsum("iib->ib", self.noise.R(t) if R is None else R))
         xhat = state.xhat
-        innovation = np.where(np.isnan(y), 0.0, y - self.system.h(t, xhat, u))
-        x, e = np.ascontiguousarray(xhat.T), np.ascontiguousarray(innovation.T)
+        innovation = self.system.output_residual(y, self.system.h(t, xhat, u))
+        innovation = np.where(np.isnan(y), 0.0, innovation)
+        seen = nearest(xhat, 0.0, self.system.state_period)
+        x, e = np.ascontiguousarray(seen.T), np.ascontiguousarray(innovation.T)
         known_noise = np.broadcast_to(std, e.shape)
         K, memory = recurrent_gain(self.trained.layers, scale, size, x, e, known_noise, memory)
         xhat = xhat + mapped(K, innovation)

@@ -174,7 +174,8 @@ class PinnObsReplay(LearnedEstimator, Estimator):
         """
         (start, end), (y0, y) = times, outputs
         missing = np.isnan(y0) | np.isnan(y)
-        y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, (y - y0) / (end - start))
+        slope = self.system.output_residual(y, y0) / (end - start)
+        y0, slope = np.where(missing, 0.0, y0), np.where(missing, 0.0, slope)
 
         for t, step, u in substeps(self.system, start, end, x, *inputs, longest):
             L = self.trained.gain(t)
@@ -184,7 +185,9 @@ class PinnObsReplay(LearnedEstimator, Estimator):
             ) -> np.ndarray:
                 k = (0, 1, 1, 2)[stage]  # index of the stage's time: start, midpoint or end
                 outputs = self.system.h(t[k], x, u[k])
-                innovation = np.where(missing, 0.0, y0 + (t[k] - start) * slope - outputs)
+                given = y0 + (t[k] - start) * slope
+                innovation = self.system.output_residual(given, outputs)
+                innovation = np.where(missing, 0.0, innovation)
                 return self.system.f(t[k], x, u[k]) + innovation @ L[k].T
 
             x = runge_kutta(rate, x, step)

@@ -137,7 +137,8 @@ def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
     error, u = np.zeros_like(x), system.input(t)
     for k in range(1, len(t)):
         times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
-        error[:, k] = model_step(system, *times, x[:, k - 1], *inputs) - x[:, k]
+        end = model_step(system, *times, x[:, k - 1], *inputs)
+        error[:, k] = system.state_residual(end, x[:, k])
     return error
 
 

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.envs.figures import measured_states
+from pinnobs_gym.envs.figures import drawn_outputs, measured_states
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import file_name, replacing
 from pinnobs_gym.scoring.metrics import by_sample
 from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row, game_of
 from pinnobs_gym.scoring.thinning import kept, kept_of_example, rounded
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System
 
 
@@ -32,9 +33,9 @@ class Example:
     x: np.ndarray
     """True states, shape (points, nx)."""
     xhat: np.ndarray
-    """Estimates, shape (points, nx)."""
+    """Estimates, shape (points, nx); of an angle, the value nearest to the true state."""
     y: np.ndarray
-    """Outputs, shape (points, ny)."""
+    """Outputs, shape (points, ny); of an angle that is a state, the value nearest to it."""
     std: np.ndarray | None
     """Standard deviations of the estimates, shape (points, nx); None if the estimator has none."""
 
@@ -70,7 +71,10 @@ def curves_of(played: Played) -> Curves:
     """Return the curves of a batch of whole episodes at the kept times; the first is the
     example."""
     system, t, xhat = played.system, played.record.t, played.estimates.xhat
-    error = by_sample(xhat - played.truth, system.scale, system.observable(played.truth))
+    shown = nearest(xhat, played.truth, system.state_period)
+    dots = drawn_outputs(system, played.truth, played.record.y)
+    error = system.state_residual(xhat, played.truth)
+    error = by_sample(error, system.scale, system.observable(played.truth))
     reference, std = played.reference, played.std
     k, m = kept(len(t)), kept_of_example(len(t))
     return Curves(
@@ -82,8 +86,8 @@ def curves_of(played: Played) -> Curves:
             played.seeds[0],
             t[m],
             rounded(played.truth[0, m]),
-            rounded(xhat[0, m]),
-            rounded(played.record.y[0, m]),
+            rounded(shown[0, m]),
+            rounded(dots[0, m]),
             None if std is None else rounded(std[0, m]),
         ),
         states=labels(system),

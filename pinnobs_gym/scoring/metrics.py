@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import Estimates
 from pinnobs_gym.scoring.consistency import consistency
 from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System
 
 DIVERGED = 0.2
@@ -106,6 +107,11 @@ def score(
         ValueError: if truth and estimates have different shapes.
     """
     xhat, scored = np.asarray(estimates.xhat, dtype=float), system.observable(truth)
+    alternatives = system.indistinguishable(truth)
+    if (period := system.state_period) is not None:  # of an angle, the representative nearest to x
+        xhat = nearest(xhat, truth, period)
+        estimates = replace(estimates, xhat=xhat)
+        alternatives = [nearest(np.asarray(other), xhat, period) for other in alternatives]
     errors: dict[str, Any] = error_scores(
         record.t,
         truth,
@@ -113,7 +119,7 @@ def score(
         system.scale,
         transient_end=transient_end,
         scored=scored,
-        alternatives=system.indistinguishable(truth),
+        alternatives=alternatives,
     )
     own: dict[str, Any] = consistency(truth, estimates, np.isnan(record.y))
     by_window = state_errors(windows(record.t, transient_end), truth, xhat, scored)

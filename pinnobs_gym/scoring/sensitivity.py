@@ -10,6 +10,7 @@ import numpy as np
 from pinnobs_gym.simulation.conditions.base import Unknowns
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.residual import Periods, residual
 from pinnobs_gym.simulation.system import System
 
 _STEP = 1e-3
@@ -51,7 +52,7 @@ def linearised(
     u = np.asarray(system.input(times))
     ends = (times[:-batch], times[batch:], rows[:-batch], u[:-batch], u[batch:])
     by_unknown = _derivatives(
-        lambda plant: model_step(plant, *ends), system, unknowns, len(ends[0])
+        lambda plant: model_step(plant, *ends), system.state_period, system, unknowns, len(ends[0])
     )
     count = by_unknown.shape[-1]
     F, Q = np.zeros((2, len(ends[0]), nx + count, nx + count))
@@ -60,7 +61,9 @@ def linearised(
     F[:, :nx, nx:] = by_unknown
     F[:, nx:, nx:] = np.eye(count)  # unknowns are constant
     # Outputs change with the plant, and as a condition of the measurement says.
-    by_unknown = _derivatives(lambda plant: plant.h(times, rows, u), system, unknowns, len(rows))
+    by_unknown = _derivatives(
+        lambda plant: plant.h(times, rows, u), system.output_period, system, unknowns, len(rows)
+    )
     own = [each.output_slopes(system, times, rows, u) for each in unknowns]
     by_state = system.h_jacobian(times, rows, u)
     H = np.concatenate([by_state, by_unknown + np.concatenate(own, axis=-1)], axis=-1)
@@ -70,19 +73,20 @@ def linearised(
 
 def _derivatives(
     function: Callable[[System], np.ndarray],
+    periods: Periods | None,
     system: System,
     unknowns: Sequence[Unknowns],
     rows: int,
 ) -> np.ndarray:
     """Return the derivatives (rows, k, num_unknowns) of a function of the plant, with values (rows,
-    k), with respect to each unknown: central differences."""
+    k) and periods, with respect to each unknown: central differences."""
     std = np.concatenate([each.std for each in unknowns])
     columns = []
     for i, step in enumerate(_STEP * std):
         deviations = np.zeros((rows, len(std)))
         deviations[:, i] = step
         larger, smaller = (function(_plant(system, unknowns, d)) for d in (deviations, -deviations))
-        columns.append((larger - smaller) / (2 * step))
+        columns.append(residual(larger, smaller, periods) / (2 * step))
     return np.stack(columns, axis=-1)
 
 

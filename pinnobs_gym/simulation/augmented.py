@@ -158,6 +158,10 @@ def _attributes(plant: System, extras: Mapping[str, Unknown], kept: list[str]) -
         else plant.output_names,
         "input_names": plant.input_names,
         "units": _units(plant, extras),
+        "output_period": property(lambda self: self._known.output_period)
+        if varying
+        else plant.output_period,
+        "state_period": plant.state_period and (*plant.state_period, *[None] * len(extras)),
         "scale": (*scale.tolist(), *(float(value.std) for value in extras.values())),
         "state_bound": (*bound.tolist(), *map(float, wide)),
         "setups": {name: _setup(plant, s, extras, kept) for name, s in plant.setups.items()},

@@ -10,6 +10,7 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.derivatives import central_differences
+from pinnobs_gym.simulation.residual import Periods
 from pinnobs_gym.simulation.system import Array, System, is_number, stack
 
 
@@ -88,7 +89,7 @@ class Augmented(System):
         if not isinstance(x, np.ndarray):
             return super().f_jacobian(t, x, u)
         plant, state = self._parts(x)
-        above = self._jacobian(self.f, plant.f_jacobian(t, state, u), t, x, u)
+        above = self._jacobian(self.f, None, plant.f_jacobian(t, state, u), t, x, u)
         _set_ones(above, self._columns(_DISTURBANCE, plant.state_names))
         F = np.zeros_like(above, shape=(*x.shape, self.nx))
         F[..., : plant.nx, :] = above
@@ -99,13 +100,15 @@ class Augmented(System):
         if not isinstance(x, np.ndarray):
             return super().h_jacobian(t, x, u)
         plant, state = self._parts(x)
-        H = self._jacobian(self.h, plant.h_jacobian(t, state, u), t, x, u)
+        own = plant.h_jacobian(t, state, u)
+        H = self._jacobian(self.h, self.output_period, own, t, x, u)
         _set_ones(H, self._columns(_BIAS, plant.output_names))
         return H
 
     def _jacobian(
         self,
         function: Callable[[Array, np.ndarray, Array], Any],
+        periods: Periods | None,
         own: Array,
         t: Array,
         x: np.ndarray,
@@ -122,7 +125,7 @@ class Augmented(System):
         columns = range(n, n + len(self.constants[_PARAMETER]))
         if columns:
             slopes = central_differences(
-                lambda x: function(t, x, u)[..., :size], x, self.scale, columns
+                lambda x: function(t, x, u)[..., :size], x, self.scale, columns, periods
             )
             result[..., columns] = slopes
         return result

@@ -21,6 +21,7 @@ from pinnobs_gym.simulation.derivatives import central_differences, traced_jacob
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.probe import ModelError, probe
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
@@ -31,6 +32,8 @@ JACOBIAN_TOLERANCE = 1e-6
 """Largest error of a Jacobian, relative to scale; that of central differences is below 1e-9."""
 TRUTH_TOLERANCE = 1e-8
 """Largest relative change of a conserved quantity along the truth."""
+PERIOD_TOLERANCE = 1e-9
+"""Largest difference, relative to their size, of values one period of a state apart."""
 STEP_WARNING = 1e-5
 """Largest error of the model over a sample, relative to scale, without a warning. By default steps
 have a local error of at most `pinnobs_gym.simulation.runge_kutta.STEP_TOLERANCE`."""
@@ -258,7 +261,8 @@ def _check_jacobian(system: System, name: str) -> None:
     t, x, u = _points(system, 20)
     scale = vector(system.scale, system.nx, "scale")
     function, jacobian = getattr(system, name), getattr(system, f"{name}_jacobian")(t, x, u)
-    differences = central_differences(lambda x: function(t, x, u), x, scale)
+    periods = system.output_period if name == "h" else None
+    differences = central_differences(lambda x: function(t, x, u), x, scale, periods=periods)
     require_shape(jacobian, differences.shape, f"{name}_jacobian")
     given, expected = np.asarray(jacobian) * scale, differences * scale
     # Size of a row: its largest entry or the function's value, and at least the largest over the
@@ -351,7 +355,7 @@ def _model_error(system: System, setup: Setup) -> float:
         if not any(t0 <= b <= t1 for b in system.breakpoints()):
             with np.errstate(all="ignore"):
                 size = np.maximum(abs(end), vector(system.scale, system.nx, "scale"))
-                error = abs(model_step(system, t0, t1, path[k]) - end) / size
+                error = abs(system.state_residual(model_step(system, t0, t1, path[k]), end)) / size
             off = np.maximum(off, error.max())  # NaN stays
     return float(off)
 
@@ -379,4 +383,25 @@ def _system_indistinguishable(cls: type[System]) -> None:
             _, y = _trajectories(system, setup, x0)
             _, like = _trajectories(system, setup, np.asarray(other))
             what = f"outputs of indistinguishable states of setup {name!r}"
+            like = nearest(like, y, system.output_period)
             require_close(like, y, TRUTH_TOLERANCE, abs(y).max(), what)
+
+
+@add_check(SYSTEM_CHECKS, "periods")
+def _system_periods(cls: type[System]) -> None:
+    """A state moved by its period has the same rates of change and the same outputs."""
+    system = cls()
+    t, x, u = _points(system, 4)
+    f, y = np.asarray(system.f(t, x, u)), np.asarray(system.h(t, x, u))
+    for i, period in enumerate(system.state_period or ()):
+        if period is None:
+            continue
+        other = x + period * np.eye(system.nx)[i]
+        name = system.state_names[i]
+        for what, found, expected in (
+            ("f", system.f(t, other, u), f),
+            ("h", nearest(np.asarray(system.h(t, other, u)), y, system.output_period), y),
+        ):
+            size = np.maximum(abs(expected).max(), 1e-300)
+            said = f"{what} at {name} and at {name} + {period:g}, the period of {name},"
+            require_close(found, expected, PERIOD_TOLERANCE, size, said)

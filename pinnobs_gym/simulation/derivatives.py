@@ -19,6 +19,7 @@ import numpy as np
 from array_api_compat import is_torch_array
 
 from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.residual import Periods, residual
 from pinnobs_gym.simulation.system import Array, System, vector
 
 _STEP = float(np.cbrt(np.finfo(float).eps))
@@ -65,6 +66,7 @@ def central_differences(
     x: np.ndarray,
     scale: Sequence[float] | np.ndarray,
     columns: Sequence[int] | None = None,
+    periods: Periods | None = None,
 ) -> np.ndarray:
     """Return the derivatives of a function by components of x, (..., m, number of columns).
 
@@ -77,6 +79,7 @@ def central_differences(
         x: where, shape (..., nx).
         scale: scale of each component, shape (nx,).
         columns: the components; all by default.
+        periods: periods of the function's values, see `System.output_period`.
     """
     chosen = list(range(x.shape[-1]) if columns is None else columns)
     count, size = len(chosen), np.asarray(scale, dtype=float)
@@ -88,7 +91,7 @@ def central_differences(
     value = np.asarray(function(points))
     # The distance between the points as they were rounded
     width = [points[i, ..., j] - points[count + i, ..., j] for i, j in enumerate(chosen)]
-    slopes = (value[:count] - value[count:]) / np.stack(width)[..., None]
+    slopes = residual(value[:count], value[count:], periods) / np.stack(width)[..., None]
     return np.moveaxis(slopes, 0, -1).astype(x.dtype, copy=False)
 
 
@@ -148,10 +151,9 @@ def _same(a: np.ndarray, b: np.ndarray, allowed: np.ndarray) -> bool:
 
 def _by_differences(name: str) -> Function:
     def function(system: System, t: Array, x: np.ndarray, u: Array) -> np.ndarray:
-        own = getattr(system, name)
-        return central_differences(
-            lambda x: own(t, x, u), x, vector(system.scale, system.nx, "scale")
-        )
+        own, scale = getattr(system, name), vector(system.scale, system.nx, "scale")
+        periods = system.output_period if name == "h" else None
+        return central_differences(lambda x: own(t, x, u), x, scale, periods=periods)
 
     return function
 

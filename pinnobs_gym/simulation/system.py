@@ -12,6 +12,7 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
+from pinnobs_gym.simulation.residual import Periods, check_periods, residual
 
 Array: TypeAlias = Any
 """An array of any library of the array API standard, such as numpy.ndarray or torch.Tensor."""
@@ -149,6 +150,12 @@ class System(ABC):
     state_bound: ClassVar[tuple[float, ...] | None] = None
     """Largest expected absolute value of each state, for the action space; ten times the scale if
     None."""
+    output_period: ClassVar[Periods | None] = None
+    """Period of each output that repeats, such as ``(None, 2 * pi)`` for a range and a bearing, in
+    its unit; None if none repeats. The truth and `h` need not be wrapped."""
+    state_period: ClassVar[Periods | None] = None
+    """Period of each state that repeats, in its unit; None if none repeats. States that differ by
+    whole periods are the same state, for `f`, `h` and the scores."""
     setups: ClassVar[Mapping[str, Setup]]
     """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
@@ -208,6 +215,16 @@ class System(ABC):
         from pinnobs_gym.simulation.derivatives import jacobian
 
         return jacobian(self, "h", t, x, u)
+
+    def output_residual(self, y: Array, yhat: Array) -> Array:
+        """Return y − ŷ (..., ny), with outputs that repeat wrapped into half a period about zero;
+        see `output_period`."""
+        return y - yhat if self.output_period is None else residual(y, yhat, self.output_period)
+
+    def state_residual(self, x: Array, xhat: Array) -> Array:
+        """Return x − x̂ (..., nx), with states that repeat wrapped into half a period about zero;
+        see `state_period`."""
+        return x - xhat if self.state_period is None else residual(x, xhat, self.state_period)
 
     def admissible(self, x0: Array) -> Array:
         """Return which states (..., nx) of a setup's box are valid initial states: bool (...)."""
@@ -321,6 +338,8 @@ class System(ABC):
             for name in cls.setups:
                 system, setup = cls.configured(name)
                 vector(cls.scale, system.nx, "scale")
+                check_periods(system.output_period, system.ny, "output_period")
+                check_periods(system.state_period, system.nx, "state_period")
                 for part in ("x0_low", "x0_high"):
                     vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
                 for prior in (setup, setup.poor_prior):
@@ -454,7 +473,9 @@ def output_scale(system: System) -> np.ndarray:
         from pinnobs_gym.simulation.derivatives import central_differences
 
         # Few evaluations: differences take less time than it takes to import SymPy.
-        slopes = central_differences(lambda x: system.h(t, x, u), x, scale)
+        slopes = central_differences(
+            lambda x: system.h(t, x, u), x, scale, periods=system.output_period
+        )
         changes = slopes * scale
     else:
         changes = system.h_jacobian(t, x, u) * scale

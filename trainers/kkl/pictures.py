@@ -77,7 +77,8 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
     error = np.full(len(states), np.nan)
     xhat = trained.inverse(z[stays], _late(trained), np.zeros(system.nu))
     scale = vector(system.scale, system.nx, "scale")
-    error[stays] = np.sqrt((((xhat - states[stays]) / scale) ** 2).mean(axis=-1))
+    off = system.state_residual(xhat, states[stays]) / scale
+    error[stays] = np.sqrt((off**2).mean(axis=-1))
     figure = Figure(figsize=(6.5, 5), layout="constrained")
     panel = figure.subplots()
     shown = np.maximum(error, _FLOOR).reshape(GRID, GRID)
@@ -151,7 +152,7 @@ def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) 
     xhat = KKL(system, trained=trained).run(episodes).xhat
     late = slice(3 * len(record.t) // 4, None)
     scale = vector(system.scale, system.nx, "scale")
-    square = (((xhat - x)[:, late] / scale) ** 2).mean(axis=(1, 2))
+    square = ((system.state_residual(xhat, x)[:, late] / scale) ** 2).mean(axis=(1, 2))
     return np.sqrt(square).reshape(x0.shape[:2])
 
 

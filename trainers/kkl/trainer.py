@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from pinnobs_gym.estimation.learned.trained_file import plain
-from pinnobs_gym.estimators.kkl import TrainedKKL
+from pinnobs_gym.estimators.kkl import TrainedKKL, check_outputs
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.trainer import Trainer
@@ -64,6 +64,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         """Return the number of samples between the two of each kept pair; 0 without pairs."""
 
     def start(self) -> None:
+        check_outputs(self.system)
         _check(self.system, self.record)
         self.sweep: list[dict[str, float]] = []
         """The results at each cut-off so far."""

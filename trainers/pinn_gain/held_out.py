@@ -71,7 +71,8 @@ class HeldOut:
         with np.errstate(all="ignore"):
             for k, t in enumerate(data.t):
                 state = gain.update(state, float(t), self._y[:, k], data.u[rows, k])
-                square[k] = (((state.xhat - data.x[rows, k]) / self._scale) ** 2).mean(axis=-1)
+                error = self._model.system.state_residual(state.xhat, data.x[rows, k])
+                square[k] = ((error / self._scale) ** 2).mean(axis=-1)
         # Bound the errors of diverged rows.
         square = np.where(np.isfinite(square), np.minimum(square, _LOST**2), _LOST**2)
         tail = square[-max(1, len(square) // 4) :]

@@ -17,6 +17,7 @@ from pinnobs_gym.estimation.learned.gain_network import (
 from pinnobs_gym.simulation.matrices import sandwich
 from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System
 
 Weights = Sequence[tuple[Tensor, Tensor]]
@@ -96,14 +97,18 @@ def update(
     H = np.broadcast_to(model.system.h_jacobian(t, x, u), (len(x), len(y), len(xhat)))
     H = torch.from_numpy(np.array(H.transpose(1, 2, 0), order="C"))
     predicted = torch.from_numpy(np.array(model.system.h(t, x, u).T, order="C"))
-    innovation = y - predicted - (H * (xhat - at)[None]).sum(1)
+    innovation = model.system.output_residual(y.T, predicted.T).T
+    innovation = innovation - (H * (xhat - at)[None]).sum(1)
+    seen = nearest(xhat.T, 0.0, model.system.state_period).T  # angles within a period
     if model.variant == "gru":
         std = torch.diagonal(R).T.sqrt()
         sizes = model.scale, model.output_scale
-        K, memory = recurrent_gain(weights, *sizes, xhat, innovation, std, state.memory)
+        K, memory = recurrent_gain(weights, *sizes, seen, innovation, std, state.memory)
         return FilterState(xhat + (K * innovation[None]).sum(1), P, memory)
     present = torch.ones_like(innovation, dtype=torch.bool)
-    xhat, P, _, memory = update_with_network(
-        weights, model.scale, xhat, P, innovation, H, R, state.memory, present
+    after, P, _, memory = update_with_network(
+        weights, model.scale, seen, P, innovation, H, R, state.memory, present
     )
-    return FilterState(xhat, P, memory)
+    if model.system.state_period is not None:
+        after = after + (xhat - seen)
+    return FilterState(after, P, memory)

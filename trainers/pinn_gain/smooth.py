@@ -91,7 +91,7 @@ def _explains(ekf: EKF, record: Record, xhat: np.ndarray) -> np.ndarray:
     over the whole record and over windows.
     """
     present = ~np.isnan(record.y)
-    error = record.y - ekf.system.h(record.t, xhat, record.u)
+    error = ekf.system.output_residual(record.y, ekf.system.h(record.t, xhat, record.u))
     square = np.where(present, error**2 / np.einsum("iib->i", ekf.noise.R(0.0)), 0.0)
     window = min(_WINDOW, record.num_samples)
     consistent = np.isfinite(xhat).all(axis=(1, 2))

@@ -121,7 +121,8 @@ class Streams:
             state = update(self.model, weights, state, at, torch.from_numpy(y), R)
             states.append(state)
             x = torch.from_numpy(np.ascontiguousarray(self.data.x[self.record, now].T))
-            errors.append((state.xhat - x) / self.model.scale)
+            error = self.model.system.state_residual(state.xhat.T, x.T).T
+            errors.append(error / self.model.scale)
         return states, torch.stack(errors)
 
     def _advance(self, state: FilterState, now: np.ndarray, first: bool) -> FilterState:
@@ -148,7 +149,8 @@ class Streams:
         self.new[:] = False
         self.position += self.chunk
         over = self.position + self.chunk > len(self.data.t)
-        error = abs(self.xhat - x) / self.model.scale.numpy()
+        error = self.model.system.state_residual(self.xhat.T, x.T).T
+        error = abs(error) / self.model.scale.numpy()
         sound = (error < _FAR).all(axis=0) & np.isfinite(self.P).all(axis=(0, 1))
         self.begin((self.rng.random(len(over)) < RESTART) | over | ~sound)
 

@@ -20,7 +20,7 @@ from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
 from trainers.pinn_obs.minimum import FIRST_STEP, Minimiser
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.passes import draw_layers, flattened, unflattened
-from trainers.pinn_obs.points import fast_frequencies, output_scale, points_of
+from trainers.pinn_obs.points import continuous, fast_frequencies, output_scale, points_of
 from trainers.pinn_obs.quasi_newton import Inverse, QuasiNewton
 from trainers.pinn_obs.recipe import Recipe
 
@@ -63,7 +63,8 @@ class FastRecipe(Recipe):
     def __init__(
         self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
     ) -> None:
-        self.config, self.system, self.record, self.noise_std = config, system, record, noise_std
+        self.config, self.system, self.noise_std = config, system, noise_std
+        self.record = record = continuous(system, record)
         t = record.t
         noisy = bool(self.noise_std.any())
         most = config.points * (_NOISY if noisy else 1)

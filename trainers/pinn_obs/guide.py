@@ -86,7 +86,8 @@ def guide_of(
         return None
     smoothed, P = path.xhat[:, 0], path.P[..., 0]
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
-    first = abs(points.y[0] - system.h(t[0], points.xhat0, points.u[0])) * points.present[0]
+    first = system.output_residual(points.y[0], system.h(t[0], points.xhat0, points.u[0]))
+    first = abs(first) * points.present[0]
     if transfer or not (first > _SIGNIFICANT * np.maximum(noise, _CLEAR * y_scale)).any():
         L = on_lines(t, samples.t, observer_gain(samples.t, along))
         return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
@@ -101,7 +102,8 @@ def guide_of(
     xhat = decay * points.xhat0 + (1 - decay) * target
     rate = (1 - decay) * np.gradient(target, t, axis=0) + decay / tau * (target - points.xhat0)
     # In the initial layer add the gain of least norm that cancels the residual, regularised.
-    innovation = (points.y - system.h(t, xhat, points.u)) * points.present / y_scale
+    innovation = system.output_residual(points.y, system.h(t, xhat, points.u))
+    innovation = innovation * points.present / y_scale
     residual = rate - system.f(t, xhat, points.u)
     residual -= np.einsum("kij,kj->ki", L, innovation * y_scale)
     floor = max(_CLEAR, float((noise / y_scale).max()))

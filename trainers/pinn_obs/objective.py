@@ -161,7 +161,8 @@ class Objective:
         """Return the innovations (..., num_points, ny), zero for missing outputs, and the residuals
         (..., num_points, nx)."""
         points = self.points
-        innovation = (points.y - self.system.h(points.t, xhat, points.u)) * points.present
+        outputs = self.system.h(points.t, xhat, points.u)
+        innovation = self.system.output_residual(points.y, outputs) * points.present
         correction = (L * innovation[..., None, :]).sum(-1)
         return innovation, rate - self.system.f(points.t, xhat, points.u) - correction
 

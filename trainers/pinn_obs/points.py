@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pinnobs_gym.simulation.record import Record
@@ -18,6 +20,19 @@ _LOOKS = 9
 """Number of samples at which the outputs' Jacobian is evaluated."""
 _PERIODS = 20
 """Number of periods in a record above which a frequency becomes an input of the network."""
+
+
+def continuous(system: System, record: Record) -> Record:
+    """Return a record of one episode with outputs that repeat moved by whole periods, so that they
+    do not jump from sample to sample and can be interpolated. Missing outputs stay missing."""
+    if system.output_period is None:
+        return record
+    y = record.y.copy()
+    for i, period in enumerate(system.output_period):
+        present = ~np.isnan(y[0, :, i])
+        if period is not None:
+            y[0, present, i] = np.unwrap(y[0, present, i], period=period)
+    return replace(record, y=y)
 
 
 def points_of(system: System, record: Record, most: int) -> tuple[Points, Record]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pinnobs_gym.simulation.conditions.base import Condition, Unknowns
+from pinnobs_gym.simulation.residual import Periods
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Array, Setup, System, vector
 
@@ -78,6 +79,16 @@ class OtherRates(System):
     def scale(self) -> tuple[float, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Scale of the original plant's states."""
         return self.plant.scale
+
+    @property
+    def output_period(self) -> Periods | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Periods of the original plant's outputs."""
+        return self.plant.output_period
+
+    @property
+    def state_period(self) -> Periods | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Periods of the original plant's states."""
+        return self.plant.state_period
 
     @property
     def model_step(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
