@@ -10,6 +10,7 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
+from pinnobs_gym.estimation.point_images import images
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import (
     carried,
@@ -19,6 +20,7 @@ from pinnobs_gym.estimation.square_root import (
     prior_root,
     root_of,
 )
+from pinnobs_gym.simulation.bounds import Box
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.record import Prior
@@ -46,6 +48,9 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     any K (Arasaratnam & Haykin 2009, the square-root form of section VII). If a covariance has no
     Cholesky factor, its variances are enlarged (`pinnobs_gym.simulation.matrices.JITTER`), and the
     relative amount is reported in the state's memory.
+
+    Points outside of the states' bounds, and points at which f or h is not defined, are replaced as
+    in `pinnobs_gym.estimation.point_images.images`.
     """
 
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -79,11 +84,17 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
         L, memory = _factor(state, memory)
-        points = unit @ L  # (nx, num_points, batch)
-        points += state.xhat.T[:, None]
-        _, _, Q = model_step_moments(self.system, self.noise, state.t, t, state.xhat, state.u, u)
+        times, inputs, xhat = (state.t, t), (state.u, u), state.xhat
+        _, F, Q = model_step_moments(self.system, self.noise, *times, xhat, *inputs)
         # Propagate each point through the model; then compute mean and covariance.
-        points = model_step(self.system, state.t, t, points.transpose(1, 2, 0), state.u, u)
+        points = images(
+            lambda points: model_step(self.system, *times, points, *inputs),
+            lambda: F,
+            xhat,
+            unit @ L,  # (nx, num_points, batch)
+            self._bounds(state),
+            self._notice("f"),
+        )
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
@@ -98,9 +109,14 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         L, memory = _factor(state, memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
-        points = X + xhat.T[:, None]
-        outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
-        outputs = outputs.transpose(2, 0, 1)
+        outputs = images(
+            lambda points: self.system.h(t, points, u),
+            lambda: self.system.h_jacobian(t, xhat, u).transpose(1, 2, 0),
+            xhat,
+            X,
+            self._bounds(state),
+            self._notice("h"),
+        ).transpose(2, 0, 1)
         mean = product(outputs, mean_weights)[:, 0]
         X, Y = X * roots, (outputs - mean[:, None]) * roots
         innovation, missing = y - mean.T, np.isnan(y)
@@ -123,6 +139,17 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
             return after
         noise = K.transpose(2, 0, 1) @ root_of(R.transpose(2, 0, 1))
         return _rooted(after, X, noise)
+
+    def _bounds(self, state: State) -> tuple[Box, np.ndarray] | None:
+        """Return the bounds of the states and the metric of the nearest point within them."""
+        box, P = self.system.state_box, state.P
+        return None if box is None or P is None else (box, P)
+
+    def _notice(self, function: str) -> str:
+        return (
+            f"{self.label} on {type(self.system).__name__}: {function} is not defined at all sigma "
+            "points; they are moved towards the estimate"
+        )
 
 
 def _factor(state: State, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:

@@ -11,6 +11,7 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.projection import nearest_points
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import outer, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
@@ -35,7 +36,8 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     The inflation follows an analysis and gives back at most the spread that the analysis has taken,
     state by state, as the relaxation to prior spread does (Whitaker & Hamill 2012). A state of
     which the outputs tell nothing is not inflated. An ensemble with no more members than states is
-    allowed; its covariance is singular.
+    allowed; its covariance is singular. If the states have bounds, a member outside of them is moved
+    to the nearest point inside, in the metric of the inverse of the ensemble's covariance.
 
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
@@ -78,7 +80,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         L = root(prior.cov.transpose(1, 2, 0))
-        members = prior.mean + spread(L, self._normal(0)(self.system.nx))
+        members = self._inside(prior.mean + spread(L, self._normal(0)(self.system.nx)))
         return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
@@ -95,6 +97,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             u,
             lambda size: normal(size)[:, None],
         )
+        members = self._inside(members)
         memory = replace(memory, members=members)
         return State(total(members) / self.members, state.t, state.u, memory=memory)
 
@@ -119,10 +122,24 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             members = members + errors[..., p, None] * column
         xhat = total(members) / self.members
         deviations = self._inflation(X, Y, K) * (members - xhat)
-        members, X = xhat + deviations, weight * deviations.transpose(2, 0, 1)
+        members = self._inside(xhat + deviations)
+        if self.system.state_box is not None:
+            xhat = total(members) / self.members
+            deviations = members - xhat
+        X = weight * deviations.transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
         memory = replace(memory, members=members, sample=memory.sample + 1)
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
+
+    def _inside(self, members: np.ndarray) -> np.ndarray:
+        """Return the members (num_members, batch, nx) with those outside of the bounds moved to the
+        nearest points inside."""
+        box = self.system.state_box
+        if box is None or not box.outside(members).any():
+            return members
+        X = (members - total(members) / self.members).transpose(2, 0, 1)
+        P = outer(X, X).transpose(2, 0, 1) / (self.members - 1)
+        return nearest_points(members, P, box)
 
     def _inflation(self, X: np.ndarray, Y: np.ndarray, K: np.ndarray) -> np.ndarray:
         """Return the factors (batch, nx) of the deviations after an analysis with the gains K (nx,

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.bounds import Bounds, Box, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 
 Array: TypeAlias = Any
@@ -149,6 +150,12 @@ class System(ABC):
     state_bound: ClassVar[tuple[float, ...] | None] = None
     """Largest expected absolute value of each state, for the action space; ten times the scale if
     None."""
+    state_low: ClassVar[Bounds | None] = None
+    """Value below which each state cannot be, such as ``(0.0, None)``, in its unit; None for no
+    bound. Estimates are never below."""
+    state_high: ClassVar[Bounds | None] = None
+    """Value above which each state cannot be, in its unit; None for no bound. Estimates are never
+    above."""
     setups: ClassVar[Mapping[str, Setup]]
     """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
@@ -175,6 +182,13 @@ class System(ABC):
     def nu(self) -> int:
         """Number of inputs."""
         return len(self.input_names)
+
+    @property
+    def state_box(self) -> Box | None:
+        """The states within `state_low` and `state_high`; None without bounds."""
+        if self.state_low is None and self.state_high is None:
+            return None
+        return box(self.state_low, self.state_high, self.nx)
 
     @abstractmethod
     def f(self, t: Array, x: Array, u: Array) -> Array:
@@ -317,6 +331,7 @@ class System(ABC):
             for name in cls.setups:
                 system, setup = cls.configured(name)
                 vector(cls.scale, system.nx, "scale")
+                box(system.state_low, system.state_high, system.nx)
                 for part in ("x0_low", "x0_high"):
                     vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
                 for prior in (setup, setup.poor_prior):
