@@ -96,8 +96,8 @@ def linear_window(
 def whitened(
     system: System, noise: Noise, sample: tuple[float, np.ndarray, np.ndarray], x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the output errors (batch, ny) at states x (batch, nx), and the output Jacobians (batch,
-    ny, nx), both divided by a root of R. A sample is its time in s, outputs and inputs."""
+    """Return the output errors (batch, ny) at states x (batch, nx), and the output Jacobians
+    (batch, ny, nx), both divided by a root of R. A sample is its time in s, outputs and inputs."""
     t, y, u = sample
     innovation, H = observe(system, t, x, y, u)
     T = root_of(noise.R(t, y).transpose(2, 0, 1))

@@ -14,7 +14,7 @@ from pinnobs_gym.estimation.linear_window import (
     whitened,
 )
 from pinnobs_gym.estimation.projection import nearest
-from pinnobs_gym.estimation.square_root import compressed, covariance, root_of, updated
+from pinnobs_gym.estimation.square_root import compressed, root_of, updated
 from pinnobs_gym.simulation.bounds import Box
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import Noise
@@ -31,6 +31,8 @@ class MovingWindow:
     """Root of its covariance P̄, shape (batch, nx, nx)."""
     x: np.ndarray
     """Estimates of the states at the window's samples, shape (num_samples, batch, nx)."""
+    exact: bool
+    """Whether the model is assumed to have no process noise in the window."""
     t: tuple[float, ...] = ()
     """Times of the samples in s."""
     y: tuple[np.ndarray, ...] = ()
@@ -63,15 +65,14 @@ class MovingWindow:
         F = F.transpose(2, 0, 1)
         G = np.broadcast_to(root_of(Q.transpose(2, 0, 1)), F.shape)
         mean = end + (F @ (deviation + step)[..., None])[..., 0]
-        return MovingWindow(
-            mean, compressed(F @ L, G), self.x[1:], self.t[1:], self.y[1:], self.u[1:]
-        )
+        L = compressed(F @ L, G)
+        rest = self.t[1:], self.y[1:], self.u[1:]
+        return MovingWindow(mean, L, self.x[1:], self.exact, *rest)
 
-    def improved(self, system: System, noise: Noise, exact: bool) -> tuple[MovingWindow, Smoothed]:
+    def improved(self, system: System, noise: Noise) -> tuple[MovingWindow, Smoothed]:
         """Return the window after a Gauss-Newton step of all its states, within their bounds, and
-        the states without bounds with their covariances. If ``exact``, the model is assumed to have
-        no process noise in the window."""
-        window = linear_window(system, noise, self.t, self.y, self.u, self.x, exact)
+        the states without bounds with their covariances."""
+        window = linear_window(system, noise, self.t, self.y, self.u, self.x, self.exact)
         states = smoothed(window, self.mean, self.root)
         box, x = system.state_box, states.x
         if box is not None and box.outside(x).any():
@@ -82,7 +83,7 @@ class MovingWindow:
 def _inside(states: Smoothed, box: Box) -> np.ndarray:
     """Return the states (num_samples, batch, nx) within the bounds that are nearest to those of the
     window, all together."""
-    n, batch, nx = states.x.shape
+    n, _, nx = states.x.shape
     rows = np.flatnonzero(box.outside(states.x).any(axis=0))
     whole = Box(np.tile(box.low, n), np.tile(box.high, n))
     together = states.x[:, rows].swapaxes(0, 1).reshape(len(rows), n * nx)
@@ -90,9 +91,3 @@ def _inside(states: Smoothed, box: Box) -> np.ndarray:
     x = states.x.copy()
     x[:, rows] = moved.reshape(len(rows), n, nx).swapaxes(0, 1)
     return x
-
-
-def last_covariances(states: Smoothed) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariances (batch, nx, nx) of the last state of a window, with and without its
-    last sample."""
-    return covariance(states.root[-1]), covariance(states.predicted_root[-1])

@@ -75,10 +75,9 @@ def kept_inside(holder: Any, box: Box) -> Any:
 
 
 def multipliers(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
-    """Return the Lagrange multipliers λ (batch, n) of the bounds, with which x − Pλ is the `nearest`
-    point of the box: positive at an upper bound, negative at a lower one. The arguments are those
-    of `nearest`, all finite.
-    """
+    """Return the Lagrange multipliers λ (batch, n) of the bounds, positive at an upper bound and
+    negative at a lower one, with which x − Pλ is the `nearest` point of the box. The arguments are
+    those of `nearest`, all finite."""
     bounded = np.flatnonzero(np.isfinite(box.low) | np.isfinite(box.high))
     # In units of the standard deviations, P is the correlation matrix.
     variance = P[:, bounded, bounded]
@@ -93,7 +92,8 @@ def multipliers(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
 def _dual_active_set(
     C: np.ndarray, low: np.ndarray, high: np.ndarray, movable: np.ndarray
 ) -> np.ndarray:
-    """Return λ (batch, n) for which d = −Cλ is the shortest vector within bounds, in the metric C⁻¹.
+    """Return λ (batch, n) for which d = −Cλ is the shortest vector within bounds, in the metric
+    C⁻¹.
 
     The dual method of Goldfarb and Idnani ("A numerically stable dual method for solving strictly
     convex quadratic programs", 1983), for bounds: begin with the minimum without bounds, and bring
@@ -146,9 +146,7 @@ def _dual_active_set(
     return force
 
 
-def _response(
-    C: np.ndarray, active: np.ndarray, p: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _response(C: np.ndarray, active: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return by how much the multipliers of the components at their bounds, bool (batch, n), shrink
     per unit of the multiplier of component p (batch,), shape (batch, n), and the variance of p that
     is left given these components, shape (batch,)."""

@@ -36,8 +36,8 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     The inflation follows an analysis and gives back at most the spread that the analysis has taken,
     state by state, as the relaxation to prior spread does (Whitaker & Hamill 2012). A state of
     which the outputs tell nothing is not inflated. An ensemble with no more members than states is
-    allowed; its covariance is singular. If the states have bounds, a member outside of them is moved
-    to the nearest point inside, in the metric of the inverse of the ensemble's covariance.
+    allowed; its covariance is singular. A member outside of the states' bounds is moved to the
+    nearest point inside, in the metric of the inverse of the ensemble's covariance.
 
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others

@@ -7,51 +7,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.exact_window import ExactWindow, innovation_covariance
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
-from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
-from pinnobs_gym.estimation.least_squares import Fit, linearised, root
+from pinnobs_gym.estimation.kalman import observe
+from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.moving_window import MovingWindow
 from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.estimation.square_root import carried, covariance, prior_root
-from pinnobs_gym.simulation.matrices import cholesky, divide, identity, mapped, product, sandwich
+from pinnobs_gym.simulation.matrices import mapped, sandwich
 from pinnobs_gym.simulation.record import Prior
-
-
-@dataclass(frozen=True)
-class WindowMemory:
-    """The window, and the prior of its first state, from which all others follow. The batch is the
-    last axis of matrices."""
-
-    arrival: np.ndarray
-    """x̄, the estimate of the window's first state from all samples before the window, shape
-    (batch, nx)."""
-    P: np.ndarray
-    """P̄, the covariance of x̄, shape (nx, nx, batch)."""
-    start: np.ndarray
-    """The current estimate of the window's first state, shape (batch, nx)."""
-    t: tuple[float, ...] = ()
-    """Times of the window's samples in s."""
-    y: tuple[np.ndarray, ...] = ()
-    """Outputs at these samples, shape (batch, ny) each."""
-    u: tuple[np.ndarray, ...] = ()
-    """Inputs at these samples, shape (batch, nu) each."""
 
 
 @dataclass(frozen=True)
 class MHEMemory:
     """The windows."""
 
-    first: WindowMemory | None
+    exact: ExactWindow | None
     """Windows whose states follow from their first one; None if the plant has process noise."""
     whole: MovingWindow | None
-    """Windows of which all states are unknown, of some rows; None if there are none."""
+    """Windows of which all states are unknown; None if no row has one."""
     rows: np.ndarray
-    """Numbers of these rows."""
+    """Numbers of the rows that have such a window, whose estimates count there."""
 
 
 @dataclass(frozen=True)
 class MHE(Estimator, GaussianEstimator):
-    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the states that best fit the model and
+    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the states that best fit the model,
     the outputs in a window of the latest samples, and the estimate from the samples before.
 
     For a plant with process noise, all states of the window are unknown. At each sample, starting
@@ -82,7 +63,11 @@ class MHE(Estimator, GaussianEstimator):
 
     name = "mhe"
     equations = r"""
-\text{exact model: } x_{k-N+1} &= \arg\min_x \; (x - \bar x)^\top \bar P^{-1} (x - \bar x)
+\text{process noise: } & x_{k-N+1}, \ldots, \hat x_k = \arg\min
+\| x_{k-N+1} - \bar x \|^2_{\bar P^{-1}}
++ \sum_{j=k-N+1}^{k} \bigl\| y_j - h(t_j, x_j, u_j) \bigr\|^2_{R^{-1}}
++ \sum_{j=k-N+1}^{k-1} \bigl\| x_{j+1} - \varphi(x_j) \bigr\|^2_{Q_j^{-1}} \\
+\text{exact model: } & x_{k-N+1} = \arg\min_x \| x - \bar x \|^2_{\bar P^{-1}}
 + \sum_{j=k-N+1}^{k} \bigl\| y_j - h(t_j, \varphi_j(x), u_j) \bigr\|^2_{R^{-1}} \\
 \hat x_k &= \varphi_k(x_{k-N+1}), \qquad
 G_j = \tfrac{\partial h(t_j, \varphi_j, u_j)}{\partial x}, \quad
@@ -99,144 +84,73 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
-        P0, mean, rows = prior.cov.transpose(1, 2, 0), prior.mean, np.arange(len(prior.mean))
-        first = WindowMemory(mean, P0, mean)
-        if self.noise.told.stochastic:
-            roots = root(P0).transpose(2, 0, 1)
-            return State(mean, P=prior.cov, memory=MHEMemory(None, self._whole(mean, roots), rows))
-        L = prior_root(self.system, prior, self.noise.R(0.0))
-        if L is None:
-            return State(mean, P=prior.cov, memory=MHEMemory(first, None, rows[:0]))
-        rows = carried(L)
-        memory = MHEMemory(first, self._whole(mean[rows], L[rows]), rows)
-        return State(mean, P=prior.cov, memory=memory)
-
-    def _whole(self, mean: np.ndarray, roots: np.ndarray) -> MovingWindow:
-        box = self.system.state_box
-        inside = mean if box is None else nearest(mean, covariance(roots), box)
-        return MovingWindow(mean, roots, inside[None])
+        mean, P0, box = prior.mean, prior.cov, self.system.state_box
+        start = mean if box is None else nearest(mean, P0, box)
+        stochastic = self.noise.told.stochastic
+        if stochastic:
+            roots = root(P0.transpose(1, 2, 0)).transpose(2, 0, 1)
+            window = MovingWindow(mean, roots, start[None], exact=False)
+            return State(mean, P=P0, memory=MHEMemory(None, window, np.arange(len(mean))))
+        exact = ExactWindow(mean, P0.transpose(1, 2, 0), start)
+        roots, rows, wide = prior_root(self.system, prior, self.noise.R(0.0)), np.arange(0), None
+        if roots is not None:
+            rows = carried(roots)
+            wide = MovingWindow(mean[rows], roots[rows], start[None, rows], exact=True)
+        return State(mean, P=P0, memory=MHEMemory(exact, wide, rows))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: MHEMemory = state.memory
-        if memory.first is None:
+        if memory.exact is None:
             return self._by_all_states(memory, t, y, u)
-        after = self._by_first_state(memory.first, t, y, u)
+        after = self._by_first_state(memory, t, y, u)
         if memory.whole is None:
-            return replace(after, memory=replace(memory, first=after.memory))
-        # Rows with a wide prior: their estimates are those with roots.
+            return after
+        # Rows with a very wide prior: their estimates are those with roots.
         rows = memory.rows
         wide = self._by_all_states(memory, t, y[rows], u[rows])
         values = {}
         for name in ("xhat", "P", "innovation", "S"):
             values[name] = getattr(after, name).copy()
             values[name][rows] = getattr(wide, name)
-        return replace(after, **values, memory=replace(wide.memory, first=after.memory))
+        return replace(after, **values, memory=replace(after.memory, whole=wide.memory.whole))
 
     def _by_all_states(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        """Return the state after a sample if all states of the window are unknown."""
-        assert memory.whole is not None
-        system, noise = self.system, self.noise
-        window = memory.whole.extended(system, t, y, u)
+        """Return the state after a sample, in the rows of whose windows all states are unknown."""
+        system, noise, window = self.system, self.noise, memory.whole
+        assert window is not None
+        window = window.extended(system, t, y, u)
         if len(window.t) > self.window:
             window = window.shortened(system, noise)
+        # The last state is the prediction of this sample.
         innovation, H = observe(system, t, window.x[-1], y, u)
-        for k in range(self.steps):
-            window, states = window.improved(system, noise, not noise.told.stochastic)
-            if k == 0:
-                P_before = covariance(states.predicted_root[-1])
+        window, states = window.improved(system, noise)
         H = H.transpose(2, 0, 1)
-        S = H @ P_before @ H.swapaxes(1, 2) + noise.R(t, y).transpose(2, 0, 1)
-        P = covariance(states.root[-1])
-        memory = replace(memory, whole=window)
-        return State(window.x[-1], t, u, P, innovation, S, memory)
-
-    def _by_first_state(
-        self, memory: WindowMemory, t: float, y: np.ndarray, u: np.ndarray
-    ) -> State:
-        """Return the state after a sample if the window's states follow from the first one, with
-        the memory of these windows alone."""
-        if len(memory.t) == self.window:
-            memory = self._moved(memory, t, u)
-        memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
-        start = memory.start
-        fit = self._fit(memory, start)
-        # The trajectory from the previous first state ends at the prediction of this sample.
-        innovation, H = observe(self.system, t, fit.x[-1], y, u)
-        step, P = self._step(fit, memory, start)
+        S = H @ covariance(states.predicted_root[-1]) @ H.swapaxes(1, 2)
+        S = S + noise.R(t, y).transpose(2, 0, 1)
         for _ in range(self.steps - 1):
-            start = start + step
-            fit = self._fit(memory, start)
-            step, P = self._step(fit, memory, start)
+            window, states = window.improved(system, noise)
+        P = covariance(states.root[-1])
+        return State(window.x[-1], t, u, P, innovation, S, replace(memory, whole=window))
+
+    def _by_first_state(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after a sample, if the states of windows follow from their first one."""
+        system, noise, window = self.system, self.noise, memory.exact
+        assert window is not None
+        window = window.extended(t, y, u)
+        if len(window.t) > self.window:
+            window = window.shortened(system, noise)
+        fit = window.fit(system, noise)
+        # The trajectory from the previous first state ends at the prediction of this sample.
+        innovation, H = observe(system, t, fit.x[-1], y, u)
+        step, P = window.step(system, fit)
+        for _ in range(self.steps - 1):
+            window = replace(window, start=window.start + step)
+            fit = window.fit(system, noise)
+            step, P = window.step(system, fit)
         # Map the last step to the latest sample to first order, without a new trajectory.
-        start = start + step
+        window = replace(window, start=window.start + step)
         xhat = fit.x[-1] + mapped(fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
-        memory = replace(memory, start=start)
-        S = _innovation_covariance(P, H, self.noise.R(t, y)).transpose(2, 0, 1)
+        S = innovation_covariance(P, H, noise.R(t, y)).transpose(2, 0, 1)
         P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S, memory)
-
-    def _step(
-        self, fit: Fit, memory: WindowMemory, start: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the step (batch, nx) of the window's first state, within its bounds, and the
-        covariance (nx, nx, batch) of the result."""
-        step, P = _step(fit, memory.P, memory.arrival - start)
-        box = self.system.state_box
-        if box is not None:
-            step = nearest(start + step, P.transpose(2, 0, 1), box) - start
-        return step, P
-
-    def _fit(self, memory: WindowMemory, start: np.ndarray) -> Fit:
-        """Return the model's trajectory through the window from its first state, and the normal
-        equations of the outputs about it."""
-        nx, batch = self.system.nx, len(start)
-        X = identity(nx, batch)
-        return linearised(self.system, self.noise, memory.t, memory.y, memory.u, start, X)
-
-    def _moved(self, memory: WindowMemory, t: float, u: np.ndarray) -> WindowMemory:
-        """Return the memory without the window's first sample, with which x̄ and P̄ are updated. The
-        arguments t and u are those of the sample to be added."""
-        start = memory.start
-        innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])
-        # Update x̄ − x and P̄ with the sample, with the output linearised about x.
-        offset = memory.arrival - start
-        innovation = innovation - mapped(H, offset)
-        R = self.noise.R(memory.t[0], memory.y[0])
-        offset, P, _ = joseph_update(offset, memory.P, innovation, H, R)
-        # Predict x, x̄ and P̄ to the next sample, which becomes the first of the window.
-        second, u_second = (*memory.t, t)[1], (*memory.u, u)[1]
-        times, inputs = (memory.t[0], second), (memory.u[0], u_second)
-        start, P, F, _ = predict(self.system, times, start, P, self.noise, inputs)
-        arrival = start + mapped(F, offset)
-        memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
-        return replace(memory, arrival=arrival, P=P, start=start)
-
-
-def _innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Return S = HP⁻Hᵀ + R, shape (ny, ny, batch), computed as R(R − HPHᵀ)⁻¹R from the covariance P
-    after the update."""
-    R = np.broadcast_to(R, (*R.shape[:2], P.shape[-1]))
-    S = product(divide(R, R - sandwich(H, P)), R)
-    return (S + S.transpose(1, 0, 2)) / 2
-
-
-def _step(fit: Fit, P: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gauss-Newton step (batch, nx) of the window's first state x, and the covariance
-    (P̄⁻¹ + Λ)⁻¹ (nx, nx, batch) of the result.
-
-    P̄ may be singular, so its inverse is avoided; components with zero variance in P̄ then follow x̄.
-
-    Args:
-        fit: the fit at x; Λ is its information.
-        P: P̄, shape (nx, nx, batch).
-        offset: x̄ − x, shape (batch, nx).
-    """
-    # With P̄ = LLᵀ, (P̄⁻¹ + Λ)⁻¹ = L(I + LᵀΛL)⁻¹Lᵀ.
-    L = cholesky(P, semidefinite=True)
-    L_transposed = L.transpose(1, 0, 2)
-    inner = identity(len(P), P.shape[-1]) + product(product(L_transposed, fit.information), L)
-    P = product(divide(L, inner), L_transposed)
-    # The step is that to x̄ plus the correction by the outputs from there.
-    right = fit.right.T - mapped(fit.information, offset)
-    return offset + mapped(P, right), P
+        return State(xhat, t, u, P, innovation, S, replace(memory, exact=window))
