@@ -31,8 +31,8 @@ def augmented(
 
     In each setup, initial states are those of the given system, and each constant is uniform within
     √3 standard deviations of its mean and within its bounds. The prior consists of the system's own
-    and of the means and variances of the constants, all independent. Where a setup names an unknown parameter, the mean
-    is the setup's value.
+    and of the means and variances of the constants, all independent. Where a setup names an unknown
+    parameter, the mean is the setup's value.
 
     Its class, ``type(augmented(...))``, is named after the system and its constants, as
     ``Satellite_a1_bias_y1``, and can be registered like any other.
@@ -206,9 +206,8 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
     low, high = (vector(part, plant.nx, "x0") for part in (setup.x0_low, setup.x0_high))
     half = np.sqrt(3) * stds  # of a uniform law with this standard deviation
     lows, highs = means - half, means + half
-    limits = box(
-        *([getattr(v, side) for v in extras.values()] for side in ("low", "high")), len(means)
-    )
+    sides = ([getattr(value, side) for value in extras.values()] for side in ("low", "high"))
+    limits = box(*sides, len(means))
     if limits is not None:
         lows, highs = limits.clipped(lows), limits.clipped(highs)
     poor = setup.poor_prior
