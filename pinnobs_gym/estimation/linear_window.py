@@ -21,7 +21,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.kalman import observe
 from pinnobs_gym.estimation.smoother import flows
-from pinnobs_gym.estimation.square_root import compressed, root_of, substituted, updated
+from pinnobs_gym.estimation.square_root import compressed, root_of, substituted
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import System
 
@@ -147,14 +147,20 @@ def _forward(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the Kalman filter's predictions (num_samples, batch, nx), less r, and the roots of
     their covariances, given those of the first sample."""
+    _, batch, ny, nx = window.H.shape
     deviations, roots = [deviation], [L]
+    rows = np.zeros((batch, ny + nx, ny + nx + window.G.shape[-1]))
+    rows[:, :ny, :ny] = np.eye(ny)
     for k in range(len(window.F)):
-        H = window.H[k]
-        innovation = window.e[k] - (H @ deviation[..., None])[..., 0]
-        unit = np.broadcast_to(np.eye(H.shape[1]), (len(H), H.shape[1], H.shape[1]))
-        step, L = updated(L, innovation, H, unit)
-        deviation = window.d[k] + (window.F[k] @ (deviation + step)[..., None])[..., 0]
-        L = compressed(window.F[k] @ L, window.G[k])
+        # QR of [[I, HL, 0], [0, FL, G]]ᵀ is [[√S, 0], [FK√S, L']]ᵀ: an update and a prediction.
+        rows[:, :ny, ny : ny + nx] = window.H[k] @ L
+        rows[:, ny:, ny : ny + nx] = window.F[k] @ L
+        rows[:, ny:, ny + nx :] = window.G[k]
+        array = compressed(rows)
+        innovation = window.e[k] - (window.H[k] @ deviation[..., None])[..., 0]
+        step = array[:, ny:, :ny] @ substituted(array[:, :ny, :ny], innovation[..., None])
+        deviation = window.d[k] + (window.F[k] @ deviation[..., None] + step)[..., 0]
+        L = array[:, ny:, ny:]
         deviations.append(deviation)
         roots.append(L)
     return np.stack(deviations), np.stack(roots)

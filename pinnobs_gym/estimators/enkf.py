@@ -122,8 +122,9 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             members = members + errors[..., p, None] * column
         xhat = total(members) / self.members
         deviations = self._inflation(X, Y, K) * (members - xhat)
-        members = self._inside(xhat + deviations)
-        if self.system.state_box is not None:
+        analysed = xhat + deviations
+        members = self._inside(analysed)
+        if members is not analysed:
             xhat = total(members) / self.members
             deviations = members - xhat
         X = weight * deviations.transpose(2, 0, 1)
