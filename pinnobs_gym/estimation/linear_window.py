@@ -9,13 +9,15 @@ its covariances, and an information filter backward that carries a root of its i
 are QR factorisations. No covariance is inverted and nothing is subtracted from one, so that
 neither a wide prior, nor states without process noise, nor a contracting plant costs digits.
 
-Here the batch is the axis before vectors and matrices.
+Here the batch is the axis before vectors and matrices. These are contiguous in memory, so that the
+sums of a row are formed in the same order in batches of any size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -82,15 +84,17 @@ def linear_window(
         exact: whether the process noise is left out.
     """
     n, batch, nx = r.shape
+    r = np.ascontiguousarray(r)
     ends, F, Q = flows(system, noise, np.array(t), r, np.array(u).reshape(n, batch, -1))
     G = np.zeros((n - 1, batch, nx, 0))
     if not exact and n > 1:
         whole = Q.transpose(0, 3, 1, 2).reshape(-1, nx, nx)
-        G = root_of(whole).reshape(n - 1, batch, nx, nx)
+        G = np.ascontiguousarray(root_of(whole)).reshape(n - 1, batch, nx, nx)
     e, H = np.empty((n, batch, system.ny)), np.empty((n, batch, system.ny, nx))
     for k in range(n):
         e[k], H[k] = whitened(system, noise, (float(t[k]), y[k], u[k]), r[k])
-    return LinearWindow(r, ends - r[1:], F.transpose(0, 3, 1, 2), G, e, H)
+    F = np.ascontiguousarray(F.transpose(0, 3, 1, 2))
+    return LinearWindow(r, ends - r[1:], F, G, e, H)
 
 
 def whitened(
@@ -101,7 +105,7 @@ def whitened(
     t, y, u = sample
     innovation, H = observe(system, t, x, y, u)
     T = root_of(noise.R(t, y).transpose(2, 0, 1))
-    T = np.broadcast_to(T, (len(x), *T.shape[1:]))
+    T = np.ascontiguousarray(np.broadcast_to(T, (len(x), *T.shape[1:])))
     both = np.concatenate([innovation[..., None], H.transpose(2, 0, 1)], axis=2)
     both = substituted(T, both)
     return both[..., 0], both[..., 1:]
@@ -130,14 +134,14 @@ def smoothed(window: LinearWindow, mean: np.ndarray, root: np.ndarray) -> Smooth
 def joint_covariance(states: Smoothed, rows: np.ndarray) -> np.ndarray:
     """Return the covariances (rows, num_samples·nx, num_samples·nx) of all states of a window
     together, in some rows of the batch."""
-    root = states.root[:, rows]
+    root, M = (np.ascontiguousarray(part[:, rows]) for part in (states.root, states.M))
     n, batch, nx, _ = root.shape
     P = np.empty((batch, n, nx, n, nx))
     for k in range(n):
         column = root[k] @ root[k].swapaxes(1, 2)
         P[:, k, :, k] = column
         for j in range(k + 1, n):  # Cov(x_j, x_k) = M Cov(x_{j−1}, x_k)
-            column = states.M[j - 1, rows] @ column
+            column = M[j - 1] @ column
             P[:, j, :, k], P[:, k, :, j] = column, column.swapaxes(1, 2)
     return P.reshape(batch, n * nx, n * nx)
 
@@ -163,7 +167,7 @@ def _forward(
         L = array[:, ny:, ny:]
         deviations.append(deviation)
         roots.append(L)
-    return np.stack(deviations), np.stack(roots)
+    return np.ascontiguousarray(np.stack(deviations)), np.ascontiguousarray(np.stack(roots))
 
 
 def _backward(window: LinearWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -194,4 +198,5 @@ def _backward(window: LinearWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _triangle(rows: np.ndarray) -> np.ndarray:
     """Return the upper triangular factor R of the QR factorisation of matrices (..., n, m)."""
-    return np.linalg.qr(rows, mode="r")
+    R: Any = np.linalg.qr(rows, mode="r")
+    return R

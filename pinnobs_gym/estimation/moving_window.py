@@ -60,14 +60,13 @@ class MovingWindow:
         unit = np.broadcast_to(np.eye(H.shape[1]), (batch, H.shape[1], H.shape[1]))
         step, L = updated(self.root, e - (H @ deviation[..., None])[..., 0], H, unit)
         # Predict it to the next sample.
-        times, inputs = self.t[:2], self.u[:2]
-        end, F, Q = model_step_moments(system, noise, *times, x, *inputs)
-        F = F.transpose(2, 0, 1)
+        end, F, Q = model_step_moments(system, noise, self.t[0], self.t[1], x, self.u[0], self.u[1])
+        F = np.ascontiguousarray(F.transpose(2, 0, 1))
         G = np.broadcast_to(root_of(Q.transpose(2, 0, 1)), F.shape)
         mean = end + (F @ (deviation + step)[..., None])[..., 0]
         L = compressed(F @ L, G)
-        rest = self.t[1:], self.y[1:], self.u[1:]
-        return MovingWindow(mean, L, self.x[1:], self.exact, *rest)
+        window = MovingWindow(mean, L, self.x[1:], self.exact)
+        return replace(window, t=self.t[1:], y=self.y[1:], u=self.u[1:])
 
     def improved(self, system: System, noise: Noise) -> tuple[MovingWindow, Smoothed]:
         """Return the window after a Gauss-Newton step of all its states, within their bounds, and

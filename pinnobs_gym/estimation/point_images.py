@@ -48,7 +48,7 @@ def images(
     if not math.isfinite(values.sum()):
         # Rows whose function is defined at the estimate, but not at all points.
         defined = np.isfinite(np.asarray(function(centre[None]))).all(axis=(0, 2))
-        bad = defined & ~np.isfinite(values).all(axis=(0, 2))
+        bad = np.logical_and(defined, ~np.isfinite(values).all(axis=(0, 2)))
         if bad.any():
             used, values = _closer(function, centre, used, values, bad)
             say_once(notice)

@@ -44,8 +44,8 @@ def nearest(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
     rows = np.flatnonzero(box.outside(x) & np.isfinite(x).all(axis=-1))
     if not len(rows):
         return x
-    x = x.copy()
-    moved = (P[rows] @ multipliers(x[rows], P[rows], box)[..., None])[..., 0]
+    x, P = x.copy(), np.ascontiguousarray(P[rows])
+    moved = (P @ multipliers(x[rows], P, box)[..., None])[..., 0]
     x[rows] = box.clipped(x[rows] - np.where(np.isfinite(moved), moved, 0.0))
     return x
 
@@ -83,9 +83,9 @@ def multipliers(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
     variance = P[:, bounded, bounded]
     std = np.sqrt(np.where(variance > 0, variance, 1.0))
     C = P[:, bounded[:, None], bounded] / (std[:, :, None] * std[:, None, :])
-    room = [(side[bounded] - x[:, bounded]) / std for side in (box.low, box.high)]
+    low, high = ((side[bounded] - x[:, bounded]) / std for side in (box.low, box.high))
     force = np.zeros(x.shape)
-    force[:, bounded] = _dual_active_set(C, *room, variance > 0) / std
+    force[:, bounded] = _dual_active_set(np.ascontiguousarray(C), low, high, variance > 0) / std
     return force
 
 

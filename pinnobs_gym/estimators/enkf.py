@@ -125,8 +125,9 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         analysed = xhat + deviations
         members = self._inside(analysed)
         if members is not analysed:
-            xhat = total(members) / self.members
-            deviations = members - xhat
+            moved = (members != analysed).any(axis=(0, 2))[:, None]
+            xhat = np.where(moved, total(members) / self.members, xhat)
+            deviations = np.where(moved, members - xhat, deviations)
         X = weight * deviations.transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
         memory = replace(memory, members=members, sample=memory.sample + 1)

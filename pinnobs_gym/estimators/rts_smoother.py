@@ -72,7 +72,7 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
         t, y, u = record.t, record.y.swapaxes(0, 1), record.u.swapaxes(0, 1)
         roots = root(record.prior.cov.transpose(1, 2, 0)).transpose(2, 0, 1)
         before, after = self._filtered(record, roots)
-        window = linear_window(self.system, self.noise, t.tolist(), y, u, after)
+        window = linear_window(self.system, self.noise, t.tolist(), list(y), list(u), after)
         # The filter linearises h about its predictions, not its estimates.
         for k in range(len(t)):
             e, H = whitened(self.system, self.noise, (float(t[k]), y[k], u[k]), before[k])

@@ -206,8 +206,8 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
     low, high = (vector(part, plant.nx, "x0") for part in (setup.x0_low, setup.x0_high))
     half = np.sqrt(3) * stds  # of a uniform law with this standard deviation
     lows, highs = means - half, means + half
-    sides = ([getattr(value, side) for value in extras.values()] for side in ("low", "high"))
-    limits = box(*sides, len(means))
+    sides = [[getattr(value, side) for value in extras.values()] for side in ("low", "high")]
+    limits = box(sides[0], sides[1], len(means))
     if limits is not None:
         lows, highs = limits.clipped(lows), limits.clipped(highs)
     poor = setup.poor_prior

@@ -28,7 +28,8 @@ class Box:
 
     def outside(self, x: np.ndarray) -> np.ndarray:
         """Return which of the states x (..., nx) exceed a bound, bool (...)."""
-        return ((x < self.low) | (x > self.high)).any(axis=-1)
+        beyond: np.ndarray = np.any((x < self.low) | (x > self.high), axis=-1)
+        return beyond
 
 
 def box(low: Bounds | None, high: Bounds | None, nx: int) -> Box | None:
