@@ -1,5 +1,6 @@
 """Bounds of states: estimates within them, on a reactor whose filters otherwise settle outside."""
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +16,14 @@ from pinnobs_gym.estimators.batch_least_squares import BatchLeastSquares
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
+from pinnobs_gym.estimators.particle import ParticleFilter
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.augmented import augmented
 from pinnobs_gym.simulation.augmented_system import Unknown
 from pinnobs_gym.simulation.checks import check_system
 from pinnobs_gym.simulation.conformance import CheckFailed
 from pinnobs_gym.simulation.model import model_step, model_step_moments
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import matrix, stack
 
@@ -240,3 +243,52 @@ def test_unknown_constants_have_bounds_beside_those_of_the_plant():
     ):
         with pytest.raises(ValueError, match=line):
             Unknown(0.1, 0.1, **bounds)
+
+
+@pytest.mark.parametrize("name", [*MODELS, "batch_least_squares"])
+def test_a_row_is_the_same_alone_and_beside_rows_at_their_bounds(name):
+    _, record = reactor_record(Reactor(), 7)
+    estimator = ESTIMATORS.resolve(name)(Reactor())
+    together, alone = estimator.run(record), estimator.run(record.rows(slice(3, 4)))
+    np.testing.assert_array_equal(together.xhat[3], alone.xhat[0])
+    np.testing.assert_array_equal(together.P[3], alone.P[0])
+
+
+SEEN = []
+"""Smallest values of the states at which `Watched` was asked for an output."""
+
+
+@dataclass(frozen=True)
+class Watched(Reactor):
+    def h(self, t, x, u):
+        SEEN.append(float(np.min(x)))
+        return super().h(t, x, u)
+
+
+@pytest.mark.parametrize("name", ["ukf", "ckf", "enkf"])
+def test_sigma_points_and_members_stay_within_the_bounds(name):
+    _, record = reactor_record(Reactor(), 5)
+    estimator = ESTIMATORS.resolve(name)(Watched())
+    estimator.noise  # noqa: B018 (what is asked once of h is not asked by the filter)
+    SEEN.clear()
+    found = estimator.run(record)
+    assert min(SEEN) >= 0.0
+    assert found.xhat.min() >= 0.0
+    assert len(SEEN) >= record.num_samples
+
+
+def test_where_all_particles_are_outside_it_is_said_and_the_estimate_is_inside(caplog):
+    say_once.cache_clear()
+    caplog.set_level(logging.WARNING, "pinnobs_gym.simulation.notices")
+    _, record = reactor_record(Reactor(), 2)
+    mean = np.array([[-8.0, -8.0], [3.0, 1.0]])
+    away = replace(record, prior=Prior(mean, 0.01 * np.eye(2)[None].repeat(2, 0))).first_samples(5)
+    found = ParticleFilter(Reactor()).run(away)
+    assert (found.xhat >= 0).all()
+    assert [each.getMessage() for each in caplog.records] == [
+        "particle filter on Reactor: all particles are outside of the bounds; they stay where they "
+        "are"
+    ]
+    alone = ParticleFilter(Reactor()).run(away.rows(slice(1, 2)))
+    np.testing.assert_allclose(found.xhat[1], alone.xhat[0], rtol=1e-10)
+    say_once.cache_clear()

@@ -1,6 +1,6 @@
 """Moving horizons on plants with process noise: the states of the window are all unknown."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mpmath
 import numpy as np
@@ -9,6 +9,8 @@ from linear import A, H, Linear, linear_record
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
 from pinnobs_gym.simulation.matrices import mapped
 from pinnobs_gym.simulation.model import model_step, model_step_moments
@@ -270,3 +272,23 @@ def test_process_noise_helps_where_there_is_some():
     assert error < 0.3 * other
     z = (told.xhat.swapaxes(0, 1) - x) / np.sqrt(np.einsum("bkii->kbi", told.P))
     assert np.mean(z[50:] ** 2) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("name", ["ReverseDuffing", "InductionMotor"])
+def test_a_window_of_one_sample_is_the_extended_filter(name):
+    """On nonlinear plants with process noise, also with missing outputs, in each row by itself."""
+    source = EpisodeSource(name)
+    record = source.record(source.play(source.draw(source.streams(range(3))))).first_samples(40)
+    y = record.y.copy()
+    y[1, 5:8], y[2, 20, -1] = np.nan, np.nan
+    record = replace(record, y=y)
+    level = {"process_noise": (0.1 * np.array(source.system.scale)).tolist()}
+    own = MHE(source.system, window=1, assumed_noise=0.0, **level).run(record)
+    peer = EKF(source.system, assumed_noise=0.0, **level).run(record)
+    scale = np.array(source.system.scale)
+    assert (abs(own.xhat - peer.xhat) <= 1e-9 * scale).all()
+    assert (abs(own.P - peer.P) <= 1e-9 * scale[:, None] * scale).all()
+    longer = MHE(source.system, window=4, **level)
+    together, alone = longer.run(record), longer.run(record.rows(slice(1, 2)))
+    np.testing.assert_array_equal(together.xhat[1], alone.xhat[0])
+    np.testing.assert_array_equal(together.P[1], alone.P[0])
