@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
-from pinnobs_gym.estimation.point_images import images
+from pinnobs_gym.estimation.point_images import SigmaPoints
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import (
     carried,
@@ -20,10 +21,10 @@ from pinnobs_gym.estimation.square_root import (
     prior_root,
     root_of,
 )
-from pinnobs_gym.simulation.bounds import Box
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import System
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     relative amount is reported in the state's memory.
 
     Points outside of the states' bounds, and points at which f or h is not defined, are replaced as
-    in `pinnobs_gym.estimation.point_images.images`.
+    in `pinnobs_gym.estimation.point_images`.
     """
 
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -84,17 +85,12 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
         L, memory = _factor(state, memory)
-        times, inputs, xhat = (state.t, t), (state.u, u), state.xhat
-        _, F, Q = model_step_moments(self.system, self.noise, *times, xhat, *inputs)
+        times, inputs, box = (state.t, t), (state.u, u), self.system.state_box
+        sigma = SigmaPoints.of(state.xhat, unit @ L, box, state.P)
+        _, F, Q = model_step_moments(self.system, self.noise, *times, state.xhat, *inputs)
         # Propagate each point through the model; then compute mean and covariance.
-        points = images(
-            lambda points: model_step(self.system, *times, points, *inputs),
-            lambda: F,
-            xhat,
-            unit @ L,  # (nx, num_points, batch)
-            self._bounds(state),
-            self._notice("f"),
-        )
+        step = partial(_step, self.system, times, inputs)
+        points = sigma.images(step(sigma.used), step, lambda: F, self._notice("f"))
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
@@ -109,12 +105,12 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         L, memory = _factor(state, memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
-        outputs = images(
-            lambda points: self.system.h(t, points, u),
+        sigma = SigmaPoints.of(xhat, X, self.system.state_box, state.P)
+        output = partial(_output, self.system, t, u)
+        outputs = sigma.images(
+            output(sigma.used),
+            output,
             lambda: self.system.h_jacobian(t, xhat, u).transpose(1, 2, 0),
-            xhat,
-            X,
-            self._bounds(state),
             self._notice("h"),
         ).transpose(2, 0, 1)
         mean = product(outputs, mean_weights)[:, 0]
@@ -140,16 +136,27 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         noise = K.transpose(2, 0, 1) @ root_of(R.transpose(2, 0, 1))
         return _rooted(after, X, noise)
 
-    def _bounds(self, state: State) -> tuple[Box, np.ndarray] | None:
-        """Return the bounds of the states and the metric of the nearest point within them."""
-        box, P = self.system.state_box, state.P
-        return None if box is None or P is None else (box, P)
-
     def _notice(self, function: str) -> str:
+        """Return what the log says where f or h is not defined at all points."""
         return (
             f"{self.label} on {type(self.system).__name__}: {function} is not defined at all sigma "
             "points; they are moved towards the estimate"
         )
+
+
+def _step(
+    system: System,
+    times: tuple[float, float],
+    inputs: tuple[np.ndarray | None, np.ndarray],
+    x: np.ndarray,
+) -> np.ndarray:
+    """Return `model_step` of states x (..., nx) between two times."""
+    return model_step(system, *times, x, *inputs)
+
+
+def _output(system: System, t: float, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the outputs (..., ny) at states x (..., nx)."""
+    return np.asarray(system.h(t, x, u))
 
 
 def _factor(state: State, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:

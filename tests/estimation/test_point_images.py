@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 
-from pinnobs_gym.estimation.point_images import images
+from pinnobs_gym.estimation.point_images import SigmaPoints
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
@@ -46,6 +46,11 @@ def points(batch=3):
     return centre, rng.standard_normal((2, 5, batch))
 
 
+def images(function, centre, deviations, bounds):
+    sigma = SigmaPoints.of(centre, deviations, *(bounds or (None, None)))
+    return sigma.images(function(sigma.used), function, jacobian, LINE)
+
+
 def jacobian():
     return np.repeat(M[..., None], 3, axis=2)
 
@@ -57,7 +62,7 @@ def test_a_linear_function_has_the_values_of_the_original_points(said):
     box = Box(np.zeros(2), np.full(2, np.inf)), np.tile(np.eye(2) + 0.3, (3, 1, 1))
     for floor, bounds in ((-np.inf, None), (0.0, None), (0.05, None), (-np.inf, box), (0.05, box)):
         seen = []
-        found = images(only_above(floor, seen), jacobian, centre, deviations, bounds, LINE)
+        found = images(only_above(floor, seen), centre, deviations, bounds)
         np.testing.assert_allclose(found, original @ M.T, atol=1e-12)
         if bounds is not None:
             assert min(x.min() for x in seen) >= 0.0
@@ -67,7 +72,7 @@ def test_a_linear_function_has_the_values_of_the_original_points(said):
 def test_a_row_that_needs_no_other_points_is_left_as_it_is():
     centre, deviations = points()
     deviations[:, :, 1] *= 0.01
-    alone = images(only_above(0.0, []), jacobian, centre, deviations, None, LINE)
+    alone = images(only_above(0.0, []), centre, deviations, None)
     plain = (centre.T[:, None] + deviations).transpose(1, 2, 0) @ M.T
     np.testing.assert_array_equal(alone[:, 1], plain[:, 1])
 
@@ -75,7 +80,7 @@ def test_a_row_that_needs_no_other_points_is_left_as_it_is():
 def test_nothing_is_said_or_done_where_the_function_is_not_defined_at_the_estimate(said):
     centre, deviations = points()
     seen = []
-    found = images(only_above(np.inf, seen), jacobian, centre, deviations, None, LINE)
+    found = images(only_above(np.inf, seen), centre, deviations, None)
     assert np.isnan(found).all()
     assert len(seen) == 2
     assert said() == []
