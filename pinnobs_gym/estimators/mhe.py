@@ -23,7 +23,8 @@ class MHEMemory:
     """The windows."""
 
     exact: ExactWindow | None
-    """Windows whose states follow from their first one; None if the plant has process noise."""
+    """Windows whose states follow from their first one; None if all states of all windows are
+    unknown."""
     whole: MovingWindow | None
     """Windows of which all states are unknown; None if no row has one."""
     rows: np.ndarray
@@ -86,13 +87,15 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         prior = checked(prior)
         mean, P0, box = prior.mean, prior.cov, self.system.state_box
         start = mean if box is None else nearest(mean, P0, box)
-        stochastic = self.noise.told.stochastic
-        if stochastic:
+        stochastic, R = self.noise.told.stochastic, self.noise.R(0.0)
+        roots, rows, wide = prior_root(self.system, prior, R), np.arange(0), None
+        # Noise that differs between rows is that of all rows, not of some.
+        by_row = self.noise.samples is not None or R.shape[-1] > 1
+        if stochastic or (roots is not None and by_row):
             roots = root(P0.transpose(1, 2, 0)).transpose(2, 0, 1)
-            window = MovingWindow(mean, roots, start[None], exact=False)
+            window = MovingWindow(mean, roots, start[None], exact=not stochastic)
             return State(mean, P=P0, memory=MHEMemory(None, window, np.arange(len(mean))))
         exact = ExactWindow(mean, P0.transpose(1, 2, 0), start)
-        roots, rows, wide = prior_root(self.system, prior, self.noise.R(0.0)), np.arange(0), None
         if roots is not None:
             rows = carried(roots)
             wide = MovingWindow(mean[rows], roots[rows], start[None, rows], exact=True)

@@ -52,9 +52,12 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
 
     def run(self, record: Record) -> Estimates:
         record = replace(record, prior=checked(record.prior))
-        roots = prior_root(self.system, record.prior, self.noise.R(0.0))
+        R = self.noise.R(0.0)
+        roots = prior_root(self.system, record.prior, R)
         rows = np.arange(0) if roots is None else carried(roots)
-        if not self.noise.stochastic:
+        # Noise that differs between rows is that of all rows, not of some.
+        by_row = self.noise.samples is not None or R.shape[-1] > 1
+        if not self.noise.stochastic or (len(rows) and by_row):
             rows = np.arange(record.batch)
         with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             if len(rows) == record.batch:

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
+from pinnobs_gym.estimators.rts_smoother import RTSSmoother
 from pinnobs_gym.simulation.matrices import mapped
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import SampledLevel
@@ -292,3 +293,20 @@ def test_a_window_of_one_sample_is_the_extended_filter(name):
     together, alone = longer.run(record), longer.run(record.rows(slice(1, 2)))
     np.testing.assert_array_equal(together.xhat[1], alone.xhat[0])
     np.testing.assert_array_equal(together.P[1], alone.P[0])
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-2])
+def test_a_wide_row_and_noise_by_sample_go_together(q):
+    record = wide_record(Moving(), 10.0, batch=3)
+    cov = record.prior.cov.copy()
+    cov[1] *= 1e14
+    both = Record(record.t, record.y, record.u, Prior(record.prior.mean, cov))
+    std = np.random.default_rng(1).uniform(0.05, 0.5, record.y.shape)
+    found = MHE(Moving(), noise_std=SampledLevel(record.t, std), process_noise=q).run(both)
+    for i in range(3):
+        level = SampledLevel(record.t, std[i : i + 1])
+        alone = MHE(Moving(), noise_std=level, process_noise=q).run(both.rows(slice(i, i + 1)))
+        np.testing.assert_allclose(found.xhat[i], alone.xhat[0], rtol=1e-8)
+        np.testing.assert_allclose(found.P[i], alone.P[0], rtol=1e-8, atol=1e-12)
+    smoother = RTSSmoother(Moving(), noise_std=SampledLevel(record.t, std), process_noise=q)
+    assert np.isfinite(smoother.run(both).xhat).all()
