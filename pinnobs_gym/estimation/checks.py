@@ -25,7 +25,7 @@ from pinnobs_gym.simulation.conformance import (
 )
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import System, initial_states, vector
+from pinnobs_gym.simulation.system import System, initial_states, output_scale, vector
 from pinnobs_gym.simulation.truth import truth
 
 ROUNDING = 1e-10
@@ -309,6 +309,25 @@ def _estimator_model_alone(estimator: BaseEstimator) -> None:
             f"and the model's state from x̂₀"
         )
         require_close(found[:, k], x, MODEL_STEP, vector(system.scale, system.nx, "scale"), what)
+
+
+@add_check(ESTIMATOR_CHECKS, "bounds")
+def _estimator_bounds(estimator: BaseEstimator) -> None:
+    """Estimates are within the bounds of the states, whatever the outputs. A system without bounds
+    has none to leave."""
+    box = estimator.system.state_box
+    if box is None:
+        return
+    record, size = _record(estimator), 10 * output_scale(estimator.system)
+    for change in (0.0, size, -size):
+        found = estimator.run(replace(record, y=record.y + change)).xhat
+        outside = box.outside(found)
+        if outside.any():
+            row, k = np.argwhere(outside)[0]
+            raise Found(
+                f"the estimate {found[row, k].tolist()} at sample {k} of row {row} is outside of "
+                f"the bounds {box.low.tolist()} to {box.high.tolist()}; expected one within"
+            )
 
 
 @add_check(ESTIMATOR_CHECKS, "irregular_times")

@@ -1,6 +1,6 @@
-"""The check of what an estimator is given, the same for all estimators.
+"""The check of what an estimator is given, and the bounds of what it returns, the same for all.
 
-`BaseEstimator` applies it to the methods ``run`` and ``update`` that a class defines, so that no
+`BaseEstimator` applies both to the methods ``run`` and ``update`` that a class defines, so that no
 estimator has to, and none can broadcast outputs of another number.
 """
 
@@ -12,24 +12,28 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.simulation.record import Record
 
 
 def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method ``run(record)`` with `Record.check_fits` before it."""
+    """Return the method ``run(record)`` with `Record.check_fits` before it, and `kept_inside` after
+    it if the system's states have bounds."""
 
     @wraps(run)
     def checked(self: Any, record: Record) -> Any:
         record.check_fits(self.system)
-        return run(self, record)
+        result, box = run(self, record), self.system.state_box
+        return result if box is None else kept_inside(result, box)
 
     return checked
 
 
 def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method ``update(state, t, y, u)`` with a check of the shapes of y and u before it.
+    """Return the method ``update(state, t, y, u)`` with a check of the shapes of y and u before it,
+    and `kept_inside` after it if the system's states have bounds.
 
-    It takes less than a microsecond. Values are checked once per record, by `Record`.
+    The check takes less than a microsecond. Values are checked once per record, by `Record`.
     """
 
     @wraps(update)
@@ -37,7 +41,8 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
         system, batch = self.system, len(state.xhat)
         if np.shape(y) != (batch, system.ny) or np.shape(u) != (batch, system.nu):
             raise ValueError(_unfit(type(system).__name__, batch, system, y, u))
-        return update(self, state, t, y, u)
+        result, box = update(self, state, t, y, u), system.state_box
+        return result if box is None else kept_inside(result, box)
 
     return checked
 

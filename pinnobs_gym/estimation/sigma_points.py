@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
+from pinnobs_gym.estimation.point_images import SigmaPoints
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import (
     carried,
@@ -20,9 +22,10 @@ from pinnobs_gym.estimation.square_root import (
     root_of,
 )
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
-from pinnobs_gym.simulation.model import model_step_moments
+from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.residual import nearest
+from pinnobs_gym.simulation.system import System
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,9 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     Cholesky factor, its variances are enlarged (`pinnobs_gym.simulation.matrices.JITTER`), and the
     relative amount is reported in the state's memory.
 
-    Of an angle, the points' values are taken within half a turn of that at x̂, so that their mean
-    and deviations are those of numbers.
+    Points outside of the states' bounds, and points at which f or h is not defined, are replaced as
+    in `pinnobs_gym.estimation.point_images`. Of an angle, the points' values are taken within half
+    a turn of that at x̂, so that their mean and deviations are those of numbers.
     """
 
     exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
@@ -83,12 +87,14 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
         L, memory = _factor(state, memory)
-        points = unit @ L  # (nx, num_points, batch)
-        points += state.xhat.T[:, None]
+        times, inputs, box = (state.t, t), (state.u, u), self.system.state_box
+        sigma = SigmaPoints.of(state.xhat, unit @ L, box, state.P)
         # Propagate the estimate and each point through the model; then compute mean and covariance.
-        points = np.concatenate([state.xhat.T[:, None], points], axis=1).transpose(1, 2, 0)
-        points, _, Q = model_step_moments(self.system, self.noise, state.t, t, points, state.u, u)
-        points = nearest(points[1:], points[0], self.system.state_period)
+        whole = np.concatenate([state.xhat[None], sigma.used])
+        values, F, Q = model_step_moments(self.system, self.noise, *times, whole, *inputs)
+        step = partial(_step, self.system, times, inputs)
+        points = sigma.images(values[1:], step, lambda: F, self._notice("f"))
+        points = nearest(points, values[0], self.system.state_period)
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
         X = (points - mean[:, None]) * roots
@@ -103,8 +109,14 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         L, memory = _factor(state, memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
-        points = X + xhat.T[:, None]
-        outputs = np.asarray(self.system.h(t, points.transpose(1, 2, 0), u))
+        sigma = SigmaPoints.of(xhat, X, self.system.state_box, state.P)
+        output = partial(_output, self.system, t, u)
+        outputs = sigma.images(
+            output(sigma.used),
+            output,
+            lambda: self.system.h_jacobian(t, xhat, u).transpose(1, 2, 0),
+            self._notice("h"),
+        )
         if (period := self.system.output_period) is not None:  # angles near that of the centre
             outputs = nearest(outputs, self.system.h(t, xhat, u), period)
         outputs = outputs.transpose(2, 0, 1)
@@ -130,6 +142,28 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
             return after
         noise = K.transpose(2, 0, 1) @ root_of(R.transpose(2, 0, 1))
         return _rooted(after, X, noise)
+
+    def _notice(self, function: str) -> str:
+        """Return what the log says where f or h is not defined at all points."""
+        return (
+            f"{self.label} on {type(self.system).__name__}: {function} is not defined at all sigma "
+            "points; they are moved towards the estimate"
+        )
+
+
+def _step(
+    system: System,
+    times: tuple[float, float],
+    inputs: tuple[np.ndarray | None, np.ndarray],
+    x: np.ndarray,
+) -> np.ndarray:
+    """Return `model_step` of states x (..., nx) between two times."""
+    return model_step(system, *times, x, *inputs)
+
+
+def _output(system: System, t: float, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the outputs (..., ny) at states x (..., nx)."""
+    return np.asarray(system.h(t, x, u))
 
 
 def _factor(state: State, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.estimation.kalman import cautious, kalman_gain, observe, predict, update_with
+from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.simulation.matrices import (
     divide_factored,
     factor,
@@ -80,6 +81,7 @@ def forward(
     x, P = record.prior.mean, record.prior.cov.transpose(1, 2, 0)
     before, after = (Path(np.empty((n, batch, nx)), np.empty((n, nx, nx, batch))) for _ in range(2))
     K, H = np.empty((n, nx, ny, batch)), np.empty((n, ny, nx, batch))
+    box = system.state_box
     ends, F, Q = np.empty((0, batch, nx)), *(np.empty((n - 1, nx, nx, batch)) for _ in range(2))
     if about is not None:
         ends, F, Q = flows(system, noise, t, about, u)
@@ -101,6 +103,8 @@ def forward(
         R = cautious(P, H[k], noise.R(float(t[k]), y[k]), caution)
         K[k], _ = kalman_gain(P, H[k], R)
         x, P = update_with(K[k], x, P, innovation, H[k], R)
+        if box is not None and about is None:
+            x = nearest(x, P.transpose(2, 0, 1), box)
         after.xhat[k], after.P[k] = x, P
     return Filtered(after.xhat, after.P, before, F, Q, K, H)
 

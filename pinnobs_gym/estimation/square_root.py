@@ -79,7 +79,7 @@ def updated(
     top = np.concatenate([noise, H @ L], axis=2)
     bottom = np.concatenate([np.zeros((len(L), L.shape[1], ny)), L], axis=2)
     array = compressed(np.concatenate([top, bottom], axis=1))
-    whitened = _solved(array[:, :ny, :ny], innovation[..., None])
+    whitened = substituted(array[:, :ny, :ny], innovation[..., None])
     return (array[:, ny:, :ny] @ whitened)[..., 0], array[:, ny:, ny:]
 
 
@@ -94,7 +94,7 @@ def gain(X: np.ndarray, Y: np.ndarray, R: np.ndarray) -> np.ndarray:
     stacked = np.concatenate([Y, root_of(R)], axis=2).swapaxes(1, 2)
     Q, T = np.linalg.qr(stacked)  # YYᵀ + R = TᵀT, and Y = Tᵀ times the first rows of Q, transposed
     product = X @ Q[:, : X.shape[2]]
-    return _solved(T.swapaxes(1, 2), product.swapaxes(1, 2), transposed=True).swapaxes(1, 2)
+    return substituted(T.swapaxes(1, 2), product.swapaxes(1, 2), transposed=True).swapaxes(1, 2)
 
 
 def root_of(R: np.ndarray) -> np.ndarray:
@@ -102,9 +102,9 @@ def root_of(R: np.ndarray) -> np.ndarray:
     return cholesky(R.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1)
 
 
-def _solved(L: np.ndarray, b: np.ndarray, transposed: bool = False) -> np.ndarray:
-    """Return L⁻¹b, or L⁻ᵀb, (batch, n, m) for lower triangular L (batch, n, n). A component with a
-    zero pivot is zero, for it has no variance."""
+def substituted(L: np.ndarray, b: np.ndarray, transposed: bool = False) -> np.ndarray:
+    """Return L⁻¹b or, if transposed, L⁻ᵀb, (batch, n, m) for lower triangular L (batch, n, n). A
+    component with a zero pivot is zero, for it has no variance."""
     n, x = L.shape[1], np.zeros(b.shape)
     if transposed:
         L = L.swapaxes(1, 2)

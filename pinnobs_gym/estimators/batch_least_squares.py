@@ -9,7 +9,8 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
-from pinnobs_gym.simulation.matrices import inner, mapped, sandwich
+from pinnobs_gym.estimation.projection import multipliers
+from pinnobs_gym.simulation.matrices import identity, inner, mapped, sandwich
 from pinnobs_gym.simulation.record import Record
 
 _ROUNDING = 1e-12
@@ -26,6 +27,9 @@ class BatchLeastSquares(OfflineEstimator):
     initial part of the record, whose length is doubled until it is the whole record. The phase of
     an oscillation, known from the prior, is thus not lost. With an exact model the errors approach
     the Cramér–Rao bound. Covariances are those of the smoothed states, Φ(P₀⁻¹ + ΣΦᵀHᵀR⁻¹HΦ)⁻¹Φᵀ.
+
+    If the states have bounds, x₀ is kept within them: a step that would leave them is that of the
+    same quadratic cost with bounds (`pinnobs_gym.estimation.projection`).
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and R that of the
     known output noise.
@@ -61,6 +65,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
         record = replace(record, prior=checked(record.prior))
         L = root(record.prior.cov.transpose(1, 2, 0))
         z = np.zeros(record.prior.mean.T.shape)
+        z = self._inside(record.prior.mean, L, z, identity(*z.shape))
         with np.errstate(all="ignore"):
             for length in self._stretches(record.num_samples):
                 z = self._fitted(record, L, z, length)
@@ -83,6 +88,8 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
         prior."""
         root_of = L[..., rows]
         x0 = record.prior.mean[rows] + mapped(root_of, z.T)
+        if (box := self.system.state_box) is not None:
+            x0 = box.clipped(x0)  # against rounding
         y, u = record.y[rows, :length].swapaxes(0, 1), record.u[rows, :length].swapaxes(0, 1)
         t = record.t[:length]
         fit = linearised(self.system, self.noise, t, y, u, x0, root_of)
@@ -101,8 +108,10 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
         for _ in range(self.max_iterations if whole else self.first_iterations):
             # The step solves the normal equations with a damped diagonal (Marquardt's scaling).
             diagonal = np.einsum("iib->ib", information)
-            step = solved(information + damping * (np.eye(len(z))[..., None] * diagonal), right)
-            trial = z[:, rows] + step
+            damped = information + damping * (np.eye(len(z))[..., None] * diagonal)
+            trial = z[:, rows] + solved(damped, right)
+            trial = self._inside(record.prior.mean[rows], L[..., rows], trial, damped)
+            step = trial - z[:, rows]
             fit = self._evaluated(record, L, trial, rows, length)
             # Accept the step and reduce the damping where the cost does not increase; else increase
             # the damping.
@@ -119,4 +128,24 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
                 break
             rows, damping, cost = rows[active], damping[active], cost[active]
             information, right = information[..., active], right[:, active]
+        return z
+
+    def _inside(
+        self, mean: np.ndarray, L: np.ndarray, z: np.ndarray, information: np.ndarray
+    ) -> np.ndarray:
+        """Return the parameters (nx, rows) within the bounds at which a quadratic cost with the
+        minimum z and the Hessian ``information`` (nx, nx, rows), up to a factor, is least; mean
+        (rows, nx) and L (nx, nx, rows) are those of the prior."""
+        box, x0 = self.system.state_box, mean + mapped(L, z.T)
+        if box is None:
+            return z
+        rows = np.flatnonzero(box.outside(x0) & np.isfinite(x0).all(axis=-1))
+        if len(rows):
+            # In x₀ the inverse of the Hessian is L·information⁻¹·Lᵀ.
+            L_rows = L[..., rows].transpose(2, 0, 1)
+            inverse = np.linalg.inv(information[..., rows].transpose(2, 0, 1))
+            C = inverse @ L_rows.swapaxes(1, 2)
+            force = multipliers(x0[rows], L_rows @ C, box)
+            z = z.copy()
+            z[:, rows] -= (C @ force[..., None])[..., 0].T
         return z

@@ -12,6 +12,7 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.projection import nearest_points
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import outer, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
@@ -36,7 +37,8 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     The inflation follows an analysis and gives back at most the spread that the analysis has taken,
     state by state, as the relaxation to prior spread does (Whitaker & Hamill 2012). A state of
     which the outputs tell nothing is not inflated. An ensemble with no more members than states is
-    allowed; its covariance is singular.
+    allowed; its covariance is singular. A member outside of the states' bounds is moved to the
+    nearest point inside, in the metric of the inverse of the ensemble's covariance.
 
     Members that differ by whole turns of an angle are the same states: they are taken within half a
     turn of their circular mean, and so are their outputs.
@@ -83,7 +85,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         prior = checked(prior)
         L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + spread(L, self._normal(0)(self.system.nx))
-        members = gathered(members, self.system.state_period)
+        members = self._inside(gathered(members, self.system.state_period))
         return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
@@ -100,7 +102,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             u,
             lambda size: normal(size)[:, None],
         )
-        members = gathered(members, self.system.state_period)
+        members = self._inside(gathered(members, self.system.state_period))
         memory = replace(memory, members=members)
         return State(total(members) / self.members, state.t, state.u, memory=memory)
 
@@ -128,11 +130,27 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         members = gathered(members, self.system.state_period)
         xhat = total(members) / self.members
         deviations = self._inflation(X, Y, K) * (members - xhat)
-        members, X = xhat + deviations, weight * deviations.transpose(2, 0, 1)
+        analysed = xhat + deviations
+        members = self._inside(analysed)
+        if members is not analysed:
+            moved = (members != analysed).any(axis=(0, 2))[:, None]
+            xhat = np.where(moved, total(members) / self.members, xhat)
+            deviations = np.where(moved, members - xhat, deviations)
+        X = weight * deviations.transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), self.system.output_residual(y, yhat)
         innovation = np.where(missing, 0.0, innovation)
         memory = replace(memory, members=members, sample=memory.sample + 1)
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
+
+    def _inside(self, members: np.ndarray) -> np.ndarray:
+        """Return the members (num_members, batch, nx) with those outside of the bounds moved to the
+        nearest points inside."""
+        box = self.system.state_box
+        if box is None or not box.outside(members).any():
+            return members
+        X = (members - total(members) / self.members).transpose(2, 0, 1)
+        P = outer(X, X).transpose(2, 0, 1) / (self.members - 1)
+        return nearest_points(members, P, box)
 
     def _inflation(self, X: np.ndarray, Y: np.ndarray, K: np.ndarray) -> np.ndarray:
         """Return the factors (batch, nx) of the deviations after an analysis with the gains K (nx,

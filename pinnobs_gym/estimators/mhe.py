@@ -7,45 +7,52 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimator, Range, State
+from pinnobs_gym.estimation.exact_window import ExactWindow, innovation_covariance
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
-from pinnobs_gym.estimation.kalman import joseph_update, observe, predict
-from pinnobs_gym.estimation.least_squares import Fit, linearised
-from pinnobs_gym.simulation.matrices import cholesky, divide, identity, mapped, product, sandwich
+from pinnobs_gym.estimation.kalman import observe
+from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.moving_window import MovingWindow
+from pinnobs_gym.estimation.projection import nearest
+from pinnobs_gym.estimation.square_root import carried, covariance, prior_root
+from pinnobs_gym.simulation.matrices import mapped, sandwich
 from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class WindowMemory:
-    """The window and the prior of its first state. The batch is the last axis of matrices."""
+class MHEMemory:
+    """The windows."""
 
-    arrival: np.ndarray
-    """x̄, the estimate of the window's first state from all samples before the window, shape
-    (batch, nx)."""
-    P: np.ndarray
-    """P̄, the covariance of x̄, shape (nx, nx, batch)."""
-    start: np.ndarray
-    """The current estimate of the window's first state, shape (batch, nx)."""
-    t: tuple[float, ...] = ()
-    """Times of the window's samples in s."""
-    y: tuple[np.ndarray, ...] = ()
-    """Outputs at these samples, shape (batch, ny) each."""
-    u: tuple[np.ndarray, ...] = ()
-    """Inputs at these samples, shape (batch, nu) each."""
+    exact: ExactWindow | None
+    """Windows whose states follow from their first one; None if all states of all windows are
+    unknown."""
+    whole: MovingWindow | None
+    """Windows of which all states are unknown; None if no row has one."""
+    rows: np.ndarray
+    """Numbers of the rows that have such a window, whose estimates count there."""
 
 
 @dataclass(frozen=True)
 class MHE(Estimator, GaussianEstimator):
-    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the model's trajectory that best fits
-    the outputs in a window of the latest samples and the estimate from the samples before.
+    """Moving-horizon estimation (Rao, Rawlings & Mayne 2003): the states that best fit the model,
+    the outputs in a window of the latest samples, and the estimate from the samples before.
 
-    At each sample, Gauss-Newton steps decrease (x − x̄)ᵀP̄⁻¹(x − x̄) + Σ(y − h)ᵀR⁻¹(y − h) over the
-    window's first state x, starting from the result at the previous sample. When a sample leaves
-    the window, x̄ and P̄ are updated with it as in an extended Kalman filter linearised about x.
-    Within the window the model is assumed exact. A window longer than the record gives
-    full-information estimation.
+    For a plant with process noise, all states of the window are unknown. At each sample, starting
+    from the result at the previous one, Gauss-Newton steps decrease the sum of (x − x̄)ᵀP̄⁻¹(x − x̄)
+    over the window's first state x, of (y − h)ᵀR⁻¹(y − h) over the samples, and of wᵀQ⁻¹w over the
+    steps, where w are the model's defects. A step is a Kalman smoother linearised about the current
+    states (Bell 1994; `pinnobs_gym.estimation.linear_window`). When a sample leaves the window, x̄
+    and P̄ are updated with it as in an extended Kalman filter linearised about x (Kühl et al. 2011).
+
+    For a plant that is told to have none, the model is assumed exact within the window, and only
+    the first state is unknown. `assumed_noise` is then added to P̄ when the window moves. Episodes
+    with a very wide prior are computed with roots, see `pinnobs_gym.estimation.square_root`.
+
+    A window longer than the record gives full-information estimation. Bounds of states hold for all
+    states of the window or, with an exact model, for the first and the latest (the minimum within
+    the box, see `pinnobs_gym.estimation.projection`).
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
-    the known one with `assumed_noise` added. Process noise is added to P̄ when the window moves.
+    the known one with `assumed_noise` added.
     """
 
     assumed_noise: float = 6e-4
@@ -57,7 +64,11 @@ class MHE(Estimator, GaussianEstimator):
 
     name = "mhe"
     equations = r"""
-x_{k-N+1} &= \arg\min_x \; (x - \bar x)^\top \bar P^{-1} (x - \bar x)
+\text{process noise: } & x_{k-N+1}, \ldots, \hat x_k = \arg\min
+\| x_{k-N+1} - \bar x \|^2_{\bar P^{-1}}
++ \sum_{j=k-N+1}^{k} \bigl\| y_j - h(t_j, x_j, u_j) \bigr\|^2_{R^{-1}}
++ \sum_{j=k-N+1}^{k-1} \bigl\| x_{j+1} - \varphi(x_j) \bigr\|^2_{Q_j^{-1}} \\
+\text{exact model: } & x_{k-N+1} = \arg\min_x \| x - \bar x \|^2_{\bar P^{-1}}
 + \sum_{j=k-N+1}^{k} \bigl\| y_j - h(t_j, \varphi_j(x), u_j) \bigr\|^2_{R^{-1}} \\
 \hat x_k &= \varphi_k(x_{k-N+1}), \qquad
 G_j = \tfrac{\partial h(t_j, \varphi_j, u_j)}{\partial x}, \quad
@@ -74,82 +85,75 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
-        P0, mean = prior.cov.transpose(1, 2, 0), prior.mean
-        return State(mean, P=prior.cov, memory=WindowMemory(mean, P0, mean))
+        mean, P0, box = prior.mean, prior.cov, self.system.state_box
+        start = mean if box is None else nearest(mean, P0, box)
+        stochastic, R = self.noise.told.stochastic, self.noise.R(0.0)
+        roots, rows, wide = prior_root(self.system, prior, R), np.arange(0), None
+        # Noise that differs between rows is that of all rows, not of some.
+        by_row = self.noise.samples is not None or R.shape[-1] > 1
+        if stochastic or (roots is not None and by_row):
+            roots = root(P0.transpose(1, 2, 0)).transpose(2, 0, 1)
+            window = MovingWindow(mean, roots, start[None], exact=not stochastic)
+            return State(mean, P=P0, memory=MHEMemory(None, window, np.arange(len(mean))))
+        exact = ExactWindow(mean, P0.transpose(1, 2, 0), start)
+        if roots is not None:
+            rows = carried(roots)
+            wide = MovingWindow(mean[rows], roots[rows], start[None, rows], exact=True)
+        return State(mean, P=P0, memory=MHEMemory(exact, wide, rows))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        memory: WindowMemory = state.memory
-        if len(memory.t) == self.window:
-            memory = self._moved(memory, t, u)
-        memory = replace(memory, t=(*memory.t, t), y=(*memory.y, y), u=(*memory.u, u))
-        start = memory.start
-        fit = self._fit(memory, start)
-        # The trajectory from the previous first state ends at the prediction of this sample.
-        innovation, H = observe(self.system, t, fit.x[-1], y, u)
-        step, P = _step(fit, memory.P, self.system.state_residual(memory.arrival, start))
+        memory: MHEMemory = state.memory
+        if memory.exact is None:
+            return self._by_all_states(memory, t, y, u)
+        after = self._by_first_state(memory, t, y, u)
+        if memory.whole is None:
+            return after
+        # Rows with a very wide prior: their estimates are those with roots.
+        rows = memory.rows
+        wide = self._by_all_states(memory, t, y[rows], u[rows])
+        values = {}
+        for name in ("xhat", "P", "innovation", "S"):
+            values[name] = getattr(after, name).copy()
+            values[name][rows] = getattr(wide, name)
+        return replace(after, **values, memory=replace(after.memory, whole=wide.memory.whole))
+
+    def _by_all_states(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after a sample, in the rows of whose windows all states are unknown."""
+        system, noise, window = self.system, self.noise, memory.whole
+        assert window is not None
+        window = window.extended(system, t, y, u)
+        if len(window.t) > self.window:
+            window = window.shortened(system, noise)
+        # The last state is the prediction of this sample.
+        innovation, H = observe(system, t, window.x[-1], y, u)
+        window, states = window.improved(system, noise)
+        H = H.transpose(2, 0, 1)
+        S = H @ covariance(states.predicted_root[-1]) @ H.swapaxes(1, 2)
+        S = S + noise.R(t, y).transpose(2, 0, 1)
         for _ in range(self.steps - 1):
-            start = start + step
-            fit = self._fit(memory, start)
-            step, P = _step(fit, memory.P, self.system.state_residual(memory.arrival, start))
+            window, states = window.improved(system, noise)
+        P = covariance(states.root[-1])
+        return State(window.x[-1], t, u, P, innovation, S, replace(memory, whole=window))
+
+    def _by_first_state(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after a sample, if the states of windows follow from their first one."""
+        system, noise, window = self.system, self.noise, memory.exact
+        assert window is not None
+        window = window.extended(t, y, u)
+        if len(window.t) > self.window:
+            window = window.shortened(system, noise)
+        fit = window.fit(system, noise)
+        # The trajectory from the previous first state ends at the prediction of this sample.
+        innovation, H = observe(system, t, fit.x[-1], y, u)
+        step, P = window.step(system, fit)
+        for _ in range(self.steps - 1):
+            window = replace(window, start=window.start + step)
+            fit = window.fit(system, noise)
+            step, P = window.step(system, fit)
         # Map the last step to the latest sample to first order, without a new trajectory.
-        start = start + step
+        window = replace(window, start=window.start + step)
         xhat = fit.x[-1] + mapped(fit.X[-1], step)
         P = sandwich(fit.X[-1], P)
-        memory = replace(memory, start=start)
-        S = _innovation_covariance(P, H, self.noise.R(t, y)).transpose(2, 0, 1)
+        S = innovation_covariance(P, H, noise.R(t, y)).transpose(2, 0, 1)
         P = ((P + P.transpose(1, 0, 2)) / 2).transpose(2, 0, 1)
-        return State(xhat, t, u, P, innovation, S, memory)
-
-    def _fit(self, memory: WindowMemory, start: np.ndarray) -> Fit:
-        """Return the model's trajectory through the window from its first state, and the normal
-        equations of the outputs about it."""
-        nx, batch = self.system.nx, len(start)
-        X = identity(nx, batch)
-        return linearised(self.system, self.noise, memory.t, memory.y, memory.u, start, X)
-
-    def _moved(self, memory: WindowMemory, t: float, u: np.ndarray) -> WindowMemory:
-        """Return the memory without the window's first sample, with which x̄ and P̄ are updated. The
-        arguments t and u are those of the sample to be added."""
-        start = memory.start
-        innovation, H = observe(self.system, memory.t[0], start, memory.y[0], memory.u[0])
-        # Update x̄ − x and P̄ with the sample, with the output linearised about x.
-        offset = self.system.state_residual(memory.arrival, start)
-        innovation = innovation - mapped(H, offset)
-        R = self.noise.R(memory.t[0], memory.y[0])
-        offset, P, _ = joseph_update(offset, memory.P, innovation, H, R)
-        # Predict x, x̄ and P̄ to the next sample, which becomes the first of the window.
-        second, u_second = (*memory.t, t)[1], (*memory.u, u)[1]
-        times, inputs = (memory.t[0], second), (memory.u[0], u_second)
-        start, P, F, _ = predict(self.system, times, start, P, self.noise, inputs)
-        arrival = start + mapped(F, offset)
-        memory = replace(memory, t=memory.t[1:], y=memory.y[1:], u=memory.u[1:])
-        return replace(memory, arrival=arrival, P=P, start=start)
-
-
-def _innovation_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Return S = HP⁻Hᵀ + R, shape (ny, ny, batch), computed as R(R − HPHᵀ)⁻¹R from the covariance P
-    after the update."""
-    R = np.broadcast_to(R, (*R.shape[:2], P.shape[-1]))
-    S = product(divide(R, R - sandwich(H, P)), R)
-    return (S + S.transpose(1, 0, 2)) / 2
-
-
-def _step(fit: Fit, P: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gauss-Newton step (batch, nx) of the window's first state x, and the covariance
-    (P̄⁻¹ + Λ)⁻¹ (nx, nx, batch) of the result.
-
-    P̄ may be singular, so its inverse is avoided; components with zero variance in P̄ then follow x̄.
-
-    Args:
-        fit: the fit at x; Λ is its information.
-        P: P̄, shape (nx, nx, batch).
-        offset: x̄ − x, shape (batch, nx).
-    """
-    # With P̄ = LLᵀ, (P̄⁻¹ + Λ)⁻¹ = L(I + LᵀΛL)⁻¹Lᵀ.
-    L = cholesky(P, semidefinite=True)
-    L_transposed = L.transpose(1, 0, 2)
-    inner = identity(len(P), P.shape[-1]) + product(product(L_transposed, fit.information), L)
-    P = product(divide(L, inner), L_transposed)
-    # The step is that to x̄ plus the correction by the outputs from there.
-    right = fit.right.T - mapped(fit.information, offset)
-    return offset + mapped(P, right), P
+        return State(xhat, t, u, P, innovation, S, replace(memory, exact=window))

@@ -62,9 +62,9 @@ class ParticleFilter(RecursiveEstimator):
     mean and the covariance of the set are preserved in expectation. This is artificial noise, and
     it also follows each tempering step.
 
-    A particle that overflows, or at which the output is not defined, has the weight zero. Where
-    this holds for all particles of an episode, they stay where they are, or the sample counts as
-    missing, and the log says so once.
+    A particle that overflows, that is outside of the states' bounds, or at which the output is not
+    defined, has the weight zero. Where this holds for all particles of an episode, they stay where
+    they are, or the sample counts as missing, and the log says so once.
 
     Particles that differ by whole turns of an angle are the same states: they are taken within half
     a turn of their circular mean, and so are their outputs.
@@ -217,11 +217,17 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         errors = self.system.output_residual(y, np.asarray(self.system.h(t, x, u)))
         errors = np.where(np.isnan(y), 0.0, errors)
         log_likelihood = -0.5 * _squared_sizes(errors, self.noise.R(t, y))
+        box = self.system.state_box
+        if box is not None:
+            outside = box.outside(x)
+            log_likelihood = np.where(outside, -np.inf, log_likelihood)
+            if outside.all(axis=0).any():
+                self._say("all particles are outside of the bounds; they stay where they are")
         if math.isfinite(log_likelihood.sum()):
             return log_likelihood
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, _ZERO)
         impossible = log_likelihood.max(axis=0) <= _ZERO
-        if impossible.any():
+        if (impossible if box is None else impossible & ~box.outside(x).all(axis=0)).any():
             self._say("an output is not defined, or impossible, at all particles; it is left out")
         return np.where(impossible, 0.0, log_likelihood)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, make_dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknown
+from pinnobs_gym.simulation.bounds import Bounds, box
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.system import PoorPrior, Setup, System, is_number, vector
@@ -29,9 +30,9 @@ def augmented(
     in the scores is no better than the prior.
 
     In each setup, initial states are those of the given system, and each constant is uniform within
-    √3 standard deviations of its mean. The prior consists of the system's own and of the means and
-    variances of the constants, all independent. Where a setup names an unknown parameter, the mean
-    is the setup's value.
+    √3 standard deviations of its mean and within its bounds. The prior consists of the system's own
+    and of the means and variances of the constants, all independent. Where a setup names an unknown
+    parameter, the mean is the setup's value.
 
     Its class, ``type(augmented(...))``, is named after the system and its constants, as
     ``Satellite_a1_bias_y1``, and can be registered like any other.
@@ -163,6 +164,8 @@ def _attributes(plant: System, extras: Mapping[str, Unknown], kept: list[str]) -
         else plant.output_period,
         "state_period": plant.state_period and (*plant.state_period, *[None] * len(extras)),
         "scale": (*scale.tolist(), *(float(value.std) for value in extras.values())),
+        "state_low": _extended(plant.state_low, n, [value.low for value in extras.values()]),
+        "state_high": _extended(plant.state_high, n, [value.high for value in extras.values()]),
         "state_bound": (*bound.tolist(), *map(float, wide)),
         "setups": {name: _setup(plant, s, extras, kept) for name, s in plant.setups.items()},
         "version": plant.version,
@@ -172,6 +175,15 @@ def _attributes(plant: System, extras: Mapping[str, Unknown], kept: list[str]) -
         else tuple(name for name in plant.uncertain if name in kept),
         "model_step": plant.model_step,
     }
+
+
+def _extended(
+    bounds: Bounds | None, nx: int, further: Sequence[float | None]
+) -> tuple[float | None, ...] | None:
+    """Return the bounds of the plant's states and those of the constants; None without any."""
+    if bounds is None and not any(bound is not None for bound in further):
+        return None
+    return (*([None] * nx if bounds is None else bounds), *further)
 
 
 def _units(plant: System, extras: Mapping[str, Unknown]) -> dict[str, str]:
@@ -197,11 +209,16 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
     stds = np.array([value.std for value in extras.values()])
     low, high = (vector(part, plant.nx, "x0") for part in (setup.x0_low, setup.x0_high))
     half = np.sqrt(3) * stds  # of a uniform law with this standard deviation
+    lows, highs = means - half, means + half
+    sides = [[getattr(value, side) for value in extras.values()] for side in ("low", "high")]
+    limits = box(sides[0], sides[1], len(means))
+    if limits is not None:
+        lows, highs = limits.clipped(lows), limits.clipped(highs)
     poor = setup.poor_prior
     return replace(
         setup,
-        x0_low=_row(low, means - half),
-        x0_high=_row(high, means + half),
+        x0_low=_row(low, lows),
+        x0_high=_row(high, highs),
         xhat0=_row(mean, means),
         P0=_diagonal(cov, stds),
         poor_prior=poor

@@ -22,12 +22,22 @@ class Unknown:
     """Mean, in the unit of the constant."""
     std: float
     """Standard deviation, above 0."""
+    low: float | None = None
+    """Value below which the constant cannot be; None for no bound."""
+    high: float | None = None
+    """Value above which the constant cannot be; None for no bound."""
 
     def __post_init__(self) -> None:
         for name, value in (("mean", self.mean), ("std", self.std)):
             if not (is_number(value) and np.isfinite(value)) or (name == "std" and value <= 0):
                 expected = "a number" if name == "mean" else "a number above 0"
                 raise ValueError(f"{name}={value!r} of an Unknown; expected {expected}")
+        for name, bound, sign in (("low", self.low, -1), ("high", self.high, 1)):
+            if bound is not None and not (is_number(bound) and sign * (bound - self.mean) > 0):
+                side = "below" if sign < 0 else "above"
+                raise ValueError(
+                    f"{name}={bound!r} of an Unknown; expected a number {side} mean={self.mean:g}"
+                )
 
 
 Constants: TypeAlias = tuple[tuple[str, Unknown], ...]

@@ -303,6 +303,29 @@ def _system_initial_states(cls: type[System]) -> None:
         require(np.isfinite(y).all(), f"outputs of setup {name!r} leave the finite ones")
 
 
+@add_check(SYSTEM_CHECKS, "bounds")
+def _system_bounds(cls: type[System]) -> None:
+    """The truth of every setup, without process noise, stays within the bounds of the states."""
+    for name, system, setup in _setups(cls):
+        box = system.state_box
+        if box is None:
+            continue
+        x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
+        x, _ = _trajectories(system, setup, x0)
+        size = vector(system.scale, system.nx, "scale")
+        for what, bound, beyond in (
+            ("below state_low", box.low, box.low - x),
+            ("above state_high", box.high, x - box.high),
+        ):
+            k, row, i = np.unravel_index(np.argmax(beyond / size), x.shape)
+            require(
+                beyond[k, row, i] <= TRUTH_TOLERANCE * size[i],
+                f"{system.state_names[i]} of the truth of setup {name!r} comes to "
+                f"{x[k, row, i]:.6g}, {what}={bound[i]:g}; expected a plant that stays within its "
+                "bounds",
+            )
+
+
 @add_check(SYSTEM_CHECKS, "prior")
 def _system_prior(cls: type[System]) -> None:
     """Every setup has a prior. A warning says where an equation is not finite at its mean, as the

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.bounds import Bounds, Box, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, check_periods, residual
 
@@ -156,6 +157,12 @@ class System(ABC):
     state_period: ClassVar[Periods | None] = None
     """Period of each state that repeats, in its unit; None if none repeats. States that differ by
     whole periods are the same state, for `f`, `h` and the scores."""
+    state_low: ClassVar[Bounds | None] = None
+    """Value below which each state cannot be, such as ``(0.0, None)``, in its unit; None for no
+    bound. Estimates are never below."""
+    state_high: ClassVar[Bounds | None] = None
+    """Value above which each state cannot be, in its unit; None for no bound. Estimates are never
+    above."""
     setups: ClassVar[Mapping[str, Setup]]
     """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
@@ -182,6 +189,13 @@ class System(ABC):
     def nu(self) -> int:
         """Number of inputs."""
         return len(self.input_names)
+
+    @property
+    def state_box(self) -> Box | None:
+        """The states within `state_low` and `state_high`; None without bounds."""
+        if self.state_low is None and self.state_high is None:
+            return None
+        return box(self.state_low, self.state_high, self.nx)
 
     @abstractmethod
     def f(self, t: Array, x: Array, u: Array) -> Array:
@@ -340,6 +354,7 @@ class System(ABC):
                 vector(cls.scale, system.nx, "scale")
                 check_periods(system.output_period, system.ny, "output_period")
                 check_periods(system.state_period, system.nx, "state_period")
+                box(system.state_low, system.state_high, system.nx)
                 for part in ("x0_low", "x0_high"):
                     vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
                 for prior in (setup, setup.poor_prior):

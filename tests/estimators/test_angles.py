@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from angles import TURN, Compass, Unwrapped, north_record
-from benchmarks.plants import LOST, RUNS, Radar, tracks
+from benchmarks.plants.radar import LOST, RUNS, Radar, tracks
 from kinds import untrained
 from small_trainings import constant_gain
 

@@ -1,0 +1,92 @@
+"""A window of samples whose states are all unknown, with the prior of the first one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pinnobs_gym.estimation.linear_window import (
+    Smoothed,
+    joint_covariance,
+    linear_window,
+    smoothed,
+    whitened,
+)
+from pinnobs_gym.estimation.projection import nearest
+from pinnobs_gym.estimation.square_root import compressed, root_of, updated
+from pinnobs_gym.simulation.bounds import Box
+from pinnobs_gym.simulation.model import model_step, model_step_moments
+from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.system import System
+
+
+@dataclass(frozen=True)
+class MovingWindow:
+    """The window and the prior of its first state. The batch is the first axis of matrices."""
+
+    mean: np.ndarray
+    """x̄, the estimate of the window's first state from all samples before, shape (batch, nx)."""
+    root: np.ndarray
+    """Root of its covariance P̄, shape (batch, nx, nx)."""
+    x: np.ndarray
+    """Estimates of the states at the window's samples, shape (num_samples, batch, nx)."""
+    exact: bool
+    """Whether the model is assumed to have no process noise in the window."""
+    t: tuple[float, ...] = ()
+    """Times of the samples in s."""
+    y: tuple[np.ndarray, ...] = ()
+    """Outputs at these samples, shape (batch, ny) each."""
+    u: tuple[np.ndarray, ...] = ()
+    """Inputs at these samples, shape (batch, nu) each."""
+
+    def extended(self, system: System, t: float, y: np.ndarray, u: np.ndarray) -> MovingWindow:
+        """Return the window with one more sample, whose state is predicted by the model."""
+        x = self.x
+        if self.t:
+            ahead = model_step(system, self.t[-1], t, x[-1], self.u[-1], u)
+            x = np.concatenate([x, ahead[None]])
+        return replace(self, x=x, t=(*self.t, t), y=(*self.y, y), u=(*self.u, u))
+
+    def shortened(self, system: System, noise: Noise) -> MovingWindow:
+        """Return the window without its first sample, with which x̄ and P̄ are updated as in an
+        extended Kalman filter linearised about the estimate of the first state from all samples, in
+        roots (Kühl, Diehl, Kraus, Schlöder & Bock 2011, "A real-time algorithm for moving horizon
+        state and parameter estimation"). There is a second sample."""
+        x, batch = self.x[0], len(self.mean)
+        e, H = whitened(system, noise, (self.t[0], self.y[0], self.u[0]), x)
+        # Update x̄ − x with the sample.
+        deviation = system.state_residual(self.mean, x)
+        unit = np.broadcast_to(np.eye(H.shape[1]), (batch, H.shape[1], H.shape[1]))
+        step, L = updated(self.root, e - (H @ deviation[..., None])[..., 0], H, unit)
+        # Predict it to the next sample.
+        end, F, Q = model_step_moments(system, noise, self.t[0], self.t[1], x, self.u[0], self.u[1])
+        F = np.ascontiguousarray(F.transpose(2, 0, 1))
+        G = np.broadcast_to(root_of(Q.transpose(2, 0, 1)), F.shape)
+        mean = end + (F @ (deviation + step)[..., None])[..., 0]
+        L = compressed(F @ L, G)
+        window = MovingWindow(mean, L, self.x[1:], self.exact)
+        return replace(window, t=self.t[1:], y=self.y[1:], u=self.u[1:])
+
+    def improved(self, system: System, noise: Noise) -> tuple[MovingWindow, Smoothed]:
+        """Return the window after a Gauss-Newton step of all its states, within their bounds, and
+        the states without bounds with their covariances."""
+        window = linear_window(system, noise, self.t, self.y, self.u, self.x, self.exact)
+        states = smoothed(window, system.state_residual(self.mean, window.r[0]), self.root)
+        box, x = system.state_box, states.x
+        if box is not None and box.outside(x).any():
+            x = _inside(states, box)
+        return replace(self, x=x), states
+
+
+def _inside(states: Smoothed, box: Box) -> np.ndarray:
+    """Return the states (num_samples, batch, nx) within the bounds that are nearest to those of the
+    window, all together."""
+    n, _, nx = states.x.shape
+    rows = np.flatnonzero(box.outside(states.x).any(axis=0))
+    whole = Box(np.tile(box.low, n), np.tile(box.high, n))
+    together = states.x[:, rows].swapaxes(0, 1).reshape(len(rows), n * nx)
+    moved = nearest(together, joint_covariance(states, rows), whole)
+    x = states.x.copy()
+    x[:, rows] = moved.reshape(len(rows), n, nx).swapaxes(0, 1)
+    return x

@@ -1,0 +1,70 @@
+"""Bounds of states, such as a concentration that is never below zero."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+
+Bounds: TypeAlias = Sequence[float | None]
+"""One bound per state, in its unit; None where a state has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The states within the bounds, which themselves belong to it."""
+
+    low: np.ndarray
+    """Lower bounds, shape (nx,); −∞ where there is none."""
+    high: np.ndarray
+    """Upper bounds, shape (nx,); ∞ where there is none."""
+
+    def clipped(self, x: np.ndarray) -> np.ndarray:
+        """Return the states x (..., nx) with each component moved to the bound that it exceeds."""
+        return np.clip(x, self.low, self.high)
+
+    def outside(self, x: np.ndarray) -> np.ndarray:
+        """Return which of the states x (..., nx) exceed a bound, bool (...)."""
+        beyond: np.ndarray = np.any((x < self.low) | (x > self.high), axis=-1)
+        return beyond
+
+
+def box(low: Bounds | None, high: Bounds | None, nx: int) -> Box | None:
+    """Return the box of bounds, or None if no state has one.
+
+    Raises:
+        ValueError: in one line, if there are not as many bounds as states, one is no number, or a
+            lower bound is not below the upper one.
+    """
+    if low is None and high is None:
+        return None
+    return _made(low if low is None else tuple(low), high if high is None else tuple(high), nx)
+
+
+@lru_cache(maxsize=64)
+def _made(
+    low: tuple[float | None, ...] | None, high: tuple[float | None, ...] | None, nx: int
+) -> Box | None:
+    sides = []
+    for name, given, missing in (("state_low", low, -np.inf), ("state_high", high, np.inf)):
+        bounds = (None,) * nx if given is None else given
+        if len(bounds) != nx:
+            raise ValueError(f"{name} has {len(bounds)} bounds; expected {nx}, None for no bound")
+        try:
+            side = np.array([missing if bound is None else bound for bound in bounds], dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name}={bounds}; expected numbers, None for no bound") from None
+        if np.isnan(side).any():
+            raise ValueError(f"{name}={bounds}; expected numbers, None for no bound")
+        side.flags.writeable = False
+        sides.append(side)
+    wrong = np.flatnonzero(~(sides[0] < sides[1]))
+    if len(wrong):
+        i = wrong[0]
+        raise ValueError(
+            f"state_low={sides[0][i]:g} of state {i + 1} is not below state_high={sides[1][i]:g}"
+        )
+    return Box(*sides) if np.isfinite(sides).any() else None
