@@ -18,7 +18,7 @@ from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import longest_step
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
 from pinnobs_gym.systems import SYSTEMS
 
@@ -117,13 +117,12 @@ class EpisodeSource:
         self.deterministic &= not self.noise.stochastic
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
-        self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
-        self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
+        self.start = self.setup.start(self.system.nx)
         self._parts = math.ceil(self.setup.dt / longest_step(self.system) - 1e-6)
 
     def contains(self, x0: np.ndarray) -> np.ndarray:
         """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
-        inside = np.asarray(((x0 >= self.x0_low) & (x0 <= self.x0_high)).all(axis=-1))
+        inside = self.start.contains(x0)
         return inside if self.fixed_x0 else inside & self.system.admissible(x0)
 
     def stream(self, seeds: np.random.SeedSequence) -> Stream:
@@ -288,13 +287,12 @@ class Stream:
             if self._queue:
                 return self._queue.pop(0)
             if source.fixed_x0:
-                drawn = source.x0_low[None]
+                drawn = source.start.mean[None]
             else:
-                shape = (_DRAWS, source.system.nx)
-                drawn = self._states.uniform(source.x0_low, source.x0_high, shape)
+                drawn = source.start.draw(self._states, _DRAWS)
                 drawn = drawn[source.system.admissible(drawn)]
             self._queue = list(source.condition.starts(drawn, source.contains))
         if self._queue:
             return self._queue.pop(0)
         name = type(source.system).__name__
-        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")
+        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states drawn is admissible")

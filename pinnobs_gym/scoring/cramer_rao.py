@@ -15,7 +15,8 @@ from pinnobs_gym.simulation.matrices import moments, sandwich
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import Noise, noise_std
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.start_law import StartLaw
+from pinnobs_gym.simulation.system import Setup, System
 
 if TYPE_CHECKING:
     from pinnobs_gym.envs.game import Game
@@ -163,7 +164,7 @@ def exact_bayes(
     seed: int = 0,
 ) -> Posterior:
     """Compute the posterior of the state of a plant without process noise by importance sampling of
-    x₀, which is uniform in the setup's set.
+    x₀, whose law is the setup's.
 
     Draws from the prior serve the first sample. Each time the number of samples doubles, new draws
     come from a Student distribution with 5 degrees of freedom, fitted to the previous weighted
@@ -178,12 +179,17 @@ def exact_bayes(
         R: variances of the output noise, shape (ny,).
         draws: number of initial states per proposal.
         seed: of the draws.
+
+    Raises:
+        ValueError: in one line, if the law of x₀ has no density.
     """
     rng = np.random.default_rng(seed)
     batch, n, nx = record.batch, record.num_samples, system.nx
-    low, high = vector(setup.x0_low, nx, "x0_low"), vector(setup.x0_high, nx, "x0_high")
+    law = setup.start(nx)
+    law.log_density(law.mean)  # raises if there is none
+    least = 1e-17 * np.diag(np.diag(law.cov))
     result = Posterior(np.empty((batch, n, nx)), np.empty((batch, n, nx, nx)), np.empty((batch, n)))
-    x0 = np.broadcast_to(_prior_draws(system, low, high, draws, rng)[:, None], (draws, batch, nx))
+    x0 = np.broadcast_to(_prior_draws(system, law, draws, rng)[:, None], (draws, batch, nx))
     log_weight = np.zeros((draws, batch))
     start, stop = 0, 1
     while start < n:
@@ -191,25 +197,23 @@ def exact_bayes(
         weight = _reweighted(system, record, R, x0, log_weight, (start, min(stop, n)), result)
         mean, cov = moments(weight, x0)
         # Student proposal at their mean, wider than their covariance.
-        spread = np.linalg.cholesky(2.0 * cov + 1e-18 * np.diag((high - low) ** 2))
+        spread = np.linalg.cholesky(2.0 * cov + least)
         student = rng.standard_normal((draws, 1, nx, 1))
         student = student / np.sqrt(rng.chisquare(5.0, (draws, 1, 1, 1)) / 5.0)
         x0 = mean + (spread @ student)[..., 0]
-        # Prior over proposal density, up to constants: the prior is uniform in the set.
-        inside = ((x0 >= low) & (x0 <= high)).all(axis=-1) & system.admissible(x0)
+        # Prior over proposal density, up to constants.
+        log_prior = np.where(system.admissible(x0), law.log_density(x0), -np.inf)
         log_density = -(nx + 5) / 2 * np.log1p((student**2).sum(axis=(2, 3)) / 5.0)
-        log_weight = np.where(inside, -log_density, -np.inf)
+        log_weight = log_prior - log_density
         start, stop = stop, 2 * stop
     return result
 
 
-def _prior_draws(
-    system: System, low: np.ndarray, high: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Draw initial states (count, nx), uniform in the admissible part of the box, by rejection."""
-    kept = np.empty((0, len(low)))
+def _prior_draws(system: System, law: StartLaw, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw admissible initial states (count, nx) of a law by rejection."""
+    kept = np.empty((0, system.nx))
     while len(kept) < count:
-        drawn = rng.uniform(low, high, (4 * count, len(low)))
+        drawn = law.draw(rng, 4 * count)
         kept = np.concatenate([kept, drawn[np.asarray(system.admissible(drawn))]])
     return kept[:count]
 

@@ -11,6 +11,7 @@ import numpy as np
 from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknown, is_number
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.start_law import Box, Joint
 from pinnobs_gym.simulation.system import PoorPrior, Setup, System, vector
 
 
@@ -191,13 +192,17 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
     # A constant whose name is not that of a parameter is not named by a setup.
     means = np.array([setup.parameters.get(name, value.mean) for name, value in extras.items()])
     stds = np.array([value.std for value in extras.values()])
-    low, high = (vector(part, plant.nx, "x0") for part in (setup.x0_low, setup.x0_high))
+    law = setup.start(plant.nx)
     half = np.sqrt(3) * stds  # of a uniform law with this standard deviation
     poor = setup.poor_prior
+    low, high = means - half, means + half
+    if isinstance(law, Box):
+        starts = {"x0_low": _row(law.corners[0], low), "x0_high": _row(law.corners[1], high)}
+    else:
+        starts = {"x0_law": Joint(law, Box(tuple(low.tolist()), tuple(high.tolist())))}
     return replace(
         setup,
-        x0_low=_row(low, means - half),
-        x0_high=_row(high, means + half),
+        **starts,
         xhat0=_row(mean, means),
         P0=_diagonal(cov, stds),
         poor_prior=poor
