@@ -16,8 +16,9 @@ from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 
-_Sample = tuple[float, np.ndarray, np.ndarray]
-"""Time in s, outputs (batch, ny) and inputs (batch, nu)."""
+_Sample = tuple[float, np.ndarray, np.ndarray, np.ndarray]
+"""Time in s, outputs (batch, ny), inputs (batch, nu), and covariance (ny, ny, batch or 1) of the
+output noise."""
 _FEW = 10
 """The likelihood is tempered if it would reduce the effective number of particles to less than
 their number over this."""
@@ -157,8 +158,9 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
         yhat, S = _predicted_output(np.exp(log_weights), outputs)
-        S = S + self.noise.R(t, y).transpose(2, 0, 1)
-        x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
+        R = self.noise.R(t, y)
+        S = S + R.transpose(2, 0, 1)
+        x, log_weights = self._tempered(x, log_weights, (t, y, u, R), memory.sample)
         weights = np.exp(log_weights)
         xhat, P = moments(weights, x)
         # Resample the episodes whose effective number of particles, 1/Σw², is below half.
@@ -181,7 +183,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         factors. Each is a power of the likelihood that leaves effectively a quarter of the
         particles, and is followed by resampling.
         """
-        t, y, u = seen
+        t, y, u, R = seen
         remaining = np.ones(len(y))
         log_likelihood = self._log_likelihood(x, seen)
         for part_number in range(_ROUNDS):
@@ -198,14 +200,15 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             discount = _DISCOUNT if self.discount is None else self.discount
             stream = sample, part_number
             x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
-            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), (t, y[rows], u[rows]))
+            part_seen = t, y[rows], u[rows], R[..., rows] if R.shape[2] > 1 else R
+            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), part_seen)
         return x, _normalised(log_weights + remaining * log_likelihood)
 
     def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
-        t, y, u = seen
+        t, y, u, R = seen
         errors = np.where(np.isnan(y), 0.0, y - np.asarray(self.system.h(t, x, u)))
-        log_likelihood = -0.5 * _squared_sizes(errors, self.noise.R(t, y))
+        log_likelihood = -0.5 * _squared_sizes(errors, R)
         if math.isfinite(log_likelihood.sum()):
             return log_likelihood
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, _ZERO)
