@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,8 +12,9 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.localisation import tapers
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import outer, spread, total
+from pinnobs_gym.simulation.matrices import divide, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -37,6 +39,10 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     which the outputs tell nothing is not inflated. An ensemble with no more members than states is
     allowed; its covariance is singular.
 
+    Correlations of few members over a long distance are mostly chance. With ``localisation``, the
+    covariances of outputs with states and with each other are tapered by distance (Gaspari & Cohn
+    1999; Houtekamer & Mitchell 2001), which takes a system that declares `System.distances`.
+
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
     in its batch. The numbers have mean zero and unit variance over the ensemble.
@@ -49,6 +55,9 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """Size of the ensemble."""
     inflation: float = 1.01
     """Largest factor of the deviations from the ensemble mean after each analysis."""
+    localisation: float | None = None
+    """Distance, in the unit of `System.distances`, from which on correlations are taken as zero;
+    None for no localisation."""
     seed: int = 0
     """Seed of the random numbers."""
 
@@ -59,10 +68,12 @@ x_k^{i-} &= \varphi(x_{k-1}^i, w_i) \quad
 \text{with } dx = f\, dt + L\, dw_i \text{ between the samples} \\
 X &= \tfrac{1}{\sqrt{N-1}} \bigl[ x_k^{i-} - \bar x_k^- \bigr]_i, \qquad
 Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(t_k, x_k^{i-}, u_k) - \bar y \bigr]_i \\
-K &= X Y^\top (Y Y^\top + R)^{-1} \\
+K &= (\rho_{xy} \circ X Y^\top) (\rho_{yy} \circ Y Y^\top + R)^{-1}, \qquad
+\rho = 1 \text{ without localisation} \\
 x_k^i &= x_k^{i-} + K\, (y_k + v_i - h(t_k, x_k^{i-}, u_k)), \qquad v_i \sim \mathcal N(0, R) \\
 x_k^i &:= \hat x_k + \ell \odot (x_k^i - \hat x_k), \qquad
-\ell_j = \min\bigl(\lambda, (1 - (K Y X^\top)_{jj} / (X X^\top)_{jj})^{-1/2}\bigr) \\
+\ell_j = \min\bigl(\lambda, (1 - (2 K Y X^\top - K (Y Y^\top + R) K^\top)_{jj}
+/ (X X^\top)_{jj})^{-1/2}\bigr) \\
 \hat x_k &= \tfrac1N \sum_i x_k^i, \qquad
 P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 """
@@ -74,6 +85,15 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             raise ValueError(f"members={self.members}; expected at least 2")
         if not 1 <= self.inflation < np.inf:
             raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
+        if self.localisation is not None:
+            if not 0 < self.localisation < np.inf:
+                raise ValueError(f"localisation={self.localisation}; expected a number above 0")
+            _ = self._tapers  # raises without distances
+
+    @cached_property
+    def _tapers(self) -> tuple[np.ndarray, np.ndarray]:
+        assert self.localisation is not None
+        return tapers(self.system, self.localisation)
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
@@ -112,23 +132,38 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
         missing = np.isnan(y)
         Y = np.where(missing.T[:, None], 0.0, Y)
-        K, S = gain_of_deviations(X, Y, self.noise.R(t, y))
+        K, S, taken = self._analysis(X, Y, self.noise.R(t, y))
         # Correct each member with its own perturbed output.
         errors = np.where(missing, 0.0, y + noise - outputs)
         for p, column in enumerate(K.transpose(1, 2, 0)):
             members = members + errors[..., p, None] * column
         xhat = total(members) / self.members
-        deviations = self._inflation(X, Y, K) * (members - xhat)
+        deviations = self._inflation(X, taken) * (members - xhat)
         members, X = xhat + deviations, weight * deviations.transpose(2, 0, 1)
         P, innovation = outer(X, X).transpose(2, 0, 1), np.where(missing, 0.0, y - yhat)
         memory = replace(memory, members=members, sample=memory.sample + 1)
         return State(xhat, t, u, P, innovation, S.transpose(2, 0, 1), memory)
 
-    def _inflation(self, X: np.ndarray, Y: np.ndarray, K: np.ndarray) -> np.ndarray:
-        """Return the factors (batch, nx) of the deviations after an analysis with the gains K (nx,
-        ny, batch) and the weighted deviations X and Y of states and outputs before it."""
-        # The analysis is expected to take the variances KYXᵀ, of XXᵀ.
-        taken = np.add.accumulate(K * outer(X, Y), axis=1)[:, -1]
+    def _analysis(
+        self, X: np.ndarray, Y: np.ndarray, R: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the gains (nx, ny, batch), the innovation covariances (ny, ny, batch), and the
+        variances (nx, batch) that the analysis is expected to take; the arguments are those of
+        `gain_of_deviations`."""
+        if self.localisation is None:
+            K, S = gain_of_deviations(X, Y, R)
+            return K, S, np.add.accumulate(K * outer(X, Y), axis=1)[:, -1]
+        between, own = outer(X, Y), outer(Y, Y)
+        states, outputs = self._tapers
+        S = outputs[..., None] * own + R
+        K = divide(states[..., None] * between, S)
+        # Members change by −K(Y − v): their variances by −2KYXᵀ + K(YYᵀ + R)Kᵀ for any gain.
+        change = 2 * between - product(K, own + R)
+        return K, S, np.add.accumulate(K * change, axis=1)[:, -1]
+
+    def _inflation(self, X: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """Return the factors (batch, nx) of the deviations after an analysis that has taken these
+        variances (nx, batch) from the weighted deviations X (nx, num_members, batch)."""
         variance = total((X * X).transpose(1, 2, 0)).T
         share = np.where(variance > 0, taken / variance, 0.0)
         return np.clip(1 / np.sqrt(1 - np.clip(share, 0.0, 1.0)), 1.0, self.inflation).T

@@ -257,6 +257,12 @@ class System(ABC):
         default."""
         return ()
 
+    def distances(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the distances between states and outputs, (nx, ny), and between outputs, (ny, ny),
+        of a plant that extends in space, in any unit; None otherwise. Ensembles may take far
+        correlations as zero (`pinnobs_gym.estimators.enkf.EnKF.localisation`)."""
+        return None
+
     def breakpoints(self) -> tuple[float, ...]:
         """Return the times in s at which f or the input jumps; the truth solver restarts at
         each."""
