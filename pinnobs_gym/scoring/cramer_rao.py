@@ -35,6 +35,7 @@ def cramer_rao(
     P0: np.ndarray,
     noise: Noise,
     missing: np.ndarray | None = None,
+    u: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the Cramér–Rao reference of each episode: the lower bound on the covariance of any
     locally unbiased estimate x̂(k|k) of this trajectory.
@@ -52,13 +53,14 @@ def cramer_rao(
         P0: covariance of the prior, shape (nx, nx).
         noise: the noise of plant and outputs.
         missing: which outputs are missing, bool (batch, num_samples, ny); none if None.
+        u: inputs at the samples, shape (batch, num_samples, nu); those of `System.input` if None.
 
     Returns:
         Covariances, shape (batch, num_samples, nx, nx).
     """
     batch, num_samples, nx = x.shape
     bound = np.empty((num_samples, nx, nx, batch))
-    steps = _linearised(system, noise, t, x, missing)
+    steps = _linearised(system, noise, t, x, _inputs(system, t, u), missing)
     for k, P in enumerate(covariances(steps, P0)):
         bound[k] = P
     return bound.transpose(3, 0, 1, 2)
@@ -87,17 +89,22 @@ def covariances(
 
 
 def _linearised(
-    system: System, noise: Noise, t: np.ndarray, x: np.ndarray, missing: np.ndarray | None
+    system: System,
+    noise: Noise,
+    t: np.ndarray,
+    x: np.ndarray,
+    u: np.ndarray,
+    missing: np.ndarray | None,
 ) -> Iterator[Step]:
     """Yield the steps of `covariances`, linearised at the true states; the arguments are those of
     `cramer_rao`."""
-    u, F, Q = system.input(t), None, np.zeros((system.nx, system.nx, 1))
+    F, Q = None, np.zeros((system.nx, system.nx, 1))
     for k in range(len(t)):
         now = x[:, k]
         if k:
-            times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
+            times, inputs = (float(t[k - 1]), float(t[k])), (u[:, k - 1], u[:, k])
             _, F, Q = model_step_moments(system, noise, *times, x[:, k - 1], *inputs)
-        H = system.h_jacobian(t[k], now, u[k]).transpose(1, 2, 0)
+        H = system.h_jacobian(t[k], now, u[:, k]).transpose(1, 2, 0)
         R = noise.R(float(t[k]))
         if missing is not None:
             # A zero row of H carries no information.
@@ -123,7 +130,14 @@ def expected_nrmse(
     return window_nrmse(np.where(counts, variance, 0.0).sum(axis=-1), counts.sum(axis=-1), part)
 
 
-def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _inputs(system: System, t: np.ndarray, u: np.ndarray | None) -> np.ndarray:
+    """Return u or, if it is None, the system's inputs at the samples, (1, num_samples, nu)."""
+    return np.asarray(system.input(t))[None] if u is None else u
+
+
+def step_error(
+    system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray | None = None
+) -> np.ndarray:
     """Return the error of one step of the model from the true state, shape (batch, num_samples,
     nx), zero at the first sample.
 
@@ -134,10 +148,11 @@ def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         system: the plant.
         t: sample times in s, shape (num_samples,).
         x: true states without process noise, shape (batch, num_samples, nx).
+        u: inputs, as in `cramer_rao`.
     """
-    error, u = np.zeros_like(x), system.input(t)
+    error, u = np.zeros_like(x), _inputs(system, t, u)
     for k in range(1, len(t)):
-        times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
+        times, inputs = (float(t[k - 1]), float(t[k])), (u[:, k - 1], u[:, k])
         error[:, k] = model_step(system, *times, x[:, k - 1], *inputs) - x[:, k]
     return error
 
@@ -275,13 +290,14 @@ def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
         return None
     P0 = record.prior.cov[0]
-    P = cramer_rao(source.system, record.t, truth, P0, source.noise, np.isnan(record.y))
+    missing = np.isnan(record.y)
+    P = cramer_rao(source.system, record.t, truth, P0, source.noise, missing, record.u)
     counted = (source.system.scale, source.system.observable(truth))
     part = windows(record.t, source.setup.transient_end)["steady"]
     steady = expected_nrmse(P, source.system.scale, part, counted[1])
     if not source.noise.stochastic:
         # Discard references below the error of the model's own step.
-        error = step_error(source.system, record.t, truth)
+        error = step_error(source.system, record.t, truth, record.u)
         squares = error[..., None] * error[..., None, :]
         floor = expected_nrmse(squares, source.system.scale, part, counted[1])
         steady = np.where(steady > floor, steady, np.nan)

@@ -6,7 +6,7 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -167,8 +167,8 @@ class System(ABC):
     """
 
     measured_input: bool = field(default=False, kw_only=True)
-    """True if u is known only at the samples (a log's columns) and interpolated linearly between
-    them; False if `input` defines it at any time."""
+    """True if u is known only at the samples (a log's columns), and between them as `input_hold`
+    says; False if `input` defines it at any time."""
 
     state_names: ClassVar[tuple[str, ...]]
     output_names: ClassVar[tuple[str, ...]]
@@ -191,6 +191,10 @@ class System(ABC):
     model_step: ClassVar[float | None] = None
     """Longest Runge-Kutta step of model-based estimators in s; if None, one that keeps the local
     error small is found (`pinnobs_gym.simulation.runge_kutta.longest_step`)."""
+    input_hold: ClassVar[Literal["previous", "linear"]] = "previous"
+    """What measured inputs are between samples: the value at the previous sample, as the output of
+    a computer is held; or on straight lines, for samples of a continuous signal. Inputs of a log
+    are measured ones."""
 
     @property
     def nx(self) -> int:
@@ -225,6 +229,22 @@ class System(ABC):
         """Return the known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
         xp = np if isinstance(t, np.ndarray) else array_namespace(t)
         return xp.zeros((*t.shape, self.nu), dtype=t.dtype)
+
+    def draw_input(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+        """Return inputs (num_samples, nu) that are drawn for one episode, at its sample times
+        (num_samples,) in s.
+
+        A system that overrides this has other inputs in each episode. Between the samples they are
+        as `input_hold` says, for the plant and for the model alike; estimators are told them at the
+        samples. They are drawn from a random stream of their own. `input` then stands for them
+        where a typical input is needed, such as in the design of gains.
+        """
+        return np.asarray(self.input(times))
+
+    @property
+    def draws_input(self) -> bool:
+        """Whether inputs are drawn for each episode."""
+        return type(self).draw_input is not System.draw_input
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         """Return ∂f/∂x, (..., nx, nx), by forward-mode automatic differentiation unless
