@@ -130,8 +130,8 @@ def lorenz63_errors(runs: int, **settings: int) -> np.ndarray:
 def figures(repeats: int) -> Iterator[Figure]:
     """Measure the ensembles."""
     for settings, asked in (
-        ({"members": 20, "localisation": 12.0, "inflation": 1.05}, 0.25),
-        ({"members": 50, "inflation": 1.05}, 0.22),
+        ({"members": 20, "localisation": 12.0, "inflation": 1.03}, 0.25),
+        ({"members": 50, "inflation": 1.04}, 0.22),
     ):
         errors = lorenz96_errors(40, range(10), CYCLES, SPUN_UP, **settings)
         said = ", ".join(f"{name} {value:g}" for name, value in settings.items())
@@ -139,7 +139,7 @@ def figures(repeats: int) -> Iterator[Figure]:
             f"EnKF of Lorenz-96, {said}: RMSE, mean of 10", float(errors.mean()), "", asked
         )
         yield at_most(f"EnKF of Lorenz-96, {said}: RMSE, largest", float(errors.max()), "", 0.5)
-    errors = lorenz96_errors(400, range(1), 200, 100, members=20, localisation=12.0, inflation=1.05)
+    errors = lorenz96_errors(400, range(1), 40, 60, members=20, localisation=12.0, inflation=1.03)
     yield at_most("EnKF of 400 states, 20 members: RMSE", float(errors.max()), "", 0.3)
     for particles in (500, 1000, 2000):
         median = float(np.median(lorenz63_errors(20, particles=particles)))

@@ -162,7 +162,7 @@ def test_a_radius_that_cannot_be_used_is_refused(cls, radius, message):
 
 @pytest.mark.parametrize("ratio", [1e5, 1e8, 1e12])
 def test_particles_from_a_wide_prior_end_at_the_kalman_filters(ratio):
-    """Within three of their standard deviations at each sample, from states at 2 and at 3.5 standard
+    """Within three of their standard deviations at each sample, from 2 and from 3.5 standard
     deviations of the prior in eight directions; P₀ is this ratio times R."""
     R, F, count = np.diag([0.01, 0.01]), runge_kutta_matrix(0.1), 5
     angles = np.arange(8) * np.pi / 4
