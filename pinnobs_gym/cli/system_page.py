@@ -14,7 +14,7 @@ from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.noise import noise_std
 from pinnobs_gym.simulation.residual import Periods
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System
 
 
 def page(cls: type[System], env_id: str) -> str:
@@ -98,14 +98,9 @@ def _setups(cls: type[System]) -> str:
     lines = []
     for name in cls.setups:
         system, setup = cls.configured(name)
-        low, high = (
-            vector(getattr(setup, part), system.nx, part).tolist() for part in ("x0_low", "x0_high")
-        )
         xhat0, P0 = (moments.tolist() for moments in prior_moments(system, setup))
-        if setup.fixed_x0:
-            start = f"x₀ = {low}"
-        else:
-            start = f"x₀ uniform in {low} to {high}, where admissible"
+        law = setup.start(system.nx)
+        start = law.sentence + ("" if law.fixed else ", where admissible")
         noise = noise_std(setup.noise_std, system.ny, "noise_std").tolist()
         process = noise_std(setup.process_noise, system.nx, "process_noise")
         lines.append(

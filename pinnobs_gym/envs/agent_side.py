@@ -93,4 +93,8 @@ class AgentSide:
         self, samples: np.ndarray, k: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         y = samples[:, : self._source.system.ny].astype(float)
-        return self._source.times[k], y, self._source.inputs[k]
+        if self._source.system.draws_input:
+            u = samples[:, self._source.system.ny : -1].astype(float)
+        else:
+            u = self._source.inputs[k]
+        return self._source.times[k], y, u

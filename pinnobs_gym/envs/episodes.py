@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import chain, cycle, islice
 from typing import TypedDict, Unpack
 
@@ -18,7 +18,7 @@ from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import longest_step
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
 from pinnobs_gym.systems import SYSTEMS
 
@@ -52,13 +52,15 @@ class Draws:
     """Initial states, shape (batch, nx)."""
     noise: np.ndarray
     """Output noise of unit variance, shape (batch, num_steps + 1, ny)."""
+    u: np.ndarray
+    """Inputs, shape (batch, num_steps + 1, nu)."""
     seeds: tuple[int, ...]
     """A seed per episode for the draws of its condition and of the process noise; empty if neither
     draws anything."""
 
     def row(self, i: int) -> Draws:
         """Return the draws of one episode."""
-        return Draws(self.x0[i : i + 1], self.noise[i : i + 1], self.seeds[i : i + 1])
+        return Draws(*(getattr(self, f.name)[i : i + 1] for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class Episodes:
     """True states, shape (num_steps + 1, batch, nx)."""
     y: np.ndarray
     """Measured outputs, shape (num_steps + 1, batch, ny)."""
+    u: np.ndarray
+    """Inputs, shape (num_steps + 1, batch, nu)."""
     observations: np.ndarray
     """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
 
@@ -106,6 +110,8 @@ class EpisodeSource:
         cls = SYSTEMS.resolve(system)
         probe(cls)
         self.system, chosen = cls.configured(setup, **changes)
+        if self.system.draws_input:
+            self.system = replace(self.system, measured_input=True)
         self.condition = parse_condition(condition)
         self.condition.plant(self.system, ())  # raises if the condition does not apply
         self.setup = self.condition.setup(self.system, chosen)
@@ -114,16 +120,15 @@ class EpisodeSource:
         self.noise = own.and_process(self.condition.process_noise(self.system, self.setup))
         self.trivial = type(self.condition) is Condition
         self.deterministic = self.fixed_x0 and self.trivial and not np.any(self.setup.noise_std)
-        self.deterministic &= not self.noise.stochastic
+        self.deterministic &= not (self.noise.stochastic or self.system.draws_input)
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
-        self.x0_low = vector(self.setup.x0_low, self.system.nx, "x0_low")
-        self.x0_high = vector(self.setup.x0_high, self.system.nx, "x0_high")
+        self.start = self.setup.start(self.system.nx)
         self._parts = math.ceil(self.setup.dt / longest_step(self.system) - 1e-6)
 
     def contains(self, x0: np.ndarray) -> np.ndarray:
         """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
-        inside = np.asarray(((x0 >= self.x0_low) & (x0 <= self.x0_high)).all(axis=-1))
+        inside = self.start.contains(x0)
         return inside if self.fixed_x0 else inside & self.system.admissible(x0)
 
     def stream(self, seeds: np.random.SeedSequence) -> Stream:
@@ -138,6 +143,9 @@ class EpisodeSource:
         """Draw the random numbers of the next episode of each stream; a stream may occur several
         times. The array ``noise``, if given, must have the right size and is overwritten."""
         x0 = np.empty((len(streams), self.system.nx))
+        u = np.broadcast_to(self.inputs, (len(streams), *self.inputs.shape))
+        if self.system.draws_input:
+            u = np.stack([self._drawn_input(stream.inputs) for stream in streams])
         if noise is None:
             noise = np.empty((len(streams), len(self.times), self.system.ny))
         for i, stream in enumerate(streams):
@@ -145,7 +153,22 @@ class EpisodeSource:
             stream.noise.standard_normal(out=noise[i])
         drawing = not self.trivial or self.noise.stochastic
         seeds = tuple(int(s.conditions.integers(2**63)) for s in streams) if drawing else ()
-        return Draws(x0, noise, seeds)
+        return Draws(x0, noise, u, seeds)
+
+    def _drawn_input(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw the inputs (num_steps + 1, nu) of an episode.
+
+        Raises:
+            ValueError: in one line, if the system draws something else.
+        """
+        name, shape = type(self.system).__name__, (len(self.times), self.system.nu)
+        u = np.asarray(self.system.draw_input(rng, self.times))
+        if u.shape != shape or u.dtype.kind not in "biuf" or not np.isfinite(u).all():
+            raise ValueError(
+                f"{name}.draw_input returned an array of {u.dtype}, shape {u.shape}; expected "
+                f"finite numbers, shape {shape}"
+            )
+        return u
 
     def play(
         self, draws: Draws, x0: np.ndarray | None = None, into: Episodes | None = None
@@ -160,25 +183,30 @@ class EpisodeSource:
         start = draws.x0 if x0 is None else x0
         episodes = self._empty(len(start)) if into is None else into
         x, y, observations = episodes.x, episodes.y, episodes.observations
+        u = episodes.u
+        u[:] = draws.u.swapaxes(0, 1)
+        inputs = u if self.system.draws_input else None
         rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
         if self.noise.stochastic:
             shape = (len(self.times) - 1, self._parts, 2, self.noise.L(0.0).shape[1])
             drawn = np.stack([rng.standard_normal(shape) for rng in rngs], axis=3)
             step = self.setup.truth_step
-            disturbed_truth(plant, self.noise, start, self.times, drawn, step, out=x)
-        elif plant is self.system and len(start) > 1 and (start == start[0]).all():
+            disturbed_truth(plant, self.noise, start, self.times, drawn, step, x, inputs)
+        elif (
+            plant is self.system and inputs is None and len(start) > 1 and (start == start[0]).all()
+        ):
             x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
         else:
-            truth(plant, start, self.times, self.setup.truth_step, out=x)
+            truth(plant, start, self.times, self.setup.truth_step, x, inputs)
         y[:] = self.noise.outputs(self.times, draws.noise.swapaxes(0, 1))
-        y += plant.h(self.times[:, None], x, self.inputs[:, None])
+        y += plant.h(self.times[:, None], x, u)
         if not self.trivial:
             sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
             y[:] = self.condition.outputs(sent, rngs)
         ny = self.system.ny
         observations[..., :ny] = y
-        observations[..., ny:-1] = self.inputs[:, None]
+        observations[..., ny:-1] = u
         observations[..., -1] = (self.times / self.times[-1])[:, None]
         return episodes
 
@@ -187,6 +215,7 @@ class EpisodeSource:
         return Episodes(
             np.empty((*shape, system.nx)),
             np.empty((*shape, system.ny)),
+            np.empty((*shape, system.nu)),
             np.empty((*shape, system.ny + system.nu + 1), np.float32),
         )
 
@@ -194,7 +223,7 @@ class EpisodeSource:
         """Return the record of the episodes, which estimators are given: the samples up to that of
         the last action."""
         batch, last = episodes.y.shape[1], self.setup.num_steps
-        u = np.broadcast_to(self.inputs[:last], (batch, last, self.system.nu))
+        u = episodes.u[:last].swapaxes(0, 1).copy()
         prior = Prior.of(self.system, self.setup, batch, xhat0)
         return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
 
@@ -232,8 +261,11 @@ class EpisodeBuffer:
             for row, draws in zip(rows, waiting, strict=True)
         ]
         seeds = tuple(seed for draws in drawn for seed in draws.seeds)
-        x0 = np.concatenate([draws.x0 for draws in drawn])
-        return Draws(x0, np.concatenate([draws.noise for draws in drawn]), seeds)
+        x0, noise, u = (
+            np.concatenate([getattr(draws, name) for draws in drawn])
+            for name in ("x0", "noise", "u")
+        )
+        return Draws(x0, noise, u, seeds)
 
     def take(
         self, rows: Sequence[int], streams: Sequence[Stream], x0: np.ndarray | None = None
@@ -272,11 +304,12 @@ class Stream:
     def __init__(self, seeds: np.random.SeedSequence, system: str) -> None:
         salt = np.frombuffer(hashlib.sha256(system.encode()).digest()[:16], "<u4").tolist()
         salted = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, *salt))
-        states, noise, conditions = (np.random.default_rng(seed) for seed in salted.spawn(3))
+        states, noise, conditions, inputs = map(np.random.default_rng, salted.spawn(4))
         self._states = states
         self._queue: list[np.ndarray] = []
         self.noise = noise
         self.conditions = conditions
+        self.inputs = inputs
 
     def next_x0(self, source: EpisodeSource) -> np.ndarray:
         """Return the next initial state (nx,) from the setup's set, as changed by the condition.
@@ -288,13 +321,12 @@ class Stream:
             if self._queue:
                 return self._queue.pop(0)
             if source.fixed_x0:
-                drawn = source.x0_low[None]
+                drawn = source.start.mean[None]
             else:
-                shape = (_DRAWS, source.system.nx)
-                drawn = self._states.uniform(source.x0_low, source.x0_high, shape)
+                drawn = source.start.draw(self._states, _DRAWS)
                 drawn = drawn[source.system.admissible(drawn)]
             self._queue = list(source.condition.starts(drawn, source.contains))
         if self._queue:
             return self._queue.pop(0)
         name = type(source.system).__name__
-        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states of the box is admissible")
+        raise ValueError(f"{name}: none of {_ATTEMPTS * _DRAWS} states drawn is admissible")

@@ -249,7 +249,7 @@ def _check_arguments(estimator: Estimator, record: Record) -> None:
 
 def _copy(record: Record) -> Record:
     prior = Prior(record.prior.mean.copy(), record.prior.cov.copy())
-    return Record(record.t.copy(), record.y.copy(), record.u.copy(), prior)
+    return Record(record.t.copy(), record.y.copy(), record.u.copy(), prior, record.noise_std)
 
 
 @add_check(ESTIMATOR_CHECKS, "causality")

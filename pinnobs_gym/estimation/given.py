@@ -1,4 +1,5 @@
-"""The check of what an estimator is given, and the bounds of what it returns, the same for all.
+"""The check of what an estimator is given, noise by sample, and the bounds of what it returns, the
+same for all estimators.
 
 `BaseEstimator` applies both to the methods ``run`` and ``update`` that a class defines, so that no
 estimator has to, and none can broadcast outputs of another number.
@@ -7,26 +8,43 @@ estimator has to, and none can broadcast outputs of another number.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import wraps
 from typing import Any
 
 import numpy as np
 
 from pinnobs_gym.estimation.projection import kept_inside
+from pinnobs_gym.simulation.noise import Noise, SampledLevel
 from pinnobs_gym.simulation.record import Record
 
 
 def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
     """Return the method ``run(record)`` with `Record.check_fits` before it, and `kept_inside` after
-    it if the system's states have bounds."""
+    it if the system's states have bounds.
+
+    Where the record has noise by sample, the method is that of an estimator which is told this
+    noise.
+    """
 
     @wraps(run)
     def checked(self: Any, record: Record) -> Any:
         record.check_fits(self.system)
+        if record.noise_std is not None and not isinstance(self.noise_std, SampledLevel):
+            told = self.system.noise(self.noise_std, self.process_noise)
+            level = SampledLevel(record.t, _filled(told, record.t, record.noise_std))
+            self = replace(self, noise_std=level)
         result, box = run(self, record), self.system.state_box
         return result if box is None else kept_inside(result, box)
 
     return checked
+
+
+def _filled(told: Noise, t: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (batch, num_samples, ny) of the output noise by sample, where
+    they are NaN those of the noise that an estimator is told."""
+    common = [np.sqrt(np.einsum("iib->bi", told.R(float(now)))) for now in t]
+    return np.where(np.isnan(std), np.stack(common, axis=1), std)
 
 
 def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:

@@ -112,8 +112,8 @@ def whitened(
 
 
 def smoothed(window: LinearWindow, deviation: np.ndarray, root: np.ndarray) -> Smoothed:
-    """Return the states of a window, given the mean of its first state, less r (batch, nx), and a root
-    (batch, nx, nx) of its covariance, both without the window's outputs."""
+    """Return the states of a window, given the mean of its first state, less r (batch, nx), and a
+    root (batch, nx, nx) of its covariance, both without the window's outputs."""
     n, batch, nx = window.r.shape
     A, b, M = _backward(window)
     before, L = _forward(window, deviation, root)

@@ -15,7 +15,7 @@ from pinnobs_gym.estimation.linear_window import (
 )
 from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.estimation.square_root import compressed, root_of, updated
-from pinnobs_gym.simulation.bounds import Box
+from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import System
@@ -79,12 +79,12 @@ class MovingWindow:
         return replace(self, x=x), states
 
 
-def _inside(states: Smoothed, box: Box) -> np.ndarray:
+def _inside(states: Smoothed, box: StateBox) -> np.ndarray:
     """Return the states (num_samples, batch, nx) within the bounds that are nearest to those of the
     window, all together."""
     n, _, nx = states.x.shape
     rows = np.flatnonzero(box.outside(states.x).any(axis=0))
-    whole = Box(np.tile(box.low, n), np.tile(box.high, n))
+    whole = StateBox(np.tile(box.low, n), np.tile(box.high, n))
     together = states.x[:, rows].swapaxes(0, 1).reshape(len(rows), n * nx)
     moved = nearest(together, joint_covariance(states, rows), whole)
     x = states.x.copy()

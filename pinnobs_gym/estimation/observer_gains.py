@@ -207,9 +207,9 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
     """Return the gain L (nx, ny) with which all errors in the initial set decay at a rate (1/s).
 
     The linear matrix inequalities are P ⪰ I and He(PA − YH) + 2·rate·P ⪯ 0 with Y = PL, for the
-    Jacobians A, H at all states of a grid over the benchmark's box of initial states. The error
-    then contracts in the constant metric P (Lohmiller & Slotine 1998; the polytopic form of
-    Alessandri 2004). They are solved by cvxpy, from the extra ``lmi``.
+    Jacobians A, H at all states of a grid over the box of the benchmark's initial states
+    (`StartLaw.corners`). The error then contracts in the constant metric P (Lohmiller & Slotine
+    1998; the polytopic form of Alessandri 2004). They are solved by cvxpy, from the extra ``lmi``.
 
     Args:
         system: the model.
@@ -226,8 +226,8 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
         raise ImportError(
             'the LMI needs cvxpy; install it with pip install "pinnobs-gym[lmi]"'
         ) from None
-    setup, nx, scale = system.setups["benchmark"], system.nx, np.asarray(system.scale)
-    low, high = vector(setup.x0_low, nx, "x0_low"), vector(setup.x0_high, nx, "x0_high")
+    nx, scale = system.nx, np.asarray(system.scale)
+    low, high = system.setups["benchmark"].start(nx).corners
     # Jacobians at the grid points, for scaled states.
     axes = [np.linspace(a, b, grid) for a, b in zip(low, high, strict=True)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, nx)

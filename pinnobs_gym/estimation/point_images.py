@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.estimation.projection import nearest_points
-from pinnobs_gym.simulation.bounds import Box
+from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.matrices import product
 from pinnobs_gym.simulation.notices import say_once
 
@@ -31,7 +31,7 @@ class SigmaPoints:
 
     @staticmethod
     def of(
-        centre: np.ndarray, deviations: np.ndarray, box: Box | None, P: np.ndarray | None
+        centre: np.ndarray, deviations: np.ndarray, box: StateBox | None, P: np.ndarray | None
     ) -> SigmaPoints:
         """Return the points with the given deviations (nx, num_points, batch) from the estimates
         (batch, nx), within the box, if there is one; P (batch, nx, nx) measures distances."""

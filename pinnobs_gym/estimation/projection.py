@@ -8,7 +8,7 @@ component to its bound by itself would change the sum. P stays as it is: on whic
 the true state lies does not make it better known.
 
 The same point is the minimum in the box of any quadratic cost with the minimum x̂ and the Hessian
-P⁻¹, up to a factor. Box-constrained Gauss-Newton steps are therefore found in the same way.
+P⁻¹, up to a factor. StateBox-constrained Gauss-Newton steps are therefore found in the same way.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.bounds import Box
+from pinnobs_gym.simulation.bounds import StateBox
 
 _ROUNDS = 10
 """Number of steps of the search per bounded component; it rarely takes more than one."""
@@ -30,7 +30,7 @@ _ROUNDING = 1e-10
 rounding."""
 
 
-def nearest(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
+def nearest(x: np.ndarray, P: np.ndarray, box: StateBox) -> np.ndarray:
     """Return the points of the box that are nearest to x in the metric P⁻¹, shape (batch, n).
 
     Rows that are not finite stay. A component without variance, or that depends on others at their
@@ -50,7 +50,7 @@ def nearest(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
     return x
 
 
-def nearest_points(points: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
+def nearest_points(points: np.ndarray, P: np.ndarray, box: StateBox) -> np.ndarray:
     """Return points (num_points, batch, n) with those outside of the box moved by `nearest`, in the
     metric of the covariances P (batch, n, n) of their rows."""
     number, row = np.nonzero(box.outside(points))
@@ -61,7 +61,7 @@ def nearest_points(points: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
     return points
 
 
-def kept_inside(holder: Any, box: Box) -> Any:
+def kept_inside(holder: Any, box: StateBox) -> Any:
     """Return a `State` or `Estimates` with the estimates outside of the box moved to the `nearest`
     ones in the metric of their covariances; without covariances, to the bounds."""
     xhat = getattr(holder, "xhat", None)  # what is no State is refused later, by its name
@@ -74,7 +74,7 @@ def kept_inside(holder: Any, box: Box) -> Any:
     return replace(holder, xhat=moved.reshape(xhat.shape))
 
 
-def multipliers(x: np.ndarray, P: np.ndarray, box: Box) -> np.ndarray:
+def multipliers(x: np.ndarray, P: np.ndarray, box: StateBox) -> np.ndarray:
     """Return the Lagrange multipliers λ (batch, n) of the bounds, positive at an upper bound and
     negative at a lower one, with which x − Pλ is the `nearest` point of the box. The arguments are
     those of `nearest`, all finite."""

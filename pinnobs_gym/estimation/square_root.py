@@ -35,12 +35,11 @@ def prior_root(system: System, prior: Prior, R: np.ndarray) -> np.ndarray | None
         R: covariance of the output noise, shape (ny, ny, batch or 1).
     """
     scale = vector(system.scale, system.nx, "scale")
-    widest = np.sqrt(np.einsum("bii->bi", prior.cov).max(axis=0, initial=0.0)) / scale
-    noise = np.sqrt(np.einsum("iib->ib", R).min(axis=1)) / output_scale(system)
-    limit = WIDE * noise.min()
-    if not (widest > limit).any():
+    widest = np.sqrt(np.einsum("bii->bi", prior.cov)) / scale
+    noise = np.sqrt(np.einsum("iib->bi", R)) / output_scale(system)
+    wide = (widest > WIDE * noise.min(axis=1, keepdims=True)).any(axis=1)
+    if not wide.any():
         return None
-    wide = (np.sqrt(np.einsum("bii->bi", prior.cov)) / scale > limit).any(axis=1)
     roots = root(prior.cov.transpose(1, 2, 0)).transpose(2, 0, 1)
     return np.where(wide[:, None, None], roots, np.nan)
 

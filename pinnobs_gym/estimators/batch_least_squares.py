@@ -92,7 +92,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
             x0 = box.clipped(x0)  # against rounding
         y, u = record.y[rows, :length].swapaxes(0, 1), record.u[rows, :length].swapaxes(0, 1)
         t = record.t[:length]
-        fit = linearised(self.system, self.noise, t, y, u, x0, root_of)
+        fit = linearised(self.system, self.noise.rows(rows), t, y, u, x0, root_of)
         information = fit.information + np.eye(len(z))[..., None]
         return Fit(fit.cost + inner(z, z), information, fit.right - z, fit.x, fit.X)
 

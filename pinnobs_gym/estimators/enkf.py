@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,9 +13,10 @@ from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.localisation import tapers
 from pinnobs_gym.estimation.projection import nearest_points
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import outer, spread, total
+from pinnobs_gym.simulation.matrices import divide, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -43,6 +45,10 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     Members that differ by whole turns of an angle are the same states: they are taken within half a
     turn of their circular mean, and so are their outputs.
 
+    Correlations of few members over a long distance are mostly chance. With ``localisation``, the
+    covariances of outputs with states and with each other are tapered by distance (Gaspari & Cohn
+    1999; Houtekamer & Mitchell 2001), which takes a system that declares `System.distances`.
+
     Random numbers depend only on the seed and the sample, and all episodes of a batch share them.
     Results are therefore reproducible, and the result of an episode does not depend on the others
     in its batch. The numbers have mean zero and unit variance over the ensemble.
@@ -55,6 +61,9 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """Size of the ensemble."""
     inflation: float = 1.01
     """Largest factor of the deviations from the ensemble mean after each analysis."""
+    localisation: float | None = None
+    """Distance, in the unit of `System.distances`, from which on correlations are taken as zero;
+    None for no localisation."""
     seed: int = 0
     """Seed of the random numbers."""
 
@@ -65,10 +74,12 @@ x_k^{i-} &= \varphi(x_{k-1}^i, w_i) \quad
 \text{with } dx = f\, dt + L\, dw_i \text{ between the samples} \\
 X &= \tfrac{1}{\sqrt{N-1}} \bigl[ x_k^{i-} - \bar x_k^- \bigr]_i, \qquad
 Y = \tfrac{1}{\sqrt{N-1}} \bigl[ h(t_k, x_k^{i-}, u_k) - \bar y \bigr]_i \\
-K &= X Y^\top (Y Y^\top + R)^{-1} \\
+K &= (\rho_{xy} \circ X Y^\top) (\rho_{yy} \circ Y Y^\top + R)^{-1}, \qquad
+\rho = 1 \text{ without localisation} \\
 x_k^i &= x_k^{i-} + K\, (y_k + v_i - h(t_k, x_k^{i-}, u_k)), \qquad v_i \sim \mathcal N(0, R) \\
 x_k^i &:= \hat x_k + \ell \odot (x_k^i - \hat x_k), \qquad
-\ell_j = \min\bigl(\lambda, (1 - (K Y X^\top)_{jj} / (X X^\top)_{jj})^{-1/2}\bigr) \\
+\ell_j = \min\bigl(\lambda, (1 - (2 K Y X^\top - K (Y Y^\top + R) K^\top)_{jj}
+/ (X X^\top)_{jj})^{-1/2}\bigr) \\
 \hat x_k &= \tfrac1N \sum_i x_k^i, \qquad
 P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 """
@@ -80,6 +91,15 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             raise ValueError(f"members={self.members}; expected at least 2")
         if not 1 <= self.inflation < np.inf:
             raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
+        if self.localisation is not None:
+            if not 0 < self.localisation < np.inf:
+                raise ValueError(f"localisation={self.localisation}; expected a number above 0")
+            _ = self._tapers  # raises without distances
+
+    @cached_property
+    def _tapers(self) -> tuple[np.ndarray, np.ndarray]:
+        assert self.localisation is not None
+        return tapers(self.system, self.localisation)
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
@@ -121,7 +141,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
         missing = np.isnan(y)
         Y = np.where(missing.T[:, None], 0.0, Y)
-        K, S = gain_of_deviations(X, Y, self.noise.R(t, y))
+        K, S, taken = self._analysis(X, Y, self.noise.R(t, y))
         # Correct each member with its own perturbed output.
         errors = self.system.output_residual(y + noise, outputs)
         errors = np.where(missing, 0.0, errors)
@@ -129,7 +149,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             members = members + errors[..., p, None] * column
         members = gathered(members, self.system.state_period)
         xhat = total(members) / self.members
-        deviations = self._inflation(X, Y, K) * (members - xhat)
+        deviations = self._inflation(X, taken) * (members - xhat)
         analysed = xhat + deviations
         members = self._inside(analysed)
         if members is not analysed:
@@ -152,11 +172,26 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         P = outer(X, X).transpose(2, 0, 1) / (self.members - 1)
         return nearest_points(members, P, box)
 
-    def _inflation(self, X: np.ndarray, Y: np.ndarray, K: np.ndarray) -> np.ndarray:
-        """Return the factors (batch, nx) of the deviations after an analysis with the gains K (nx,
-        ny, batch) and the weighted deviations X and Y of states and outputs before it."""
-        # The analysis is expected to take the variances KYXᵀ, of XXᵀ.
-        taken = np.add.accumulate(K * outer(X, Y), axis=1)[:, -1]
+    def _analysis(
+        self, X: np.ndarray, Y: np.ndarray, R: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the gains (nx, ny, batch), the innovation covariances (ny, ny, batch), and the
+        variances (nx, batch) that the analysis is expected to take; the arguments are those of
+        `gain_of_deviations`."""
+        if self.localisation is None:
+            K, S = gain_of_deviations(X, Y, R)
+            return K, S, np.add.accumulate(K * outer(X, Y), axis=1)[:, -1]
+        between, own = outer(X, Y), outer(Y, Y)
+        states, outputs = self._tapers
+        S = outputs[..., None] * own + R
+        K = divide(states[..., None] * between, S)
+        # Members change by −K(Y − v): their variances by −2KYXᵀ + K(YYᵀ + R)Kᵀ for any gain.
+        change = 2 * between - product(K, own + R)
+        return K, S, np.add.accumulate(K * change, axis=1)[:, -1]
+
+    def _inflation(self, X: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """Return the factors (batch, nx) of the deviations after an analysis that has taken these
+        variances (nx, batch) from the weighted deviations X (nx, num_members, batch)."""
         variance = total((X * X).transpose(1, 2, 0)).T
         share = np.where(variance > 0, taken / variance, 0.0)
         return np.clip(1 / np.sqrt(1 - np.clip(share, 0.0, 1.0)), 1.0, self.inflation).T

@@ -17,22 +17,27 @@ from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 
-_Sample = tuple[float, np.ndarray, np.ndarray]
-"""Time in s, outputs (batch, ny) and inputs (batch, nu)."""
+_Sample = tuple[float, np.ndarray, np.ndarray, np.ndarray]
+"""Time in s, outputs (batch, ny), inputs (batch, nu), and covariance (ny, ny, batch or 1) of the
+output noise."""
 _FEW = 10
 """The likelihood is tempered if it would reduce the effective number of particles to less than
 their number over this."""
 _DISCOUNT = 0.95
 """Liu and West's δ where kernels are needed."""
-_ROUNDS = 20
+_TEMPERED = 0.7
+"""Their δ in tempering. Wide kernels keep the covariance of the set right over many resamplings,
+even where the outputs are four standard deviations from the prior."""
+_ROUNDS = 100
 """Largest number of tempering steps per sample."""
 _LARGEST = 1e150
 """Absolute value of a state beyond which a particle counts as overflowed; its square is finite."""
 _ZERO = -1e300
 """Logarithm of the weight of a particle that is out of the question. It is finite, so that a zeroth
 power of it is one."""
-_HALVINGS = 20
-"""Number of bisection steps in the search of a tempering power."""
+_HALVINGS = 60
+"""Number of bisection steps in the search of a tempering power. After a prior that is wide relative
+to the output noise, the first power is as small as R/P₀."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ class ParticleFilter(RecursiveEstimator):
     """Number of particles."""
     discount: float | None = None
     """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set. If
-    None, it is 1 with process noise, 0.95 without, and 0.95 in tempering."""
+    None, it is 1 with process noise, 0.95 without, and 0.7 in tempering."""
     seed: int = 0
     """Seed of the random numbers."""
 
@@ -162,11 +167,11 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         missing = np.isnan(y)
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
-        weights = np.exp(log_weights)
+        weights, R = np.exp(log_weights), self.noise.R(t, y)
         outputs = gathered(outputs, self.system.output_period, weights)
         yhat, S = _predicted_output(weights, outputs)
-        S = S + self.noise.R(t, y).transpose(2, 0, 1)
-        x, log_weights = self._tempered(x, log_weights, (t, y, u), memory.sample)
+        S = S + R.transpose(2, 0, 1)
+        x, log_weights = self._tempered(x, log_weights, (t, y, u, R), memory.sample)
         weights = np.exp(log_weights)
         x = gathered(x, self.system.state_period, weights)
         xhat, P = moments(weights, x)
@@ -188,10 +193,10 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         """Return the particles and the logarithms of their weights after the update with a sample.
 
         Where the likelihood would leave too few effective particles, it is applied in several
-        factors. Each is a power of the likelihood that leaves effectively a quarter of the
+        factors. Each is a power of the likelihood that leaves effectively half of the
         particles, and is followed by resampling.
         """
-        t, y, u = seen
+        t, y, u, R = seen
         remaining = np.ones(len(y))
         log_likelihood = self._log_likelihood(x, seen)
         for part_number in range(_ROUNDS):
@@ -205,18 +210,19 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             log_weights = log_weights.copy()
             log_weights[:, rows] = _normalised(old + part * likelihood)
             remaining[rows] -= part
-            discount = _DISCOUNT if self.discount is None else self.discount
+            discount = _TEMPERED if self.discount is None else self.discount
             stream = sample, part_number
             x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
-            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), (t, y[rows], u[rows]))
+            part_seen = t, y[rows], u[rows], R[..., rows] if R.shape[2] > 1 else R
+            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), part_seen)
         return x, _normalised(log_weights + remaining * log_likelihood)
 
     def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
-        t, y, u = seen
+        t, y, u, R = seen
         errors = self.system.output_residual(y, np.asarray(self.system.h(t, x, u)))
         errors = np.where(np.isnan(y), 0.0, errors)
-        log_likelihood = -0.5 * _squared_sizes(errors, self.noise.R(t, y))
+        log_likelihood = -0.5 * _squared_sizes(errors, R)
         box = self.system.state_box
         if box is not None:
             outside = box.outside(x)
@@ -307,11 +313,11 @@ def _effective(log_weights: np.ndarray) -> np.ndarray:
 def _power(
     log_weights: np.ndarray, log_likelihood: np.ndarray, remaining: np.ndarray, count: int
 ) -> np.ndarray:
-    """Return the power of the likelihood, at most ``remaining``, that leaves effectively a quarter
+    """Return the power of the likelihood, at most ``remaining``, that leaves effectively half
     of the particles, shape (batch,). It is found by bisection."""
     low, high = np.zeros_like(remaining), remaining
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        enough = _effective(log_weights + middle * log_likelihood) > count / 4
+        enough = _effective(log_weights + middle * log_likelihood) > count / 2
         low, high = np.where(enough, middle, low), np.where(enough, high, middle)
     return high

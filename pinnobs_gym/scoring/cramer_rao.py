@@ -15,7 +15,8 @@ from pinnobs_gym.simulation.matrices import moments, sandwich
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import Noise, noise_std
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.start_law import StartLaw
+from pinnobs_gym.simulation.system import Setup, System
 
 if TYPE_CHECKING:
     from pinnobs_gym.envs.game import Game
@@ -34,6 +35,7 @@ def cramer_rao(
     P0: np.ndarray,
     noise: Noise,
     missing: np.ndarray | None = None,
+    u: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the Cramér–Rao reference of each episode: the lower bound on the covariance of any
     locally unbiased estimate x̂(k|k) of this trajectory.
@@ -51,13 +53,14 @@ def cramer_rao(
         P0: covariance of the prior, shape (nx, nx).
         noise: the noise of plant and outputs.
         missing: which outputs are missing, bool (batch, num_samples, ny); none if None.
+        u: inputs at the samples, shape (batch, num_samples, nu); those of `System.input` if None.
 
     Returns:
         Covariances, shape (batch, num_samples, nx, nx).
     """
     batch, num_samples, nx = x.shape
     bound = np.empty((num_samples, nx, nx, batch))
-    steps = _linearised(system, noise, t, x, missing)
+    steps = _linearised(system, noise, t, x, _inputs(system, t, u), missing)
     for k, P in enumerate(covariances(steps, P0)):
         bound[k] = P
     return bound.transpose(3, 0, 1, 2)
@@ -86,17 +89,22 @@ def covariances(
 
 
 def _linearised(
-    system: System, noise: Noise, t: np.ndarray, x: np.ndarray, missing: np.ndarray | None
+    system: System,
+    noise: Noise,
+    t: np.ndarray,
+    x: np.ndarray,
+    u: np.ndarray,
+    missing: np.ndarray | None,
 ) -> Iterator[Step]:
     """Yield the steps of `covariances`, linearised at the true states; the arguments are those of
     `cramer_rao`."""
-    u, F, Q = system.input(t), None, np.zeros((system.nx, system.nx, 1))
+    F, Q = None, np.zeros((system.nx, system.nx, 1))
     for k in range(len(t)):
         now = x[:, k]
         if k:
-            times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
+            times, inputs = (float(t[k - 1]), float(t[k])), (u[:, k - 1], u[:, k])
             _, F, Q = model_step_moments(system, noise, *times, x[:, k - 1], *inputs)
-        H = system.h_jacobian(t[k], now, u[k]).transpose(1, 2, 0)
+        H = system.h_jacobian(t[k], now, u[:, k]).transpose(1, 2, 0)
         R = noise.R(float(t[k]))
         if missing is not None:
             # A zero row of H carries no information.
@@ -122,7 +130,14 @@ def expected_nrmse(
     return window_nrmse(np.where(counts, variance, 0.0).sum(axis=-1), counts.sum(axis=-1), part)
 
 
-def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _inputs(system: System, t: np.ndarray, u: np.ndarray | None) -> np.ndarray:
+    """Return u or, if it is None, the system's inputs at the samples, (1, num_samples, nu)."""
+    return np.asarray(system.input(t))[None] if u is None else u
+
+
+def step_error(
+    system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray | None = None
+) -> np.ndarray:
     """Return the error of one step of the model from the true state, shape (batch, num_samples,
     nx), zero at the first sample.
 
@@ -133,10 +148,11 @@ def step_error(system: System, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         system: the plant.
         t: sample times in s, shape (num_samples,).
         x: true states without process noise, shape (batch, num_samples, nx).
+        u: inputs, as in `cramer_rao`.
     """
-    error, u = np.zeros_like(x), system.input(t)
+    error, u = np.zeros_like(x), _inputs(system, t, u)
     for k in range(1, len(t)):
-        times, inputs = (float(t[k - 1]), float(t[k])), (u[k - 1 : k], u[k : k + 1])
+        times, inputs = (float(t[k - 1]), float(t[k])), (u[:, k - 1], u[:, k])
         end = model_step(system, *times, x[:, k - 1], *inputs)
         error[:, k] = system.state_residual(end, x[:, k])
     return error
@@ -164,7 +180,7 @@ def exact_bayes(
     seed: int = 0,
 ) -> Posterior:
     """Compute the posterior of the state of a plant without process noise by importance sampling of
-    x₀, which is uniform in the setup's set.
+    x₀, whose law is the setup's.
 
     Draws from the prior serve the first sample. Each time the number of samples doubles, new draws
     come from a Student distribution with 5 degrees of freedom, fitted to the previous weighted
@@ -179,12 +195,17 @@ def exact_bayes(
         R: variances of the output noise, shape (ny,).
         draws: number of initial states per proposal.
         seed: of the draws.
+
+    Raises:
+        ValueError: in one line, if the law of x₀ has no density.
     """
     rng = np.random.default_rng(seed)
     batch, n, nx = record.batch, record.num_samples, system.nx
-    low, high = vector(setup.x0_low, nx, "x0_low"), vector(setup.x0_high, nx, "x0_high")
+    law = setup.start(nx)
+    law.log_density(law.mean)  # raises if there is none
+    least = 1e-17 * np.diag(np.diag(law.cov))
     result = Posterior(np.empty((batch, n, nx)), np.empty((batch, n, nx, nx)), np.empty((batch, n)))
-    x0 = np.broadcast_to(_prior_draws(system, low, high, draws, rng)[:, None], (draws, batch, nx))
+    x0 = np.broadcast_to(_prior_draws(system, law, draws, rng)[:, None], (draws, batch, nx))
     log_weight = np.zeros((draws, batch))
     start, stop = 0, 1
     while start < n:
@@ -192,25 +213,23 @@ def exact_bayes(
         weight = _reweighted(system, record, R, x0, log_weight, (start, min(stop, n)), result)
         mean, cov = moments(weight, x0)
         # Student proposal at their mean, wider than their covariance.
-        spread = np.linalg.cholesky(2.0 * cov + 1e-18 * np.diag((high - low) ** 2))
+        spread = np.linalg.cholesky(2.0 * cov + least)
         student = rng.standard_normal((draws, 1, nx, 1))
         student = student / np.sqrt(rng.chisquare(5.0, (draws, 1, 1, 1)) / 5.0)
         x0 = mean + (spread @ student)[..., 0]
-        # Prior over proposal density, up to constants: the prior is uniform in the set.
-        inside = ((x0 >= low) & (x0 <= high)).all(axis=-1) & system.admissible(x0)
+        # Prior over proposal density, up to constants.
+        log_prior = np.where(system.admissible(x0), law.log_density(x0), -np.inf)
         log_density = -(nx + 5) / 2 * np.log1p((student**2).sum(axis=(2, 3)) / 5.0)
-        log_weight = np.where(inside, -log_density, -np.inf)
+        log_weight = log_prior - log_density
         start, stop = stop, 2 * stop
     return result
 
 
-def _prior_draws(
-    system: System, low: np.ndarray, high: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Draw initial states (count, nx), uniform in the admissible part of the box, by rejection."""
-    kept = np.empty((0, len(low)))
+def _prior_draws(system: System, law: StartLaw, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw admissible initial states (count, nx) of a law by rejection."""
+    kept = np.empty((0, system.nx))
     while len(kept) < count:
-        drawn = rng.uniform(low, high, (4 * count, len(low)))
+        drawn = law.draw(rng, 4 * count)
         kept = np.concatenate([kept, drawn[np.asarray(system.admissible(drawn))]])
     return kept[:count]
 
@@ -272,13 +291,14 @@ def reference(game: Game, record: Record, truth: np.ndarray) -> Reference | None
     if not source.condition.reference or source.fixed_x0 or not (std > 0).all():
         return None
     P0 = record.prior.cov[0]
-    P = cramer_rao(source.system, record.t, truth, P0, source.noise, np.isnan(record.y))
+    missing = np.isnan(record.y)
+    P = cramer_rao(source.system, record.t, truth, P0, source.noise, missing, record.u)
     counted = (source.system.scale, source.system.observable(truth))
     part = windows(record.t, source.setup.transient_end)["steady"]
     steady = expected_nrmse(P, source.system.scale, part, counted[1])
     if not source.noise.stochastic:
         # Discard references below the error of the model's own step.
-        error = step_error(source.system, record.t, truth)
+        error = step_error(source.system, record.t, truth, record.u)
         squares = error[..., None] * error[..., None, :]
         floor = expected_nrmse(squares, source.system.scale, part, counted[1])
         steady = np.where(steady > floor, steady, np.nan)

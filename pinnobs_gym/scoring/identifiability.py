@@ -70,8 +70,8 @@ def identifiability(game: Game) -> Identifiability | None:
     limit that less noise does not change, so that `free_over_known` grows as the noise decreases.
 
     Returns:
-        None if the condition has no unknowns, without output noise, from a fixed initial state, or
-        where an error is zero or not finite.
+        None if the condition has no unknowns, without output noise, from a fixed initial state,
+        with inputs that are drawn, or where an error is zero or not finite.
     """
     key = (type(game.source.system), game.name, pickle.dumps(dict(game.changes)))
     if key not in _known:
@@ -84,7 +84,7 @@ def _computed(game: Game) -> Identifiability | None:
     system, setup = source.system, source.setup
     unknowns = source.condition.unknowns(system, setup)
     std = noise_std(setup.noise_std, system.ny, "noise_std")
-    if not unknowns or source.fixed_x0 or not (std > 0).all():
+    if not unknowns or source.fixed_x0 or system.draws_input or not (std > 0).all():
         return None
     # Trajectories of the nominal plant, and which of their outputs are missing.
     episodes = _without_unknowns(game).episodes(_SEEDS)

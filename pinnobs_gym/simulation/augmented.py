@@ -12,6 +12,7 @@ from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknow
 from pinnobs_gym.simulation.bounds import Bounds, box
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.start_law import Box, Joint
 from pinnobs_gym.simulation.system import PoorPrior, Setup, System, is_number, vector
 
 
@@ -207,7 +208,7 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
     # A constant whose name is not that of a parameter is not named by a setup.
     means = np.array([setup.parameters.get(name, value.mean) for name, value in extras.items()])
     stds = np.array([value.std for value in extras.values()])
-    low, high = (vector(part, plant.nx, "x0") for part in (setup.x0_low, setup.x0_high))
+    law = setup.start(plant.nx)
     half = np.sqrt(3) * stds  # of a uniform law with this standard deviation
     lows, highs = means - half, means + half
     sides = [[getattr(value, side) for value in extras.values()] for side in ("low", "high")]
@@ -215,10 +216,13 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
     if limits is not None:
         lows, highs = limits.clipped(lows), limits.clipped(highs)
     poor = setup.poor_prior
+    if isinstance(law, Box):
+        starts = {"x0_low": _row(law.corners[0], lows), "x0_high": _row(law.corners[1], highs)}
+    else:
+        starts = {"x0_law": Joint(law, Box(tuple(lows.tolist()), tuple(highs.tolist())))}
     return replace(
         setup,
-        x0_low=_row(low, lows),
-        x0_high=_row(high, highs),
+        **starts,
         xhat0=_row(mean, means),
         P0=_diagonal(cov, stds),
         poor_prior=poor

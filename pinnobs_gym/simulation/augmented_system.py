@@ -144,6 +144,14 @@ class Augmented(System):
         plant, state = self._parts(x0)
         return plant.admissible(state)
 
+    def distances(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Those of the plant; constants are at distance 0 from every output."""
+        own = self.plant.distances()
+        if own is None:
+            return None
+        constants = np.zeros((self.nx - self.plant.nx, self.ny))
+        return np.concatenate([np.asarray(own[0], dtype=float), constants]), own[1]
+
     def observable(self, x: Array) -> Array:
         """The plant's components as the plant says, and all constants."""
         plant, state = self._parts(x)

@@ -14,7 +14,7 @@ Bounds: TypeAlias = Sequence[float | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class StateBox:
     """The states within the bounds, which themselves belong to it."""
 
     low: np.ndarray
@@ -32,7 +32,7 @@ class Box:
         return beyond
 
 
-def box(low: Bounds | None, high: Bounds | None, nx: int) -> Box | None:
+def box(low: Bounds | None, high: Bounds | None, nx: int) -> StateBox | None:
     """Return the box of bounds, or None if no state has one.
 
     Raises:
@@ -47,7 +47,7 @@ def box(low: Bounds | None, high: Bounds | None, nx: int) -> Box | None:
 @lru_cache(maxsize=64)
 def _made(
     low: tuple[float | None, ...] | None, high: tuple[float | None, ...] | None, nx: int
-) -> Box | None:
+) -> StateBox | None:
     sides = []
     for name, given, missing in (("state_low", low, -np.inf), ("state_high", high, np.inf)):
         bounds = (None,) * nx if given is None else given
@@ -67,4 +67,4 @@ def _made(
         raise ValueError(
             f"state_low={sides[0][i]:g} of state {i + 1} is not below state_high={sides[1][i]:g}"
         )
-    return Box(*sides) if np.isfinite(sides).any() else None
+    return StateBox(*sides) if np.isfinite(sides).any() else None

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from pinnobs_gym.simulation.cached import cached_by_plant
+from pinnobs_gym.simulation.start_law import Box, Points, StartLaw
 from pinnobs_gym.simulation.system import Setup, System, vector
 
 _POINTS = 2**22
@@ -19,27 +20,42 @@ _REFLECTED = 3
 
 def prior_moments(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean x̂₀ (nx,) and the covariance P₀ (nx, nx) of a setup's prior, in state units:
-    the setup's own or, where it has none, those of its initial set (`set_moments`)."""
+    the setup's own or, where it has none, those of its initial set (`_law_moments`)."""
     nx = system.nx
     mean = None if setup.xhat0 is None else vector(setup.xhat0, nx, "xhat0")
     cov = None if setup.P0 is None else np.array(setup.P0, dtype=float)
     if cov is not None and cov.shape != (nx, nx):
         raise ValueError(f"P0 has shape {cov.shape}; expected ({nx}, {nx})")
     if mean is None or cov is None:
-        low, high = (
-            tuple(vector(getattr(setup, name), nx, name).tolist()) for name in ("x0_low", "x0_high")
-        )
-        own_mean, own_cov = set_moments(system, low, high)
+        own_mean, own_cov = _law_moments(system, setup.start(nx))
         mean = own_mean.copy() if mean is None else mean
         cov = own_cov.copy() if cov is None else cov
     return mean, cov
+
+
+def _law_moments(system: System, law: StartLaw) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean (nx,) and the covariance (nx, nx) of the admissible states of a law; those
+    of a Gaussian itself, whichever of its states are admissible.
+
+    Raises:
+        ValueError: in one line, if no state is admissible.
+    """
+    if isinstance(law, Box):
+        return set_moments(system, tuple(law.low), tuple(law.high))
+    if isinstance(law, Points):
+        states = np.array(law.states, dtype=float)
+        kept = states[np.asarray(system.admissible(states))]
+        if not len(kept):
+            raise ValueError(f"{type(system).__name__}: no state of {law.states} is admissible")
+        law = Points(tuple(map(tuple, kept.tolist())))
+    return law.mean, law.cov
 
 
 @cached_by_plant
 def set_moments(
     system: System, low: tuple[float, ...], high: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (nx,) and the covariance (nx, nx) of the law of initial states: uniform in a
+    """Return the mean (nx,) and the covariance (nx, nx) of initial states that are uniform in a
     box, restricted to `System.admissible`.
 
     Both are exact if `System.admissible` is not overridden. Otherwise they are averages over the

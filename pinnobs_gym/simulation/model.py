@@ -29,8 +29,8 @@ def model_step(
     method, in equal steps of at most `longest_step`. Rows (batch, nx) of x may
     have their own times, t0 and t1 of shape (batch,); all rows take the same number of steps.
 
-    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used, with linear
-    interpolation between them, only if the system's input is measured.
+    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used, between them as
+    `System.input_hold` says, only if the system's input is measured.
     """
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
         x = runge_kutta(partial(_rate, system, t, u), x, step)
@@ -238,8 +238,9 @@ def substeps(
         if system.measured_input:
             if u0 is None or u1 is None:
                 raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
-            # Interpolate measured inputs linearly.
             weight = (part / count).reshape(3, *([1] * u0.ndim))
+            if system.input_hold == "previous":
+                weight = 0 * weight
             u = (1 - weight) * u0 + weight * u1
         else:
             u = system.input(t)

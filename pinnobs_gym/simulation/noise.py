@@ -4,9 +4,9 @@ references read."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 
@@ -87,6 +87,10 @@ class SampledLevel:
         """Return the standard deviations (batch, ny) at a time, None if it is that of no sample."""
         k = int(np.searchsorted(self.t, t))
         return self.std[:, k] if k < len(self.t) and self.t[k] == t else None
+
+    def rows(self, rows: np.ndarray | slice) -> SampledLevel:
+        """Return the noise of some rows of the batch."""
+        return SampledLevel(self.t, self.std[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +180,10 @@ class Noise:
         own = self.process, self.output, self.samples
         return _Sum(*own, own=self, further=L[..., None])
 
+    def rows(self, rows: np.ndarray | slice) -> Self:
+        """Return the noise of some rows of the batch, which differ only in noise by sample."""
+        return self if self.samples is None else replace(self, samples=self.samples.rows(rows))
+
     @property
     def stochastic(self) -> bool:
         """Whether the plant has process noise."""
@@ -199,6 +207,11 @@ class _Sum(Noise):
 
     def G(self, t: float) -> np.ndarray:
         return self.own.G(t)
+
+    def rows(self, rows: np.ndarray | slice) -> Self:
+        if self.samples is None:
+            return self
+        return replace(super().rows(rows), own=self.own.rows(rows))
 
     def outputs(self, t: np.ndarray, v: np.ndarray) -> np.ndarray:
         return self.own.outputs(t, v)
@@ -266,6 +279,11 @@ class AssumedNoise(Noise):
 
     def G(self, t: float) -> np.ndarray:
         return self._derived("G", self.told.G(t), self._raised)
+
+    def rows(self, rows: np.ndarray | slice) -> Self:
+        if self.samples is None:
+            return self
+        return replace(super().rows(rows), told=self.told.rows(rows))
 
     def _raised(self, G: np.ndarray) -> np.ndarray:
         """Return G with the floor in rows that are zero."""

@@ -39,7 +39,7 @@ def probe(cls: type[System]) -> None:
     """
     system, setup = cls.configured()
     inputs = _call(system, "input", (system.nu,), t=np.linspace(0.0, setup.duration, 3))
-    _call(system, "admissible", (), x=np.zeros((3, system.nx)) + np.asarray(setup.x0_low))
+    _call(system, "admissible", (), x=np.zeros((3, system.nx)) + setup.start(system.nx).mean)
     states = initial_states(system, setup, 6)
     for batch in _BATCHES:
         count = int(np.prod(batch))

@@ -51,8 +51,8 @@ class Record:
 
     Raises:
         ValueError: in one line, if an array does not hold real numbers, has another number of rows
-            or samples than the others, or holds infinite values; if t does not increase; or if a
-            time or an input is not a number.
+            or samples than the others, or holds infinite values; if t does not increase; if a time
+            or an input is not a number; or if a standard deviation is not above zero.
     """
 
     t: np.ndarray
@@ -63,9 +63,14 @@ class Record:
     """Inputs at the samples, shape (batch, num_samples, nu)."""
     prior: Prior
     """The prior of the initial state."""
+    noise_std: np.ndarray | None = None
+    """Standard deviations of the output noise by sample, in output units, shape (batch,
+    num_samples, ny); NaN where the level that the estimator is told holds, as it does everywhere if
+    this is None."""
 
     def __post_init__(self) -> None:
-        for name in ("t", "y", "u"):
+        arrays = ["y", "u"] if self.noise_std is None else ["y", "u", "noise_std"]
+        for name in ("t", *arrays):
             object.__setattr__(self, name, _real(name, getattr(self, name)))
         steps = np.diff(self.t)
         if self.t.ndim != 1 or not len(self.t):
@@ -79,16 +84,20 @@ class Record:
                 f"t must increase; sample {row} has t={self.t[row]} after {self.t[row - 1]}"
             )
         batch = len(self.prior.mean)
-        for name in ("y", "u"):
-            array = getattr(self, name)
+        for name in arrays:
+            array, last = getattr(self, name), "u" if name == "u" else "y"
             if array.ndim != 3 or array.shape[:2] != (batch, len(self.t)):
                 raise ValueError(
-                    f"{name} has shape {array.shape}; expected ({batch}, {len(self.t)}, n{name})"
+                    f"{name} has shape {array.shape}; expected ({batch}, {len(self.t)}, n{last})"
                 )
-        for name, wrong in (("y", np.isinf(self.y)), ("u", ~np.isfinite(self.u))):
+        std = np.ones(1) if self.noise_std is None else self.noise_std
+        for name, wrong, allowed in (
+            ("y", np.isinf(self.y), "finite numbers, or NaN if missing"),
+            ("u", ~np.isfinite(self.u), "finite numbers"),
+            ("noise_std", np.isinf(std) | (std <= 0), "numbers above 0, or NaN if not known"),
+        ):
             if wrong.any():
                 row, sample, i = (int(index) for index in np.argwhere(wrong)[0])
-                allowed = "finite numbers, or NaN if missing" if name == "y" else "finite numbers"
                 raise ValueError(
                     f"{name}{i + 1} of row {row} is {getattr(self, name)[row, sample, i]} at "
                     f"sample {sample}; expected {allowed}"
@@ -101,11 +110,13 @@ class Record:
             ValueError: in one line that names the array, its size and the size expected.
         """
         kind, nx = type(system).__name__, system.nx
-        for name, size in (("y", system.ny), ("u", system.nu)):
-            found = getattr(self, name).shape[2]
-            if found != size:
+        sizes = {"y": system.ny, "u": system.nu, "noise_std": system.ny}
+        for name, size in sizes.items():
+            array, last = getattr(self, name), "u" if name == "u" else "y"
+            if array is not None and array.shape[2] != size:
                 raise ValueError(
-                    f"{name} has {found} column(s) in the record; {kind} has n{name}={size}"
+                    f"{name} has {array.shape[2]} column(s) in the record; {kind} has "
+                    f"n{last}={size}"
                 )
         for name, size in (("mean", (nx,)), ("cov", (nx, nx))):
             shape, expected = getattr(self.prior, name).shape, (self.batch, *size)
@@ -127,11 +138,17 @@ class Record:
     def rows(self, rows: np.ndarray | slice) -> Record:
         """Return the record of some of the episodes."""
         prior = Prior(self.prior.mean[rows], self.prior.cov[rows])
-        return Record(self.t, self.y[rows], self.u[rows], prior)
+        std = None if self.noise_std is None else self.noise_std[rows]
+        return Record(self.t, self.y[rows], self.u[rows], prior, std)
 
     def first_samples(self, number: int) -> Record:
         """Return the record of the first samples."""
-        return Record(self.t[:number], self.y[:, :number], self.u[:, :number], self.prior)
+        return self.samples(slice(number))
+
+    def samples(self, chosen: slice | np.ndarray) -> Record:
+        """Return the record of some of the samples."""
+        std = None if self.noise_std is None else self.noise_std[:, chosen]
+        return Record(self.t[chosen], self.y[:, chosen], self.u[:, chosen], self.prior, std)
 
 
 def _real(name: str, value: Any) -> np.ndarray:
@@ -149,8 +166,9 @@ def _real(name: str, value: Any) -> np.ndarray:
 
 def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:
     """Read a record from a CSV file with columns t (s), y1, y2, ... and, if the system has inputs,
-    u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output. Other
-    columns are ignored.
+    u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output. Columns
+    y1_std, y2_std, ... hold the standard deviation of an output's noise at each sample, where it is
+    known. Other columns are ignored.
 
     Also returns the system, with `System.measured_input` set if the file has columns u. A file
     without them uses the input that the system's class defines, if it defines one.
@@ -173,10 +191,12 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
             f"log {path} has no column {', '.join(missing)}; {type(system).__name__} needs "
             f"{', '.join(['t', *outputs, *inputs])}, and the header has {', '.join(header)}"
         )
-    twice = [name for name in ["t", *outputs, *inputs] if header.count(name) > 1]
+    levels = [name for name in (f"{output}_std" for output in outputs) if name in header]
+    read = ["t", *outputs, *inputs, *levels]
+    twice = [name for name in read if header.count(name) > 1]
     if twice:
         raise ValueError(f"log {path} has column {twice[0]} twice")
-    columns = {name: header.index(name) for name in ["t", *outputs, *inputs]}
+    columns = {name: header.index(name) for name in read}
     table = {name: np.empty(len(rows) - 1) for name in columns}
     for i, (number, row) in enumerate(rows[1:]):
         if len(row) != len(header):
@@ -194,7 +214,11 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
     if np.isnan(y).all():
         raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
     u = np.stack([table[n] for n in inputs], axis=-1) if inputs else system.input(t)
-    return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior)
+    std = None
+    if levels:
+        unknown = np.full(len(t), np.nan)
+        std = np.stack([table.get(f"{output}_std", unknown) for output in outputs], axis=-1)[None]
+    return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior, std)
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
@@ -241,4 +265,6 @@ def _number(cell: str, name: str, where: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise ValueError(f"{where}: {name}={_shown(cell)} is not a finite number")
+    if name.endswith("_std") and value <= 0:
+        raise ValueError(f"{where}: {name}={_shown(cell)}; expected a number above 0, or no value")
     return value

@@ -5,15 +5,16 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from array_api_compat import array_namespace
 
-from pinnobs_gym.simulation.bounds import Bounds, Box, box
+from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, check_periods, residual
+from pinnobs_gym.simulation.start_law import Box, StartLaw, check_covariance
 
 Array: TypeAlias = Any
 """An array of any library of the array API standard, such as numpy.ndarray or torch.Tensor."""
@@ -29,7 +30,7 @@ class PoorPrior:
     """Covariance P₀, nx rows of nx numbers, in products of state units."""
 
     def __post_init__(self) -> None:
-        _check_covariance(self.P0)
+        check_covariance(self.P0, "P0")
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,9 @@ class Setup:
     noise.
 
     Vectors are sequences (one number per state or output) or one number for all components. Initial
-    states are uniform in the box ``x0_low`` to ``x0_high``, redrawn until `System.admissible`
-    accepts them. A box of zero width means one fixed initial state.
+    states are uniform in the box ``x0_low`` to ``x0_high``, or follow the law ``x0_law``; they are
+    redrawn until `System.admissible` accepts them. A box of zero width means one fixed initial
+    state.
 
     The prior that estimators are given is N(x̂₀, P₀). By default x̂₀ and P₀ are the mean and the
     covariance of the law of the initial states
@@ -47,10 +49,14 @@ class Setup:
     setup must give both.
     """
 
-    x0_low: Sequence[float]
-    """Lower corner of the box of initial states, in state units."""
-    x0_high: Sequence[float]
-    """Upper corner of the box of initial states, in state units."""
+    x0_low: Sequence[float] | None = None
+    """Lower corner of the box of initial states, in state units; None with ``x0_law``."""
+    x0_high: Sequence[float] | None = None
+    """Upper corner of the box of initial states, in state units; None with ``x0_law``."""
+    _: KW_ONLY
+    x0_law: StartLaw | None = None
+    """The law of initial states in place of a box, such as
+    `pinnobs_gym.simulation.start_law.Gaussian` or `Points`; see `start`."""
     duration: float
     """Length of an episode in s."""
     dt: float
@@ -94,16 +100,39 @@ class Setup:
             )
         for name in ("noise_std", "process_noise"):
             noise_root(getattr(self, name), None, name)
-        if np.any(np.asarray(self.x0_low) > np.asarray(self.x0_high)):
+        corners = [name for name in ("x0_low", "x0_high") if getattr(self, name) is not None]
+        if len(corners) != (0 if self.x0_law else 2):
+            given = ", ".join([*corners, *(["x0_law"] if self.x0_law else [])]) or "neither"
+            raise ValueError(f"x0_low and x0_high, or x0_law, are expected; given: {given}")
+        if not self.x0_law and np.any(np.asarray(self.x0_low) > np.asarray(self.x0_high)):
             raise ValueError(f"x0_low={self.x0_low} is above x0_high={self.x0_high}")
         if self.P0 is not None:
-            _check_covariance(self.P0)
+            check_covariance(self.P0, "P0")
         if self.fixed_x0 and (self.xhat0 is None or self.P0 is None):
             missing = "xhat0" if self.xhat0 is None else "P0"
+            state = f"x0_low=x0_high={self.x0_low}" if self.x0_law is None else f"{self.x0_law}"
             raise ValueError(
-                f"the initial state is fixed, x0_low=x0_high={self.x0_low}, and defines no prior; "
-                f"give {missing}"
+                f"the initial state is fixed, {state}, and defines no prior; give {missing}"
             )
+
+    def start(self, nx: int) -> StartLaw:
+        """Return the law of the initial states of a system with that number of states.
+
+        Raises:
+            ValueError: in one line, if the law has another number of states.
+        """
+        if self.x0_law is None:
+            corners = (self.x0_low, "x0_low"), (self.x0_high, "x0_high")
+            low, high = (
+                vector(() if corner is None else corner, nx, name).tolist()
+                for corner, name in corners
+            )
+            return Box(tuple(low), tuple(high))
+        if len(self.x0_law.mean) != nx:
+            raise ValueError(
+                f"x0_law has states of {len(self.x0_law.mean)} number(s); expected {nx}"
+            )
+        return self.x0_law
 
     @property
     def num_steps(self) -> int:
@@ -123,6 +152,8 @@ class Setup:
     @property
     def fixed_x0(self) -> bool:
         """Whether every episode starts from the same state."""
+        if self.x0_law is not None:
+            return self.x0_law.fixed
         return bool(np.all(np.asarray(self.x0_low) == np.asarray(self.x0_high)))
 
 
@@ -138,8 +169,8 @@ class System(ABC):
     """
 
     measured_input: bool = field(default=False, kw_only=True)
-    """True if u is known only at the samples (a log's columns) and interpolated linearly between
-    them; False if `input` defines it at any time."""
+    """True if u is known only at the samples (a log's columns), and between them as `input_hold`
+    says; False if `input` defines it at any time."""
 
     state_names: ClassVar[tuple[str, ...]]
     output_names: ClassVar[tuple[str, ...]]
@@ -174,6 +205,10 @@ class System(ABC):
     model_step: ClassVar[float | None] = None
     """Longest Runge-Kutta step of model-based estimators in s; if None, one that keeps the local
     error small is found (`pinnobs_gym.simulation.runge_kutta.longest_step`)."""
+    input_hold: ClassVar[Literal["previous", "linear"]] = "previous"
+    """What measured inputs are between samples: the value at the previous sample, as the output of
+    a computer is held; or on straight lines, for samples of a continuous signal. Inputs of a log
+    are measured ones."""
 
     @property
     def nx(self) -> int:
@@ -191,7 +226,7 @@ class System(ABC):
         return len(self.input_names)
 
     @property
-    def state_box(self) -> Box | None:
+    def state_box(self) -> StateBox | None:
         """The states within `state_low` and `state_high`; None without bounds."""
         if self.state_low is None and self.state_high is None:
             return None
@@ -215,6 +250,22 @@ class System(ABC):
         """Return the known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
         xp = np if isinstance(t, np.ndarray) else array_namespace(t)
         return xp.zeros((*t.shape, self.nu), dtype=t.dtype)
+
+    def draw_input(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+        """Return inputs (num_samples, nu) that are drawn for one episode, at its sample times
+        (num_samples,) in s.
+
+        A system that overrides this has other inputs in each episode. Between the samples they are
+        as `input_hold` says, for the plant and for the model alike; estimators are told them at the
+        samples. They are drawn from a random stream of their own. `input` then stands for them
+        where a typical input is needed, such as in the design of gains.
+        """
+        return np.asarray(self.input(times))
+
+    @property
+    def draws_input(self) -> bool:
+        """Whether inputs are drawn for each episode."""
+        return type(self).draw_input is not System.draw_input
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         """Return ∂f/∂x, (..., nx, nx); unless overridden, that of
@@ -241,7 +292,7 @@ class System(ABC):
         return x - xhat if self.state_period is None else residual(x, xhat, self.state_period)
 
     def admissible(self, x0: Array) -> Array:
-        """Return which states (..., nx) of a setup's box are valid initial states: bool (...)."""
+        """Return which states (..., nx) of a setup's law are valid initial states: bool (...)."""
         xp = array_namespace(x0)
         return xp.all(xp.isfinite(x0), axis=-1)
 
@@ -260,6 +311,12 @@ class System(ABC):
         """Return other states (..., nx) that give the same output as x at all times; none by
         default."""
         return ()
+
+    def distances(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the distances between states and outputs, (nx, ny), and between outputs, (ny, ny),
+        of a plant that extends in space, in any unit; None otherwise. Ensembles may take far
+        correlations as zero (`pinnobs_gym.estimators.enkf.EnKF.localisation`)."""
+        return None
 
     def breakpoints(self) -> tuple[float, ...]:
         """Return the times in s at which f or the input jumps; the truth solver restarts at
@@ -356,7 +413,9 @@ class System(ABC):
                 check_periods(system.state_period, system.nx, "state_period")
                 box(system.state_low, system.state_high, system.nx)
                 for part in ("x0_low", "x0_high"):
-                    vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
+                    if getattr(setup, part) is not None:
+                        vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
+                setup.start(system.nx)
                 for prior in (setup, setup.poor_prior):
                     if prior is not None:
                         _check_sizes(prior, system.nx, f"of setup {name!r}")
@@ -373,18 +432,6 @@ def _check_sizes(prior: Setup | PoorPrior, nx: int, where: str) -> None:
         vector(prior.xhat0, nx, f"xhat0 {where}")
     if prior.P0 is not None and np.shape(prior.P0) != (nx, nx):
         raise ValueError(f"P0 {where} has shape {np.shape(prior.P0)}; expected ({nx}, {nx})")
-
-
-def _check_covariance(P0: Sequence[Sequence[float]]) -> None:
-    """Raise ValueError unless P₀ is a covariance; zero variances are allowed."""
-    P = np.array(P0, dtype=float)
-    if P.ndim != 2 or P.shape[0] != P.shape[1]:
-        raise ValueError(f"P0={P0}; expected a covariance, as many rows as columns")
-    size = abs(P).max(initial=0.0)
-    if not np.isfinite(P).all() or (abs(P - P.T) > 1e-9 * size).any():
-        raise ValueError(f"P0={P0}; expected a covariance, symmetric and finite")
-    if (np.linalg.eigvalsh(P) < -1e-9 * size).any():
-        raise ValueError(f"P0={P0}; expected a covariance, without eigenvalues below 0")
 
 
 def independent(*std: float) -> tuple[tuple[float, ...], ...]:
@@ -468,7 +515,7 @@ def matrix(like: Array, rows: Sequence[Sequence[Array | float]]) -> Array:
 _TIMES = 9
 """Number of times, evenly spread over an episode, at which `output_scale` evaluates the output."""
 _MOST_DRAWS = 100
-"""How often ten states for each wanted one are drawn from a box."""
+"""How often ten states for each wanted one are drawn from a law."""
 _STATES = 16
 """Number of initial states at which it does."""
 
@@ -499,24 +546,23 @@ def output_scale(system: System) -> np.ndarray:
 
 
 def initial_states(system: System, setup: Setup, count: int) -> np.ndarray:
-    """Return states (count, nx) of a setup's initial set, the same at every call: uniform in the
-    box, of which the admissible ones are taken, or the fixed initial state.
+    """Return states (count, nx) of a setup's initial set, the same at every call: drawn from its
+    law, of which the admissible ones are taken, or the fixed initial state.
 
     Raises:
         ValueError: in one line, if too few of the states drawn are admissible.
     """
-    low, high = (vector(getattr(setup, n), system.nx, n) for n in ("x0_low", "x0_high"))
-    if setup.fixed_x0:
-        return np.repeat(low[None], count, axis=0)
-    rng, x0 = np.random.default_rng(0), np.empty((0, system.nx))
+    law, rng, x0 = setup.start(system.nx), np.random.default_rng(0), np.empty((0, system.nx))
+    if law.fixed:
+        return np.repeat(law.mean[None], count, axis=0)
     for _ in range(_MOST_DRAWS):
         if len(x0) >= count:
             break
-        drawn = rng.uniform(low, high, (10 * count, system.nx))
+        drawn = law.draw(rng, 10 * count)
         x0 = np.concatenate([x0, drawn[np.asarray(system.admissible(drawn))]])
     if len(x0) < count:
         raise ValueError(
-            f"{type(system).__name__}: {len(x0)} of {_MOST_DRAWS * 10 * count} states of the box "
-            "are admissible"
+            f"{type(system).__name__}: {len(x0)} of {_MOST_DRAWS * 10 * count} states of the "
+            "setup's law are admissible"
         )
     return x0[:count]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from pinnobs_gym.simulation import dop853
+from pinnobs_gym.simulation.driven import driven
 from pinnobs_gym.simulation.noise import Noise, weighted
 from pinnobs_gym.simulation.system import System, vector
 
@@ -38,6 +39,7 @@ def truth(
     times: np.ndarray,
     max_step: float | None = None,
     out: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the trajectories x(t) of the plant from given initial states.
 
@@ -55,6 +57,8 @@ def truth(
         times: sample times in s, ascending, shape (num_samples,); x0 is the state at the first.
         max_step: the initial step in s; a hundredth of the time span if None.
         out: array for the result.
+        inputs: inputs at the samples, shape (num_samples, batch, nu), which replace those of
+            `System.input`; between samples they are as `System.input_hold` says.
 
     Returns:
         States, shape (num_samples, batch, nx).
@@ -66,10 +70,15 @@ def truth(
     times = np.asarray(times, dtype=float)
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
+    longest = max_step or float(times[-1] - times[0]) / 100
+    if inputs is not None:  # they, or their slopes, jump at each sample
+        for k in range(len(times) - 1):
+            plant = driven(system, times[k : k + 2], inputs[k : k + 2])
+            truth(plant, x[k], times[k : k + 2], longest, x[k : k + 2])
+        return x
     # Integrate each interval between breakpoints separately, since f is smooth only within it.
     ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
     start, state = float(times[0]), np.asarray(x0, dtype=float)
-    longest = max_step or float(times[-1] - times[0]) / 100
     done = 1
     for end in ends:
         stop = int(np.searchsorted(times, end, side="right"))
@@ -89,6 +98,7 @@ def disturbed_truth(
     draws: np.ndarray,
     max_step: float | None = None,
     out: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the trajectories of a plant with process noise, dx = f dt + L dw.
 
@@ -106,6 +116,7 @@ def disturbed_truth(
             the number of columns of L.
         max_step: longest step of the solver in s; a hundredth of the time span if None.
         out: array for the result.
+        inputs: as in `truth`.
 
     Returns:
         States, shape (num_samples, batch, nx).
@@ -120,10 +131,13 @@ def disturbed_truth(
     stages[0] = x0
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
+            plant = system
+            if inputs is not None:
+                plant = driven(system, times[k : k + 2], inputs[k : k + 2])
             parts = np.linspace(times[k], times[k + 1], draws.shape[1] + 1)
             for start, end, (even, odd) in zip(parts[:-1], parts[1:], draws[k], strict=True):
                 force = _Force(noise, float(start), float(end), even, odd)
-                _through_part(system, float(start), float(end), longest, force, stages)
+                _through_part(plant, float(start), float(end), longest, force, stages)
             x[k + 1] = stages[0]
     _check_finite(system, x0, x)
     return x
@@ -431,10 +445,9 @@ def _solve_adaptively(
 
 
 def rows_of(system: System, rows: np.ndarray) -> System:
-    """Return the system with its array parameters (batch,) restricted to some rows."""
-    changes = {
-        f.name: getattr(system, f.name)[rows]
-        for f in fields(system)
-        if getattr(getattr(system, f.name), "ndim", 0)
-    }
+    """Return the system with its array parameters (batch,) restricted to some rows, and those of a
+    plant that is one of its parameters."""
+    values = {f.name: getattr(system, f.name) for f in fields(system)}
+    changes = {name: value[rows] for name, value in values.items() if getattr(value, "ndim", 0)}
+    changes |= {n: rows_of(value, rows) for n, value in values.items() if isinstance(value, System)}
     return replace(system, **changes) if changes else system

@@ -132,7 +132,7 @@ def filterpy_sigma_points(own: GaussianEstimator, record: Record) -> np.ndarray:
 def moving_horizon(repeats: int) -> Iterator[Figure]:
     """Compare the MHE on 64 episodes of ReverseDuffing with do-mpc's on one, with window 20."""
     _, _, record = played("ReverseDuffing", 64)
-    part = Record(record.t[:200], record.y[:, :200], record.u[:, :200], record.prior)
+    part = record.first_samples(200)
     own, peer = MHE(ReverseDuffing(), window=20), do_mpc_horizon(part.rows(slice(0, 1)), 20)
     times = []
     for _ in range(repeats):

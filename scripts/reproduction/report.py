@@ -49,7 +49,7 @@ def starts(table: Table) -> str:
     parts, sizes = [], set()
     for name in dict.fromkeys(case.system for case in table.cases):
         system, setup = SYSTEMS.resolve(name).configured(SETUP)
-        x0, xhat0 = _vector(setup.x0_low), _vector(prior_moments(system, setup)[0])
+        x0, xhat0 = _vector(setup.start(system.nx).mean), _vector(prior_moments(system, setup)[0])
         parts.append(f"{name} x₀ = {x0}, x̂₀ = {xhat0}")
         sizes.add(f"{setup.num_steps:,} samples over {setup.duration:g} s")
     return f"Records of {' or '.join(sorted(sizes))}: {'; '.join(parts)}."

@@ -11,7 +11,7 @@ from pinnobs_gym.estimation.point_images import SigmaPoints
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
-from pinnobs_gym.simulation.bounds import Box
+from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent
@@ -59,7 +59,7 @@ def test_a_linear_function_has_the_values_of_the_original_points(said):
     """Whatever part of its domain is closed, and with bounds, too."""
     centre, deviations = points()
     original = (centre.T[:, None] + deviations).transpose(1, 2, 0)
-    box = Box(np.zeros(2), np.full(2, np.inf)), np.tile(np.eye(2) + 0.3, (3, 1, 1))
+    box = StateBox(np.zeros(2), np.full(2, np.inf)), np.tile(np.eye(2) + 0.3, (3, 1, 1))
     for floor, bounds in ((-np.inf, None), (0.0, None), (0.05, None), (-np.inf, box), (0.05, box)):
         seen = []
         found = images(only_above(floor, seen), centre, deviations, bounds)

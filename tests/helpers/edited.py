@@ -39,7 +39,7 @@ class Oscillator(System):
     state_names = ("p", "v")
     output_names = ("y1",)
     scale = (1.0, 1.0)
-    setups = {"benchmark": Setup((-1.0, -1.0), (1.0, 1.0), 2.0, 0.1, 0.05)}
+    setups = {"benchmark": Setup((-1.0, -1.0), (1.0, 1.0), duration=2.0, dt=0.1, noise_std=0.05)}
 
     def f(self, t, x, u):
         return stack(x, x[..., 1], -x[..., 0] - RATE * x[..., 1])

@@ -144,7 +144,7 @@ def test_a_guess_further_away():
     for name in SYSTEMS.classes():
         source = EpisodeSource(name, condition="xhat0_far")
         near = EpisodeSource(name).setup
-        centre = (source.x0_low + source.x0_high) / 2
+        centre = source.setup.start(source.system.nx).mean
         further = abs(np.array(source.setup.xhat0) - centre) - abs(np.array(near.xhat0) - centre)
         np.testing.assert_allclose(further, 2 * np.sqrt(np.diag(near.P0)))
         assert source.setup.P0 == near.P0

@@ -32,7 +32,13 @@ class Sound(System):
     scale = (1.0, 1.0)
     setups = {
         "benchmark": Setup(
-            (-1, -1), (1, 1), 2.0, 0.1, noise_std=0.1, xhat0=(0, 0), P0=independent(1, 1)
+            (-1, -1),
+            (1, 1),
+            duration=2.0,
+            dt=0.1,
+            noise_std=0.1,
+            xhat0=(0, 0),
+            P0=independent(1, 1),
         )
     }
 

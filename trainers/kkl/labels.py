@@ -181,16 +181,17 @@ def initial_states(
 ) -> np.ndarray:
     """Draw states (count, nx) from Latin hypercubes over a box.
 
-    Without a box it is the benchmark's, of which only the admissible states are taken.
+    Without a box it is that of the benchmark's law (`StartLaw.corners`), of which only the
+    admissible states are taken.
 
     Raises:
         ValueError: in one line, if the corners are not those of a box, or hardly any states of the
             benchmark's box are admissible.
     """
-    setup = system.setups["benchmark"]
+    own_low, own_high = system.setups["benchmark"].start(system.nx).corners
     own = low is None or high is None
-    lower = vector(setup.x0_low if low is None else low, system.nx, "low")
-    upper = vector(setup.x0_high if high is None else high, system.nx, "high")
+    lower = vector(own_low if low is None else low, system.nx, "low")
+    upper = vector(own_high if high is None else high, system.nx, "high")
     if not (np.isfinite([lower, upper]).all() and (lower <= upper).all()):
         raise ValueError(f"low={low}, high={high}; expected finite corners, low at most high")
     cube = qmc.LatinHypercube(system.nx, rng=np.random.default_rng(seed))

@@ -67,8 +67,7 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
         output / np.maximum(output.sum(0), 1e-9),
         record.prior.mean[0],
     )
-    samples = Record(t[chosen], record.y[:, chosen], record.u[:, chosen], record.prior)
-    return points, samples
+    return points, record.samples(chosen)
 
 
 def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.conditions.base import Condition
 from pinnobs_gym.simulation.initial_set import prior_moments
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.system import Setup, System
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class GivenPoorPrior(Condition):
 @dataclass(frozen=True)
 class FarGuess(Condition):
     """An initial estimate further away: each component of x̂₀ is moved by a number of prior standard
-    deviations away from the middle of the box of initial states; upwards if it is the middle. P₀ is
-    unchanged."""
+    deviations away from the mean of the law of initial states, which is the middle of a box;
+    upwards if it is there. P₀ is unchanged."""
 
     deviations: float = 2.0
     reference = False
@@ -47,9 +47,8 @@ class FarGuess(Condition):
         return f"x̂₀ moved by {self.deviations:g} σ of the prior in each state"
 
     def setup(self, system: System, setup: Setup) -> Setup:
-        low, high = (vector(getattr(setup, n), system.nx, n) for n in ("x0_low", "x0_high"))
         xhat0, P0 = prior_moments(system, setup)
-        away = np.where(xhat0 >= (low + high) / 2, 1.0, -1.0)
+        away = np.where(xhat0 >= setup.start(system.nx).mean, 1.0, -1.0)
         moved = xhat0 + self.deviations * away * np.sqrt(np.diag(P0))
         return replace(setup, xhat0=tuple(moved.tolist()))
 

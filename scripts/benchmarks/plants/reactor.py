@@ -13,7 +13,7 @@ from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
-from pinnobs_gym.simulation.bounds import Box
+from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Array, Setup, System, independent, matrix, stack
@@ -136,7 +136,7 @@ def box_step(repeats: int) -> Iterator[Figure]:
     """Compare the nearest point of a box with that of scipy.optimize.lsq_linear."""
     rng, n, batch = np.random.default_rng(0), 5, 100
     A, x = rng.standard_normal((batch, n, n)), 3 * rng.standard_normal((batch, n))
-    P, box = A @ A.swapaxes(1, 2) + 1e-3 * np.eye(n), Box(-np.ones(n), np.full(n, 0.5))
+    P, box = A @ A.swapaxes(1, 2) + 1e-3 * np.eye(n), StateBox(-np.ones(n), np.full(n, 0.5))
     roots = np.linalg.inv(np.linalg.cholesky(P))
 
     def peer() -> np.ndarray:
