@@ -15,6 +15,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates, Estimator, State
+from pinnobs_gym.estimation.takes import EVERYTHING, FEATURES
 from pinnobs_gym.simulation.conformance import (
     Found,
     add_check,
@@ -93,6 +94,7 @@ def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False
     steps = np.full(NUM_SAMPLES - 1, setup.dt)
     if irregular:
         steps *= rng.uniform(0.3, 2.0, len(steps))
+        steps = np.maximum(np.round(steps), 1.0) if system.discrete else steps
     t = np.append(0.0, np.cumsum(steps))
     x = truth(system, initial_states(system, setup, batch), t).swapaxes(0, 1)
     noise = system.noise(setup.noise_std, setup.process_noise)
@@ -154,6 +156,18 @@ def _estimator_exemptions(estimator: BaseEstimator) -> None:
         require(name in known.split(", "), f"exempt_from names {name!r}; known are {known}")
         one_line = isinstance(reason, str) and reason.strip() and "\n" not in reason
         require(one_line, f"exempt_from[{name!r}]={reason!r}; expected a reason in one line")
+
+
+@add_check(ESTIMATOR_CHECKS, "takes")
+def _estimator_takes(estimator: BaseEstimator) -> None:
+    """Every name in `takes` is that of a feature of a plant."""
+    declared: Any = estimator.takes
+    require(
+        isinstance(declared, frozenset),
+        f"takes={declared!r}; expected a frozenset of names",
+    )
+    unknown = sorted(map(str, declared - EVERYTHING))
+    require(not unknown, f"takes names {', '.join(unknown)}; known are {', '.join(FEATURES)}")
 
 
 @add_check(ESTIMATOR_CHECKS, "shapes")

@@ -55,9 +55,7 @@ def required(system: System, u: Array | None) -> Array:
     return u
 
 
-def inputs_at(
-    system: System, t: Array, part: Array, u0: Array | None, u1: Array | None
-) -> Array:
+def inputs_at(system: System, t: Array, part: Array, u0: Array | None, u1: Array | None) -> Array:
     """Return the inputs (n, ..., nu) at n times t, (n,) or (n, batch), of an interval between two
     samples.
 
@@ -70,12 +68,12 @@ def inputs_at(
     """
     if not system.measured_input:
         return system.input(t)
-    u0 = required(system, u0)
+    before = required(system, u0)
     if system.input_hold == "previous":
-        xp: Any = np if isinstance(u0, np.ndarray) else array_namespace(u0)
-        return xp.broadcast_to(u0, (len(part), *u0.shape))
-    weight = part.reshape(len(part), *([1] * u0.ndim))
-    return (1 - weight) * u0 + weight * required(system, u1)
+        xp: Any = np if isinstance(before, np.ndarray) else array_namespace(before)
+        return xp.broadcast_to(before, (len(part), *before.shape))
+    weight = part.reshape(len(part), *([1] * before.ndim))
+    return (1 - weight) * before + weight * required(system, u1)
 
 
 class Motion(ABC):

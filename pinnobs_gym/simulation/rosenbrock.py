@@ -108,7 +108,7 @@ def _sum(weights: tuple[float, ...], parts: list[np.ndarray]) -> np.ndarray:
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
     """Return inverses (..., n, n); NaN where there is none."""
-    usable = np.isfinite(matrices).all(axis=(-2, -1))
+    usable: np.ndarray = np.isfinite(matrices).all(axis=(-2, -1))
     usable &= np.linalg.det(np.where(usable[..., None, None], matrices, 0.0)) != 0
     result = np.full_like(matrices, np.nan)
     result[usable] = np.linalg.inv(matrices[usable])

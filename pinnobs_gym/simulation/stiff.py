@@ -92,9 +92,7 @@ class Stiff(Motion):
         return (end + moved).reshape(x.shape)
 
 
-def _steps(
-    over: Interval, x: np.ndarray
-) -> Iterator[tuple[Rows, np.ndarray, np.ndarray]]:
+def _steps(over: Interval, x: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np.ndarray]]:
     """Yield each step from x (..., nx) to the end of an interval: the rows with their steps, zero
     in those that stay, and the states before and after it."""
     system, shape = over.system, x.shape[:-1]
@@ -123,7 +121,7 @@ def _steps(
         # The error is of order 4 in the step, by the embedded method of order 3.
         factor = np.clip(0.9 * np.maximum(off, 1e-10) ** -0.25, 0.1, 5.0)
         step = np.minimum(np.minimum(step * factor, left), system.model_step or np.inf)
-    x = np.where((left > 0)[..., None], np.nan, x)
+    x = np.where((t < end)[..., None], np.nan, x)
     yield Rows(over, t, np.zeros(shape)), x, x
 
 

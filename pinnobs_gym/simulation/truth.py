@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -12,7 +13,10 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from pinnobs_gym.simulation import dop853
+from pinnobs_gym.simulation.maps import Map
+from pinnobs_gym.simulation.motion import Interval
 from pinnobs_gym.simulation.noise import Noise, weighted
+from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import System, vector
 
 TOLERANCE = 3e-11
@@ -47,7 +51,8 @@ def truth(
     that polynomial, midway between nodes, controls the error: episodes whose local error exceeds
     `TOLERANCE` are simulated again with half the step. Episodes that no step satisfies (stiff or
     not smooth) are solved by an adaptive method, LSODA. The result of an episode does not depend on
-    the others in its batch.
+    the others in its batch. All episodes of a plant with `System.stiff` are solved by LSODA, and a
+    map is evaluated.
 
     Args:
         system: the plant; its parameters may be arrays (batch,), one value per episode.
@@ -66,6 +71,14 @@ def truth(
     times = np.asarray(times, dtype=float)
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
+    if system.discrete:
+        plant = replace(system, measured_input=False)
+        with np.errstate(all="ignore"):
+            for k in range(len(times) - 1):
+                between = Interval(plant, times[k], times[k + 1], None, None)
+                x[k + 1] = Map().step(between, x[k])
+        _check_finite(system, x0, x)
+        return x
     # Integrate each interval between breakpoints separately, since f is smooth only within it.
     ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
     start, state = float(times[0]), np.asarray(x0, dtype=float)
@@ -79,6 +92,25 @@ def truth(
         done, start, state = stop, float(end), last
     _check_finite(system, x0, x)
     return x
+
+
+def noise_shape(system: System, noise: Noise, dt: float, step: float) -> tuple[int, int, int]:
+    """Return how many standard normal numbers the process noise of an episode takes in each time
+    between samples: the parts of that time, the numbers for each component in a part, and the
+    components.
+
+    Args:
+        system: the plant.
+        noise: its noise.
+        dt: time between samples in s.
+        step: longest step of the model in s, see
+            `pinnobs_gym.simulation.runge_kutta.longest_step`.
+    """
+    if system.discrete:
+        return round(dt), 1, noise.L(0.0).shape[1]
+    if system.stiff:
+        return 1, 1, system.nx
+    return math.ceil(dt / step - 1e-6), 2, noise.L(0.0).shape[1]
 
 
 def disturbed_truth(
@@ -95,15 +127,15 @@ def disturbed_truth(
     The law is that of `pinnobs_gym.simulation.model.noisy_model_step`: in each of equal parts of
     the intervals between samples, white noise is replaced by its projection on linear functions of
     time. The solver is that of `truth` with equal steps of at most ``max_step``. Its error is not
-    controlled, as it is far below any relevant noise.
+    controlled, as it is far below any relevant noise. Maps and stiff plants move as the model does.
 
     Args:
         system: as in `truth`.
         noise: the noise of the plant.
         x0: initial states, shape (batch, nx), in state units.
         times: sample times in s, ascending, shape (num_samples,).
-        draws: standard normal numbers, shape (num_samples - 1, num_parts, 2, batch, m), where m is
-            the number of columns of L.
+        draws: standard normal numbers, shape (num_samples - 1, num_parts, num_each, batch, m), see
+            `noise_shape`.
         max_step: longest step of the solver in s; a hundredth of the time span if None.
         out: array for the result.
 
@@ -120,6 +152,9 @@ def disturbed_truth(
     stages[0] = x0
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
+            if system.discrete or system.stiff:
+                x[k + 1] = _moved(system, noise, (times[k], times[k + 1]), x[k], draws[k])
+                continue
             parts = np.linspace(times[k], times[k + 1], draws.shape[1] + 1)
             for start, end, (even, odd) in zip(parts[:-1], parts[1:], draws[k], strict=True):
                 force = _Force(noise, float(start), float(end), even, odd)
@@ -127,6 +162,21 @@ def disturbed_truth(
             x[k + 1] = stages[0]
     _check_finite(system, x0, x)
     return x
+
+
+def _moved(
+    system: System,
+    noise: Noise,
+    times: tuple[float, float],
+    x: np.ndarray,
+    draws: np.ndarray,
+) -> np.ndarray:
+    """Return the states of a map or a stiff plant with process noise at the second of two times,
+    from x (batch, nx) at the first, given numbers (num_parts, 1, batch, m)."""
+    motion = Map() if system.discrete else Stiff()
+    between = Interval(replace(system, measured_input=False), *times, None, None)
+    drawn = iter(draws)
+    return motion.noisy(between, noise, x[None], lambda size: next(drawn))[0]
 
 
 @dataclass(frozen=True)
@@ -215,7 +265,7 @@ def _solve_interval(
     rows = np.arange(len(x0))
     with np.errstate(all="ignore"):
         # Simulate the remaining episodes; those over the tolerance continue with half the step.
-        for _ in range(_HALVINGS):
+        for _ in range(0 if system.stiff else _HALVINGS):
             plant = rows_of(system, rows)
             everything = len(rows) == len(x0)
             part = out if everything else np.empty((len(times), len(rows), x0.shape[1]))
