@@ -91,7 +91,7 @@ def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False
     system = estimator.system
     setup = system.setups["benchmark"]
     rng = np.random.default_rng(2)
-    steps = np.full(NUM_SAMPLES - 1, setup.dt)
+    steps = np.full(NUM_SAMPLES - 1, float(setup.dt))
     if irregular:
         steps *= rng.uniform(0.3, 2.0, len(steps))
         steps = np.maximum(np.round(steps), 1.0) if system.discrete else steps

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.takes import lacking
@@ -20,7 +18,6 @@ def applies(cls: type[BaseEstimator], game: Game) -> bool:
     return not lacking(cls, system, system.noise(setup.noise_std, setup.process_noise))
 
 
-@lru_cache(maxsize=1024)
 def cell_without_scores(estimator: str, game: GameName) -> str:
     """Return the cell of an estimator without scores in a game: `NOT_APPLICABLE` if it does not
     take the game's system, and empty otherwise, or if this process knows one of them not.

@@ -11,6 +11,7 @@ import numpy as np
 from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknown, is_number
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.noise import Level, noise_root
 from pinnobs_gym.simulation.system import PoorPrior, Setup, System, vector
 
 
@@ -211,7 +212,16 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
             _diagonal(np.array(poor.P0, dtype=float), stds),
         ),
         parameters=own,
+        process_noise=_padded(plant, setup, len(stds)),
     )
+
+
+def _padded(plant: System, setup: Setup, count: int) -> Level:
+    """Return the plant's process noise with none in ``count`` further states."""
+    L = noise_root(setup.process_noise, plant.nx, "process_noise")
+    if not L.any():
+        return 0.0
+    return tuple(map(tuple, np.pad(L, ((0, count), (0, 0))).tolist()))
 
 
 def _row(first: np.ndarray, second: np.ndarray) -> tuple[float, ...]:

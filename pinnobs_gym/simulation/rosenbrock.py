@@ -94,7 +94,8 @@ def rosenbrock(rows: Rows, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # (I − γhA)uᵢ = γ(h f + Σ cᵢⱼ uⱼ + γᵢ h² ∂f/∂t): the book's equations times γh, for h = 0.
         right = h * (rate + _SLOPES[i] * slope)
         right = _GAMMA * (right + _sum(_C[i], increments) if i else right)
-        increments.append(np.einsum("...ij,...j->...i", inverse, right))
+        columns = (inverse[..., j] * right[..., j, None] for j in range(x.shape[-1]))
+        increments.append(sum(columns, np.zeros(())))  # in one order, in any batch
     return point + increments[-1], increments[-1]
 
 
@@ -108,7 +109,7 @@ def _sum(weights: tuple[float, ...], parts: list[np.ndarray]) -> np.ndarray:
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
     """Return inverses (..., n, n); NaN where there is none."""
-    usable: np.ndarray = np.isfinite(matrices).all(axis=(-2, -1))
+    usable = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
     usable &= np.linalg.det(np.where(usable[..., None, None], matrices, 0.0)) != 0
     result = np.full_like(matrices, np.nan)
     result[usable] = np.linalg.inv(matrices[usable])

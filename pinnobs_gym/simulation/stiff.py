@@ -28,6 +28,8 @@ _ATTEMPTS = 10_000
 """Number of steps tried between two samples after which a row counts as diverged."""
 _SHORTEST = 1e-14
 """Shortest step, relative to the interval; a row that needs a shorter one counts as diverged."""
+_DIVERGED = 1e9
+"""Size of a state, relative to its scale, at which a row counts as diverged."""
 _TERMS = 10
 """Number of terms of the Taylor series for the process noise over a part of a step."""
 _NORM = 0.125
@@ -41,7 +43,7 @@ class Stiff(Motion):
     The Jacobian of a step is that of the method itself, by central differences of the step with its
     length fixed; its relative error is about 1e-9. The process noise over a step is exact for
     constant A = ∂f/∂x, of which the mean of both ends is taken: ∫e^(As) L Lᵀ e^(Aᵀs) ds. Simpson's
-    rule would overestimate it in directions that decay within a step. Noisy states are moved
+    rule would overestimate it by far in directions that decay within a step. Noisy states are moved
     without noise, and then disturbed by noise of that covariance.
     """
 
@@ -64,9 +66,9 @@ class Stiff(Motion):
                 L = noise.L(rows.t + rows.step / 2)
                 if L.shape[1]:
                     A = (rows.jacobian(0.0, before) + rows.jacobian(1.0, after)) / 2
-                    Q = sandwich(flow, Q) + accumulated(
-                        np.ascontiguousarray(A.transpose(1, 2, 0)), outer(L, L), rows.step
-                    )
+                    A = np.ascontiguousarray(A.transpose(1, 2, 0))
+                    decay, added = accumulated(A, outer(L, L), rows.step)
+                    Q = sandwich(decay, Q) + added
         return x, F, Q
 
     def noisy(
@@ -107,8 +109,9 @@ def _steps(over: Interval, x: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np
             size = np.maximum(np.maximum(abs(x), abs(tried)), scale)
             off = (abs(error) / size).max(axis=-1) / STIFF_TOLERANCE
         off = np.where(np.isfinite(tried).all(axis=-1) & np.isfinite(off), off, np.inf)
-        # A row whose step would have to be too short has diverged, and ends here.
-        lost = (off > 1) & (step <= _SHORTEST * whole) & (step > 0)
+        # A row whose state is too large, or whose step would have to be too short, ends here.
+        large = (off <= 1) & ~((abs(tried) / scale).max(axis=-1) < _DIVERGED)
+        lost = (step > 0) & (large | ((off > 1) & (step <= _SHORTEST * whole)))
         taken = np.where((off <= 1) | lost, step, 0.0)
         after = np.where((off <= 1)[..., None], tried, x)
         after = np.where(lost[..., None], np.nan, after)
@@ -132,9 +135,12 @@ def _step_jacobian(rows: Rows, x: np.ndarray) -> np.ndarray:
     return np.where((rows.step > 0)[:, None, None], jacobian, np.eye(x.shape[-1]))
 
 
-def accumulated(A: np.ndarray, density: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return ∫e^(As) D e^(Aᵀs) ds over a length, for A (n, n, batch), constant, and the density D
-    (n, n, batch or 1) of white noise, in all rows (batch,) with their own lengths.
+def accumulated(
+    A: np.ndarray, density: np.ndarray, length: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return e^(As) over a length s, and ∫e^(As) D e^(Aᵀs) ds, (n, n, batch) each, for A (n, n,
+    batch), constant, the density D (n, n, batch or 1) of white noise, and the rows' own lengths
+    (batch,).
 
     The length is halved until a Taylor series converges at once. Doubling it again costs two
     products: Q(2s) = Q(s) + e^(As) Q(s) e^(Aᵀs) (Moler & Van Loan 1978, method 3, for Φ).
@@ -154,4 +160,4 @@ def accumulated(A: np.ndarray, density: np.ndarray, length: np.ndarray) -> np.nd
         going = i < doublings
         Q = np.where(going, Q + sandwich(flow, Q), Q)
         flow = np.where(going, product(flow, flow), flow)
-    return Q
+    return flow, Q
