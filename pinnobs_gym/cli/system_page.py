@@ -81,7 +81,8 @@ def _bound(system: System) -> Sequence[float]:
 
 
 def _motion(system: System, setup: Setup) -> str:
-    """Return how the model moves between samples, and what its inputs are there."""
+    """Return in a sentence how the model moves between samples, and what the inputs of a log are
+    there."""
     moves = described(system, setup.dt)
     if not system.nu:
         return f"{moves[0].upper()}{moves[1:]}.\n"
