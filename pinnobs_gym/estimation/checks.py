@@ -158,18 +158,6 @@ def _estimator_exemptions(estimator: BaseEstimator) -> None:
         require(one_line, f"exempt_from[{name!r}]={reason!r}; expected a reason in one line")
 
 
-@add_check(ESTIMATOR_CHECKS, "takes")
-def _estimator_takes(estimator: BaseEstimator) -> None:
-    """Every name in `takes` is that of a feature of a plant."""
-    declared: Any = estimator.takes
-    require(
-        isinstance(declared, frozenset),
-        f"takes={declared!r}; expected a frozenset of names",
-    )
-    unknown = sorted(map(str, declared - EVERYTHING))
-    require(not unknown, f"takes names {', '.join(unknown)}; known are {', '.join(FEATURES)}")
-
-
 @add_check(ESTIMATOR_CHECKS, "shapes")
 def _estimator_shapes(estimator: BaseEstimator) -> None:
     """Estimates, covariances and innovations have their shapes and are finite."""
@@ -392,3 +380,15 @@ def _estimator_save_load(estimator: BaseEstimator) -> None:
         loaded = type(estimator).load(path, estimator.system)
     found, expected = loaded.run(record), estimator.run(record)
     _require_same(estimator, found, expected, ROUNDING, "a loaded estimator and the one saved")
+
+
+@add_check(ESTIMATOR_CHECKS, "takes")
+def _estimator_takes(estimator: BaseEstimator) -> None:
+    """Every name in `takes` is that of a feature of a plant."""
+    declared: Any = estimator.takes
+    require(
+        isinstance(declared, frozenset),
+        f"takes={declared!r}; expected a frozenset of names",
+    )
+    unknown = sorted(map(str, declared - EVERYTHING))
+    require(not unknown, f"takes names {', '.join(unknown)}; known are {', '.join(FEATURES)}")
