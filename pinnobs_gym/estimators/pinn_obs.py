@@ -101,7 +101,7 @@ STEP = 0.7
 """Longest step of the replay, relative to the time constant of the gain; the Runge-Kutta method is
 stable up to 2.8."""
 _TAKES = EVERYTHING - {"maps", "stiff", "bounds"}
-"""What plants may have: it needs the rate of change, at the points of a loss or by explicit steps."""
+"""What a plant may have: the rate of change is needed, at points of a loss or by explicit steps."""
 MOST_STEPS = 200
 """Largest number of steps between two samples that a gain can cause."""
 

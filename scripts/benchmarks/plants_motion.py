@@ -284,8 +284,8 @@ def reactor() -> Iterator[Figure]:
     off, error, ekf = 0.0, 0.0, EKF(Reactor(measured_input=True))
     for seed in range(20):
         path, record = reactor_run(seed)
-        off = max(off, reactor_error(path, record))
-        error = max(error, abs(ekf.run(record).xhat[0, 10:, 0] - path[10:, 0]).max())
+        off = max(off, float(reactor_error(path, record)))
+        error = max(error, float(abs(ekf.run(record).xhat[0, 10:, 0] - path[10:, 0]).max()))
     yield at_most("reactor: error of the model in c_A", off, "mol/l", 5e-4)
     yield at_most("reactor: error of the EKF in c_A from sample 10 on", error, "mol/l", 5e-4)
 
