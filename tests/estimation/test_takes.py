@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from benchmarks.plants_motion import Growth, Robertson
+from made_rows import rows_of
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.envs.registration import register_system
@@ -16,9 +17,13 @@ from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.kkl import KKL
 from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.open_loop import OpenLoop
+from pinnobs_gym.leaderboard import ranks_table
 from pinnobs_gym.leaderboard.applicable import NOT_APPLICABLE, cell_without_scores
+from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.contenders import label
 from pinnobs_gym.leaderboard.jobs.plan import jobs_of
 from pinnobs_gym.leaderboard.suites import Entry, Suite
+from pinnobs_gym.scoring.rows import Stored
 from pinnobs_gym.simulation.conformance import CheckFailed
 from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.simulation.system import Setup, System
@@ -112,3 +117,23 @@ def test_a_leaderboard_plays_what_applies_and_marks_the_rest(tmp_path):
     assert cell_without_scores("luenberger", other) == ""
     assert cell_without_scores("ekf", game) == ""
     assert cell_without_scores("nobody", game) == ""
+
+
+def test_the_overview_says_which_cells_do_not_apply():
+    register_system(Growth)
+    game = Game.of("Growth").name
+    rows = [
+        row
+        for name, games in (
+            ("ekf", ("pinnobs/Growth-v0", "pinnobs/ReverseDuffing-v0")),
+            ("luenberger", ("pinnobs/ReverseDuffing-v0",)),
+        )
+        for env_id in games
+        for row in rows_of(name, [0.1, 0.2], env_id=env_id, game_hash=env_id)
+    ]
+    part = board(Stored(rows, [])).main
+    grid = ranks_table.grid(part.lines, part.places.peer)
+    column = list(grid.header).index(label(game))
+    cells = {line[1]: line[column] for line in grid.lines}
+    assert cells["luenberger"] == NOT_APPLICABLE
+    assert cells["ekf"] != NOT_APPLICABLE

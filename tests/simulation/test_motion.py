@@ -314,7 +314,7 @@ def test_noise_of_a_stiff_plant_is_that_of_a_linear_one(rate):
     """σ²(1 − e^(−2at))/2a, whatever the samples between, and that of ensembles and of truth."""
     system = Forced(rate)
     noise, x0 = system.noise(), np.array([[0.3, 1.0]])
-    _, F, Q = model_step_moments(system, noise, 0.0, 1.0, x0)
+    _, _F, Q = model_step_moments(system, noise, 0.0, 1.0, x0)
     a = np.array([rate, 1.0])
     expected = np.diag(0.3**2 * (1 - np.exp(-2 * a)) / (2 * a))
     np.testing.assert_allclose(Q[..., 0], expected, rtol=1e-6, atol=1e-12)
