@@ -12,9 +12,10 @@ from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.model import described
 from pinnobs_gym.simulation.noise import noise_std
 from pinnobs_gym.simulation.residual import Periods
-from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.system import Setup, System
 
 
 def page(cls: type[System], env_id: str) -> str:
@@ -48,6 +49,8 @@ def page(cls: type[System], env_id: str) -> str:
             ],
         ),
         *_repeating(system, system.output_names, system.output_period),
+        "\n## Motion of the Model\n",
+        _motion(system, setup),
         "\n## Reward\n",
         "−mean(((x̂ − x)/scale)²) of the true state behind the observation that the action answers; "
         f"{NOT_FINITE_REWARD:g} for an action that is not finite.\n",
@@ -78,6 +81,18 @@ def page(cls: type[System], env_id: str) -> str:
 
 def _bound(system: System) -> Sequence[float]:
     return system.state_bound or tuple(10 * scale for scale in system.scale)
+
+
+def _motion(system: System, setup: Setup) -> str:
+    """Return in a sentence how the model moves between samples, and what the inputs of a log are
+    there."""
+    moves = described(system, setup.dt)
+    if not system.nu:
+        return f"{moves[0].upper()}{moves[1:]}.\n"
+    held = "held from the last sample on"
+    joined = "joined by straight lines"
+    between = held if system.input_hold == "previous" else joined
+    return f"{moves[0].upper()}{moves[1:]}; the inputs of a log are {between}.\n"
 
 
 def _unit(cls: type[System], name: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,7 +18,7 @@ from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.simulation.truth import disturbed_truth, truth
+from pinnobs_gym.simulation.truth import disturbed_truth, noise_shape, truth
 from pinnobs_gym.systems import SYSTEMS
 
 _DRAWS = 64
@@ -124,7 +123,8 @@ class EpisodeSource:
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.start = self.setup.start(self.system.nx)
-        self._parts = math.ceil(self.setup.dt / longest_step(self.system) - 1e-6)
+        step = longest_step(self.system)
+        self._drawn = noise_shape(self.system, self.noise, self.setup.dt, step)
 
     def contains(self, x0: np.ndarray) -> np.ndarray:
         """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
@@ -189,7 +189,7 @@ class EpisodeSource:
         rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
         if self.noise.stochastic:
-            shape = (len(self.times) - 1, self._parts, 2, self.noise.L(0.0).shape[1])
+            shape = (len(self.times) - 1, *self._drawn)
             drawn = np.stack([rng.standard_normal(shape) for rng in rngs], axis=3)
             step = self.setup.truth_step
             disturbed_truth(plant, self.noise, start, self.times, drawn, step, x, inputs)

@@ -15,6 +15,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates, Estimator, State
+from pinnobs_gym.estimation.takes import EVERYTHING, FEATURES
 from pinnobs_gym.simulation.conformance import (
     Found,
     add_check,
@@ -92,9 +93,10 @@ def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False
     system = estimator.system
     setup = system.setups["benchmark"]
     rng = np.random.default_rng(2)
-    steps = np.full(NUM_SAMPLES - 1, setup.dt)
+    steps = np.full(NUM_SAMPLES - 1, float(setup.dt))
     if irregular:
         steps *= rng.uniform(0.3, 2.0, len(steps))
+        steps = np.maximum(np.round(steps), 1.0) if system.discrete else steps
     t = np.append(0.0, np.cumsum(steps))
     x = truth(system, initial_states(system, setup, batch), t).swapaxes(0, 1)
     noise = system.noise(setup.noise_std, setup.process_noise)
@@ -418,3 +420,15 @@ def _estimator_save_load(estimator: BaseEstimator) -> None:
         loaded = type(estimator).load(path, estimator.system)
     found, expected = loaded.run(record), estimator.run(record)
     _require_same(estimator, found, expected, ROUNDING, "a loaded estimator and the one saved")
+
+
+@add_check(ESTIMATOR_CHECKS, "takes")
+def _estimator_takes(estimator: BaseEstimator) -> None:
+    """Every name in `takes` is that of a feature of a plant."""
+    declared: Any = estimator.takes
+    require(
+        isinstance(declared, frozenset),
+        f"takes={declared!r}; expected a frozenset of names",
+    )
+    unknown = sorted(map(str, declared - EVERYTHING))
+    require(not unknown, f"takes names {', '.join(unknown)}; known are {', '.join(FEATURES)}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.given import checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
+from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
@@ -110,6 +111,10 @@ class BaseEstimator(ABC):
     exempt_from: ClassVar[Mapping[str, str]] = {}
     """Checks of `pinnobs_gym.estimation.checks.check_estimator` that do not apply to the estimator,
     by name, with the reason in one line."""
+    takes: ClassVar[frozenset[str]] = EVERYTHING
+    """What a plant may have: names of `pinnobs_gym.estimation.takes.FEATURES` that the estimator
+    uses, or on which its estimates do not depend. A system with another one is refused, its cells
+    in a leaderboard are not applicable, and checks of that feature are left out."""
     equations: ClassVar[str] = ""
     """The equations in LaTeX for the estimator's page, one per line as in an ``aligned``
     environment. φ is the model's flow from the previous sample; a raised minus marks quantities
@@ -123,7 +128,8 @@ class BaseEstimator(ABC):
 
     def __post_init__(self) -> None:
         probe(type(self.system))
-        self.system.noise(self.noise_std, self.process_noise)  # raises for a wrong level
+        noise = self.system.noise(self.noise_std, self.process_noise)  # raises for a wrong level
+        check_taken(type(self), self.system, noise)
         check_settings(self, self.setting_fields())
 
     @classmethod

@@ -10,6 +10,7 @@ from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
 from pinnobs_gym.estimation.projection import multipliers
+from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.matrices import identity, inner, mapped, sandwich
 from pinnobs_gym.simulation.record import Record
 
@@ -46,6 +47,7 @@ class BatchLeastSquares(OfflineEstimator):
     exempt_from = {
         name: OfflineEstimator.exempt_from[name] for name in ("causality", "run_equals_updates")
     }
+    takes = EVERYTHING - {"process_noise"}  # one initial state explains all samples
     equations = r"""
 \hat x_{0|n} &= \arg\min_x \; (x - \hat x_0)^\top P_0^{-1} (x - \hat x_0)
 + \sum_{k=0}^{n} \bigl\| y_k - h(t_k, \varphi_k(x), u_k) \bigr\|^2_{R^{-1}} \\

@@ -131,6 +131,7 @@ class KKL(LearnedEstimator, Estimator):
 
     knows = ("model", "noise", "initial set", "simulated true states")
     exempt_from = {"model_alone": "its estimate is a function of z, which knows no prior"}
+    takes = frozenset({"own_flow", "process_noise", "full_noise", "sampled_noise", "state_period"})
     equations = r"""
 \dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
 \hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial t} + \tfrac{\partial T}{\partial x}\,

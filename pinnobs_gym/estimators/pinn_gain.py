@@ -22,6 +22,7 @@ from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.matrices import mapped
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
@@ -72,6 +73,7 @@ class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
     """The trained network."""
 
     name = "pinn_gain"
+    takes = EVERYTHING - {"bounds"}
     equations = r"""
 K &= P_k^- H^\top S^{-1}, \qquad s_j = \bigl( (H P_k^- H^\top)_{jj} / S_{jj} \bigr)^{3/4} \\
 K'_{ij} &= K_{ij}\, 8^{\tanh(a_{ij} s_j)}

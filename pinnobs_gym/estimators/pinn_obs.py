@@ -16,8 +16,10 @@ from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
+from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.simulation.model import substeps
+from pinnobs_gym.simulation.motion import inputs_at
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import runge_kutta
 from pinnobs_gym.simulation.system import System
@@ -98,6 +100,8 @@ def estimates_of(rows: Sequence[TrainedNetwork], t: np.ndarray) -> Estimates:
 STEP = 0.7
 """Longest step of the replay, relative to the time constant of the gain; the Runge-Kutta method is
 stable up to 2.8."""
+_TAKES = EVERYTHING - {"maps", "stiff", "bounds"}
+"""What a plant may have: the rate of change is needed, at points of a loss or by explicit steps."""
 MOST_STEPS = 200
 """Largest number of steps between two samples that a gain can cause."""
 
@@ -110,8 +114,9 @@ class PinnObsReplay(LearnedEstimator, Estimator):
 
     Between samples the observer is integrated by the classical Runge-Kutta method. The equal steps
     are at most the system's `System.model_step`, and at most `STEP` over the largest eigenvalue of
-    L(t)C, C = ∂h/∂x. Outputs and measured inputs are interpolated linearly from one sample to the
-    next, so that x̂ at a sample uses that sample and none after it. An output that is missing at
+    L(t)C, C = ∂h/∂x. Outputs are interpolated linearly from one sample to the next, and measured
+    inputs as `System.input_hold` says, so that x̂ at a sample uses that sample and none after it. An
+    output that is missing at
     either end of the interval contributes no correction in it. At the first sample x̂ is the prior
     mean.
 
@@ -123,6 +128,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     """The trained network."""
 
     name = "pinn_obs_replay"
+    takes = _TAKES
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u) + L(t)\, (y - h(t, \hat x, u)), \qquad \hat x(t_0) = \hat x_0
 """
@@ -204,7 +210,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
         """
         t = np.linspace(start, end, 3)
         if self.system.measured_input and u0 is not None:
-            u = u0 + np.array([0.0, 0.5, 1.0])[:, None, None] * (u1 - u0)
+            u = inputs_at(self.system, t, np.array([0.0, 0.5, 1.0]), u0, u1)
         else:
             u = np.asarray(self.system.input(t))[:, None]
         x = np.repeat(self.trained.xhat(t)[:, None], u.shape[1], axis=1)
@@ -222,6 +228,7 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     """The trained network."""
 
     name = "pinn_obs_direct"
+    takes = _TAKES
     equations = r"""
 (\hat x(t), L(t)) &= \text{network}(t), \text{ of least loss on this record; see pinn\_obs}
 """
@@ -270,6 +277,7 @@ class PinnObs(OfflineEstimator):
     nothing is stored if None."""
 
     name = "pinn_obs"
+    takes = _TAKES
     equations = r"""
 (\hat x(t), L(t)) &= \text{network}_\vartheta(t) \\
 \min_\vartheta \; & w_0 \| \hat x(t_0) - \hat x_0 \|^2

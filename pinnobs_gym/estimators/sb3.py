@@ -16,6 +16,7 @@ from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same, plain
+from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Setup, System
@@ -129,6 +130,7 @@ class Sb3(LearnedEstimator, Estimator):
     """The trained agent."""
 
     name = "sb3"
+    takes = EVERYTHING - {"bounds", "sampled_noise"}
     equations = r"""
 \hat x_k &= \hat x_k^- + \sigma(k) \odot \rho_k\, \bigl( e_k \oslash \sqrt{S(k)} \bigr), \qquad
 e_k = y_k - h(t_k, \hat x_k^-, u_k) \\

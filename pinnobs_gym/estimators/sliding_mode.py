@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.observer_gains import (
     time_since,
 )
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -43,6 +44,7 @@ class SlidingMode(RecursiveEstimator):
 
     name = "sliding_mode"
     knows = ("model", "prior", "noise", "initial set")
+    takes = EVERYTHING - {"maps", "bounds"}  # its gain is that of a rate of change
     equations = r"""
 e &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
 s_j = 1 + \frac{\rho_j}{\varepsilon_j} \min\Bigl( 1, \frac{\varepsilon_j}{|e_j|} \Bigr) \\

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.applicable import cell_without_scores
 from pinnobs_gym.leaderboard.contenders import label
 from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
 from pinnobs_gym.leaderboard.numerals import interval_text, number
@@ -69,10 +70,7 @@ def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Gr
         (Column("transient rank", 4), lambda line: _rank(line.places.get("transient"))),
         (Column(f"transient{over}", 2), lambda line: _factor(line.places.get("transient"))),
         (Column("diverged %", 1), lambda line: number(100 * line.diverged, 2)),
-        *(
-            (Column(label(game)), lambda line, game=game: _of_game(line.games.get(game)))
-            for game in games
-        ),
+        *((Column(label(game)), lambda line, game=game: _of_game(line, game)) for game in games),
         (Column("track", 3, numeric=False), lambda line: line.track),
         (Column("µs/step", 5), lambda line: number(line.us_per_step, 2)),
         (Column("knows", numeric=False), lambda line: ", ".join(line.knows)),
@@ -180,9 +178,10 @@ def _ranked(found: Mapping[str, Places]) -> tuple[list[str], str]:
     return ranked, " ".join(notes)
 
 
-def _of_game(s: Standing | None) -> str:
+def _of_game(line: Line, game: GameName) -> str:
+    s = line.games.get(game)
     if s is None:
-        return ""
+        return cell_without_scores(line.estimator, game)
     lost = f"div {s.diverged.percent.value:.0f} %" if s.diverged.value else ""
     median = number(s.steady.value)
     return ", ".join(filter(None, [median, lost]))

@@ -12,6 +12,7 @@ from pinnobs_gym.simulation.augmented_system import Augmented, Constants, Unknow
 from pinnobs_gym.simulation.bounds import Bounds, box
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.noise import Level, noise_root
 from pinnobs_gym.simulation.start_law import Box, Joint
 from pinnobs_gym.simulation.system import PoorPrior, Setup, System, is_number, vector
 
@@ -22,12 +23,13 @@ def augmented(
     output_bias: Mapping[str, Unknown] | None = None,
     disturbance: Mapping[str, Unknown] | None = None,
 ) -> System:
-    """Return a system with unknown constants as further states, whose rate of change is zero, so
+    """Return a system with unknown constants as further states, which do not change, so
     that every estimator estimates them (Jazwinski 1970, section 8.4).
 
     The further states are, in this order: the parameters by their names, ``bias_<output>``, which
     is added to an output, and ``disturbance_<state>``, which is added to the rate of change of a
-    state, in state units per second. Their scale is the standard deviation, so that an error of 1
+    state, in state units per second (to the next state of a map). A disturbed plant moves by its f
+    even if it has a flow of its own. Their scale is the standard deviation, so that an error of 1
     in the scores is no better than the prior.
 
     In each setup, initial states are those of the given system, and each constant is uniform within
@@ -102,6 +104,7 @@ def _class(
         **_attributes(plant, extras, [f.name for f in kept]),
         # A method that the plant leaves to `System` is left to it here, too: others ask for that.
         **{name: getattr(System, name) for name in _OPTIONAL if _is_inherited(cls, name)},
+        **({"flow": System.flow} if disturbances else {}),
         "__doc__": f"{cls.__name__} with unknown constants as states: {', '.join(extras)}.",
         "__module__": cls.__module__,  # where its equations are
         "__reduce__": _reduced,
@@ -131,7 +134,7 @@ def _again(plant: System, constants: tuple[Any, Any, Any], values: dict[str, Any
     return _class(plant, *constants)(**values)
 
 
-_OPTIONAL = ("input", "admissible", "f_jacobian", "h_jacobian")
+_OPTIONAL = ("input", "admissible", "f_jacobian", "h_jacobian", "flow")
 
 
 def _is_inherited(cls: type[System], name: str) -> bool:
@@ -175,6 +178,9 @@ def _attributes(plant: System, extras: Mapping[str, Unknown], kept: list[str]) -
         if plant.uncertain is None
         else tuple(name for name in plant.uncertain if name in kept),
         "model_step": plant.model_step,
+        "discrete": plant.discrete,
+        "stiff": plant.stiff,
+        "input_hold": plant.input_hold,
     }
 
 
@@ -197,7 +203,7 @@ def _units(plant: System, extras: Mapping[str, Unknown]) -> dict[str, str]:
         if f"disturbance_{name}" in extras:
             unit = units.get(name, "1")
             faster = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
-            units[f"disturbance_{name}"] = faster
+            units[f"disturbance_{name}"] = unit if plant.discrete else faster
     return units
 
 
@@ -231,7 +237,16 @@ def _setup(plant: System, setup: Setup, extras: Mapping[str, Unknown], kept: lis
             _diagonal(np.array(poor.P0, dtype=float), stds),
         ),
         parameters=own,
+        process_noise=_padded(plant, setup, len(stds)),
     )
+
+
+def _padded(plant: System, setup: Setup, count: int) -> Level:
+    """Return the plant's process noise with none in ``count`` further states."""
+    L = noise_root(setup.process_noise, plant.nx, "process_noise")
+    if not L.any():
+        return 0.0
+    return tuple(map(tuple, np.pad(L, ((0, count), (0, 0))).tolist()))
 
 
 def _row(first: np.ndarray, second: np.ndarray) -> tuple[float, ...]:
@@ -277,10 +292,17 @@ def _check_rows(system: Augmented, plant: System) -> None:
     count = 2 + max(system.nx, system.ny)  # not a size that could be taken for that of an axis
     mean = vector(system.setups["benchmark"].xhat0 or (), system.nx, "xhat0")
     x, t = np.tile(mean, (count, 1)), np.zeros(count)
-    for name, size in (("f", system.nx), ("h", system.ny)):
+    u, later = np.asarray(system.input(t)), t + system.setups["benchmark"].dt
+    calls: dict[str, tuple[int, tuple[Any, ...]]] = {
+        "f": (system.nx, (t, x, u)),
+        "h": (system.ny, (t, x, u)),
+    }
+    if system.own_flow:
+        calls["flow"] = system.nx, (t, later, x, u)
+    for name, (size, arguments) in calls.items():
         try:
             with np.errstate(all="ignore"):
-                shape = np.shape(getattr(system, name)(t, x, np.asarray(system.input(t))))
+                shape = np.shape(getattr(system, name)(*arguments))
             found = "" if shape == (count, size) else f"returns shape {shape}"
         except Exception as error:  # whatever the user's function raises
             found = f"raises {type(error).__name__}: {' '.join(str(error).split())}"

@@ -85,7 +85,13 @@ class Augmented(System):
     def f(self, t: Array, x: Array, u: Array) -> Array:
         plant, state = self._parts(x)
         columns = self._columns(_DISTURBANCE, plant.state_names)
-        return _joined(x, self._plus(plant.f(t, state, u), x, columns), 0.0)
+        own = self._plus(plant.f(t, state, u), x, columns)
+        return _followed(own, x) if self.discrete else _joined(x, own, 0.0)
+
+    def flow(self, t0: Array, t1: Array, x: Array, u: Array) -> Array:
+        """Return the plant's own flow, with the constants as they are."""
+        plant, state = self._parts(x)
+        return _followed(plant.flow(t0, t1, state, u), x)
 
     def h(self, t: Array, x: Array, u: Array) -> Array:
         plant, state = self._parts(x)
@@ -103,6 +109,9 @@ class Augmented(System):
         _set_ones(above, self._columns(_DISTURBANCE, plant.state_names))
         F = np.zeros_like(above, shape=(*x.shape, self.nx))
         F[..., : plant.nx, :] = above
+        if self.discrete:  # the constants of a map remain what they are
+            for i in range(plant.nx, self.nx):
+                F[..., i, i] = 1.0
         return F
 
     def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
@@ -184,6 +193,15 @@ def _joined(x: Array, first: Array, value: float | bool) -> Array:
     xp = array_namespace(first)
     rest = xp.full_like(x[..., first.shape[-1] :], value, dtype=first.dtype)
     return xp.concat([first, rest], axis=-1)
+
+
+def _followed(first: Array, x: Array) -> Array:
+    """Return the array (..., nx) of the columns ``first`` and, in those that are left, of x."""
+    if isinstance(first, np.ndarray):
+        out = np.array(np.broadcast_to(x, (*first.shape[:-1], x.shape[-1])), dtype=first.dtype)
+        out[..., : first.shape[-1]] = first
+        return out
+    return array_namespace(first).concat([first, x[..., first.shape[-1] :]], axis=-1)
 
 
 def _set_ones(matrix: np.ndarray, columns: dict[int, int]) -> None:

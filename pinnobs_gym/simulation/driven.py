@@ -27,7 +27,15 @@ def driven(plant: System, times: np.ndarray, inputs: np.ndarray) -> System:
 @cache
 def _class_of(cls: type[System]) -> Any:
     """Return the class of a driven plant, which has the attributes and the name of the plant's."""
-    names = "state_names", "output_names", "input_names", "scale", "input_hold"
+    names = (
+        "state_names",
+        "output_names",
+        "input_names",
+        "scale",
+        "input_hold",
+        "stiff",
+        "model_step",
+    )
     shared = {name: property(lambda self, name=name: getattr(self.plant, name)) for name in names}
     return dataclass(frozen=True)(type(cls.__name__, (_Driven,), shared))
 
@@ -52,6 +60,9 @@ class _Driven(System):
 
     def h(self, t: Array, x: Array, u: Array) -> Array:
         return self.plant.h(t, x, u)
+
+    def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
+        return self.plant.f_jacobian(t, x, u)
 
     def input(self, t: Array) -> Array:
         """Return the inputs (..., batch, nu) at times t, (...) or (..., 1)."""

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.maps import Map
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
+from pinnobs_gym.simulation.motion import Interval, Motion, inputs_at
 from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.own_flow import OwnFlow, differences
 from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
+from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import Array, System
 
 _STAGES = np.array([0, 1, 1, 2])
@@ -21,17 +25,49 @@ _STAGES = np.array([0, 1, 1, 2])
 _PARTS = np.array([0.0, 0.5, 1.0])
 """A step's start, middle and end, in steps."""
 
+_MAP, _STIFF, _OWN_FLOW = Map(), Stiff(), OwnFlow()
+
+
+def _motion(system: System) -> Motion | None:
+    """Return how the model moves, None if by Runge-Kutta steps."""
+    if type(system).flow is not System.flow:
+        return _OWN_FLOW
+    if system.discrete:
+        return _MAP
+    return _STIFF if system.stiff else None
+
+
+def described(system: System, dt: float) -> str:
+    """Return in a few words how a model moves from one sample to the next, dt later."""
+    motion = _motion(system)
+    if motion is None:
+        count = max(1, math.ceil(dt / longest_step(system) - 1e-6))
+        return f"{count} Runge-Kutta step{'s' * (count > 1)} per sample"
+    texts: dict[Motion, str] = {
+        _OWN_FLOW: "by its own flow",
+        _MAP: f"a map, {dt:g} step{'s' * (dt > 1)} per sample",
+        _STIFF: "stiff: linearly implicit steps of controlled error",
+    }
+    return texts[motion]
+
 
 def model_step(
     system: System, t0: Array, t1: Array, x: Array, u0: Array | None = None, u1: Array | None = None
 ) -> Array:
-    """Propagate the model's state x (..., nx) from t0 to t1 (s) by the classical Runge-Kutta
-    method, in equal steps of at most `longest_step`. Rows (batch, nx) of x may
-    have their own times, t0 and t1 of shape (batch,); all rows take the same number of steps.
+    """Propagate the model's state x (..., nx) from t0 to t1 (s).
 
-    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used, between them as
-    `System.input_hold` says, only if the system's input is measured.
+    A map takes its steps, a stiff plant linearly implicit ones (`pinnobs_gym.simulation.stiff`),
+    and one that overrides `System.flow` moves by that. Any other moves by the classical
+    Runge-Kutta method, in equal steps of at most `longest_step`. Rows (batch, nx) of x may have
+    their own times, t0 and t1 of shape (batch,); all rows take the same number of Runge-Kutta
+    steps.
+
+    ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used only if the
+    system's input is measured, between the samples as `System.input_hold` says.
     """
+    motion = _motion(system)
+    if motion is not None:
+        return motion.step(Interval(system, t0, t1, u0, u1), x)
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
         x = runge_kutta(partial(_rate, system, t, u), x, step)
     return x
@@ -62,7 +98,13 @@ def noisy_model_step(
         u0: inputs at t0, shape (batch, nu); see `model_step`.
         u1: inputs at t1, shape (batch, nu).
         normal: returns standard normal numbers (num_points, 1, m) for a given m.
+
+    Maps, stiff plants and those with a flow of their own have noise as
+    `pinnobs_gym.simulation.maps`, ``stiff`` and ``own_flow`` say.
     """
+    motion = _motion(system)
+    if motion is not None:
+        return motion.noisy(Interval(system, t0, t1, u0, u1), noise, x, normal)
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
         L = [noise.L(float(now))[..., 0].T for now in t]
         rate = partial(_rate, system, t, u)
@@ -110,6 +152,10 @@ def model_step_jacobian(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return `model_step` of x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape (batch, nx,
     nx), with the batch innermost in memory."""
+    motion = _motion(system)
+    if motion is not None:
+        x, F, _ = motion.moments(Interval(system, t0, t1, u0, u1), None, x)
+        return x, F.transpose(2, 0, 1)
     F = None
     for end, flow, _, _ in _linearised_steps(system, t0, t1, x, u0, u1):
         x, F = end, flow if F is None else product(flow, F)  # chain rule over the substeps
@@ -132,11 +178,19 @@ def model_step_moments(
     Q = ∫Ψ L Lᵀ Ψᵀ ds, where Ψ(s) = ∂x(t1)/∂x(s), by Simpson's rule over each substep (Van Loan 1978
     for constant A). Ψ at the middle is the cubic Hermite polynomial through its values and slopes
     −ΨA at the ends, which costs no evaluation of f. Neither the number of substeps nor samples
-    between without any output change Q beyond the error of the rule, of fourth order.
+    between without any output change Q beyond the error of the rule, of fourth order. See
+    `noisy_model_step` for other motions.
 
     States x are (batch, nx), or (num_points, batch, nx); of several points, F and Q belong to the
     first.
     """
+    motion = _motion(system)
+    if motion is not None:
+        over = Interval(system, t0, t1, u0, u1)
+        if x.ndim == 2:
+            return motion.moments(over, noise, x)
+        first, F, Q = motion.moments(over, noise, x[0])
+        return np.concatenate([first[None], motion.step(over, x[1:])]), F, Q
     F, Q = None, None
     for end, flow, A, (t, h) in _linearised_steps(system, t0, t1, x, u0, u1):
         x, F = end, flow if F is None else product(flow, F)  # chain rule over the substeps
@@ -155,6 +209,16 @@ def model_step_moments(
         Q = added if Q is None else sandwich(flow, Q) + added
     assert F is not None  # there is at least one substep
     return x, F, np.zeros((len(F), len(F), 1)) if Q is None else Q
+
+
+def flow_jacobian(
+    system: System, t0: float | np.ndarray, t1: float | np.ndarray, x: np.ndarray, u: np.ndarray
+) -> np.ndarray:
+    """Return the derivative (batch, nx, nx) of `System.flow` at x (batch, nx): by central
+    differences if the class overrides it, and that of `model_step` otherwise."""
+    if system.own_flow:
+        return differences(lambda at: system.flow(t0, t1, at, u), system, x)
+    return model_step_jacobian(system, t0, t1, x, u, u)[1]
 
 
 def _linearised_steps(
@@ -235,13 +299,4 @@ def substeps(
         part = parts + k if k else parts
         after = part * step
         t = t0 + (after.T if by_row else after)
-        if system.measured_input:
-            if u0 is None or u1 is None:
-                raise ValueError(f"{type(system).__name__} has a measured input; u is missing")
-            weight = (part / count).reshape(3, *([1] * u0.ndim))
-            if system.input_hold == "previous":
-                weight = 0 * weight
-            u = (1 - weight) * u0 + weight * u1
-        else:
-            u = system.input(t)
-        yield t, step, u
+        yield t, step, inputs_at(system, t, part / count, u0, u1)

@@ -38,17 +38,26 @@ def probe(cls: type[System]) -> None:
             expected, or returns other values when it is called again.
     """
     system, setup = cls.configured()
-    inputs = _call(system, "input", (system.nu,), t=np.linspace(0.0, setup.duration, 3))
+    times = np.linspace(0.0, setup.duration, 3)
+    times = np.floor(times) if cls.discrete else times  # those of a map are whole numbers
+    inputs = _call(system, "input", (system.nu,), t=times)
     _call(system, "admissible", (), x=np.zeros((3, system.nx)) + setup.start(system.nx).mean)
     states = initial_states(system, setup, 6)
     for batch in _BATCHES:
         count = int(np.prod(batch))
         x = states[:count].reshape(*batch, system.nx)
         t = np.linspace(0.0, setup.duration, count).reshape(batch)
+        t = np.floor(t) if cls.discrete else t
         u = np.broadcast_to(inputs[-1], (*batch, system.nu)).copy()
         _call(system, "f", (system.nx,), t=t, x=x, u=u)
         _call(system, "h", (system.ny,), t=t, x=x, u=u)
+        if system.own_flow:
+            _call(system, "flow", (system.nx,), t0=t, t1=t + setup.dt, x=x, u=u)
         _call(system, "observable", (system.nx,), x=x)
+        if cls.flow_jacobian is not System.flow_jacobian:
+            shape = (system.nx, system.nx)
+            if len(batch) == 1:  # it is called for a batch with one axis
+                _call(system, "flow_jacobian", shape, t0=t, t1=t + setup.dt, x=x, u=u)
         if cls.f_jacobian is not System.f_jacobian:
             _call(system, "f_jacobian", (system.nx, system.nx), t=t, x=x, u=u)
         if cls.h_jacobian is not System.h_jacobian:
@@ -67,6 +76,7 @@ def probe_torch(cls: type[System], name: str) -> None:
     system, setup = cls.configured()
     x = torch.tensor(initial_states(system, setup, 3))
     t = torch.linspace(0.0, setup.duration, 3, dtype=x.dtype)
+    t = torch.floor(t) if cls.discrete else t
     u = torch.tensor(np.asarray(system.input(t.numpy())))
     function, where = getattr(system, name), _Where(system, name)
     what = f"of torch tensors, which {name}_jacobian needs; expected {_ADVICE}, or a "

@@ -104,12 +104,20 @@ class Record:
                 )
 
     def check_fits(self, system: System) -> None:
-        """Check that the record has the outputs, the inputs and the states of a system.
+        """Check that the record has the outputs, the inputs and the states of a system and, for a
+        map, that its times are whole numbers.
 
         Raises:
-            ValueError: in one line that names the array, its size and the size expected.
+            ValueError: in one line that names the array, its size and the size expected, or the
+                sample.
         """
         kind, nx = type(system).__name__, system.nx
+        if system.discrete and (self.t != np.round(self.t)).any():
+            sample = int(np.flatnonzero(self.t != np.round(self.t))[0])
+            raise ValueError(
+                f"sample {sample} has t={self.t[sample]:g}; {kind} is a map, expected a whole "
+                "number of steps"
+            )
         sizes = {"y": system.ny, "u": system.nu, "noise_std": system.ny}
         for name, size in sizes.items():
             array, last = getattr(self, name), "u" if name == "u" else "y"
@@ -166,9 +174,9 @@ def _real(name: str, value: Any) -> np.ndarray:
 
 def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Record]:
     """Read a record from a CSV file with columns t (s), y1, y2, ... and, if the system has inputs,
-    u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output. Columns
-    y1_std, y2_std, ... hold the standard deviation of an output's noise at each sample, where it is
-    known. Other columns are ignored.
+    u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output, or an
+    input that keeps its last value. Columns y1_std, y2_std, ... hold the standard deviation of an
+    output's noise at each sample, where it is known. Other columns are ignored.
 
     Also returns the system, with `System.measured_input` set if the file has columns u. A file
     without them uses the input that the system's class defines, if it defines one.
@@ -213,12 +221,25 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
     y = np.stack([table[name] for name in outputs], axis=-1)[None]
     if np.isnan(y).all():
         raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
+    for name in inputs:
+        if np.isnan(table[name][0]):
+            raise ValueError(
+                f"log {path}, line {rows[1][0]}: {name} is empty; expected a number in the first "
+                "row, as an empty input keeps its last value"
+            )
+        table[name] = _kept(table[name])
     u = np.stack([table[n] for n in inputs], axis=-1) if inputs else system.input(t)
     std = None
     if levels:
         unknown = np.full(len(t), np.nan)
         std = np.stack([table.get(f"{output}_std", unknown) for output in outputs], axis=-1)[None]
     return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior, std)
+
+
+def _kept(values: np.ndarray) -> np.ndarray:
+    """Return the values (num_samples,) with the last number before it in place of each NaN."""
+    last = np.where(np.isnan(values), 0, np.arange(len(values)))
+    return values[np.maximum.accumulate(last)]
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
@@ -257,7 +278,7 @@ def _shown(text: str) -> str:
 def _number(cell: str, name: str, where: str) -> float:
     text = cell.strip()
     missing = text == "" or text.lower() == "nan"
-    if missing and name.startswith("y"):
+    if missing and name != "t":
         return math.nan
     try:
         value = float(text)

@@ -70,7 +70,13 @@ def longest_step(system: System) -> float:
     Where f is not smooth, such as with friction, no step is that precise; halving ends when it no
     longer reduces the error fourfold. Parameters that are arrays, one number per row of a batch,
     count with the benchmark's value. The result is kept.
+
+    A map has steps of 1. The steps of a stiff plant are controlled, and have no such limit.
     """
+    if system.discrete:
+        return 1.0
+    if system.stiff and system.model_step is None:
+        return np.inf
     if system.model_step is not None:
         return system.model_step
     kept = vars(system)  # the attributes of this instance, which is frozen to others

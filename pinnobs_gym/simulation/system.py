@@ -161,6 +161,8 @@ class Setup:
 class System(ABC):
     """A plant ẋ = f(t, x, u), y = h(t, x, u), the single source of its equations.
 
+    With `discrete`, it is a map x⁺ = f(k, x, u) instead, whose time is counted in steps.
+
     To add a system, subclass it in one file. The dataclass fields are the physical parameters, the
     class attributes below define names, dimensions and setups, and `f` and `h` are the equations.
     Both act on the last axis and accept any leading axes. They are written in the array API (``xp =
@@ -205,6 +207,13 @@ class System(ABC):
     model_step: ClassVar[float | None] = None
     """Longest Runge-Kutta step of model-based estimators in s; if None, one that keeps the local
     error small is found (`pinnobs_gym.simulation.runge_kutta.longest_step`)."""
+    discrete: ClassVar[bool] = False
+    """Whether the plant is a map x⁺ = f(k, x, u). All times are then counted in steps, and those of
+    samples are whole numbers."""
+    stiff: ClassVar[bool] = False
+    """Whether f has rates so different that an explicit method would need very small steps. The
+    model then moves by a linearly implicit method (`pinnobs_gym.simulation.rosenbrock`), with
+    `f_jacobian`, and the truth by LSODA."""
     input_hold: ClassVar[Literal["previous", "linear"]] = "previous"
     """What measured inputs are between samples: the value at the previous sample, as the output of
     a computer is held; or on straight lines, for samples of a continuous signal. Inputs of a log
@@ -291,6 +300,31 @@ class System(ABC):
         see `state_period`."""
         return x - xhat if self.state_period is None else residual(x, xhat, self.state_period)
 
+    def flow(self, t0: Array, t1: Array, x: Array, u: Array) -> Array:
+        """Return the state (..., nx) at t1 (s) that follows from the state x (..., nx) at t0.
+
+        The default moves the model as all estimators do: by a map, a linearly implicit method or a
+        Runge-Kutta method. A plant with an exact or own propagation overrides it, and every
+        estimator then uses that. Truth is still the solution of `f`.
+
+        Args:
+            t0: a number or, like t1, an array (...) that broadcasts against the batch of x.
+            t1: the later time in s.
+            x: states at t0.
+            u: inputs at t0, shape (..., nu), held until t1 if they are measured. An input that
+                `input` defines is known to the plant at any time.
+        """
+        from pinnobs_gym.simulation.model import model_step
+
+        return model_step(self, t0, t1, x, u, u)
+
+    def flow_jacobian(self, t0: Array, t1: Array, x: Array, u: Array) -> Array:
+        """Return the derivative of `flow` with respect to x, (batch, nx, nx), for x (batch, nx):
+        exactly for the default flow, and by central differences for an overridden one."""
+        from pinnobs_gym.simulation.model import flow_jacobian
+
+        return flow_jacobian(self, t0, t1, x, u)
+
     def admissible(self, x0: Array) -> Array:
         """Return which states (..., nx) of a setup's law are valid initial states: bool (...)."""
         xp = array_namespace(x0)
@@ -358,7 +392,19 @@ class System(ABC):
                 raise ValueError(f"unknown parameter {name!r} of {cls.__name__}; it has {known}")
         system = replace(system, **wanted)
         system.noise(chosen.noise_std, chosen.process_noise)
+        system.check_times(chosen)
         return system, chosen
+
+    def check_times(self, setup: Setup) -> None:
+        """Check that the samples of a setup are at whole steps, if the plant is a map.
+
+        Raises:
+            ValueError: in one line, if they are not.
+        """
+        if self.discrete and setup.dt != round(setup.dt):
+            raise ValueError(
+                f"dt={setup.dt:g} of {type(self).__name__}, a map; expected a whole number of steps"
+            )
 
     def noise(
         self, noise_std: Level | SampledLevel | None = None, process_noise: Level | None = None
@@ -386,6 +432,32 @@ class System(ABC):
         level = own.process_noise if process_noise is None else process_noise
         return Noise(noise_root(level, self.nx, f"process_noise of {name}"), output, samples)
 
+    @property
+    def own_flow(self) -> bool:
+        """Whether the class overrides `flow`."""
+        return type(self).flow is not System.flow
+
+    @classmethod
+    def _validate_motion(cls) -> None:
+        """Raise TypeError in one line if what the class says of its motion does not agree."""
+        own = cls.flow is not System.flow
+        if cls.input_hold not in ("previous", "linear"):
+            raise TypeError(
+                f"system {cls.__name__}: input_hold={cls.input_hold!r}; expected 'previous' or "
+                "'linear'"
+            )
+        if own and cls.input_hold == "linear":
+            raise TypeError(
+                f"system {cls.__name__} has its own flow, whose input is held, and "
+                "input_hold='linear'; expected 'previous'"
+            )
+        if cls.discrete and (own or cls.stiff):
+            other = "its own flow" if own else "stiff=True"
+            raise TypeError(
+                f"system {cls.__name__} is a map (discrete=True) and has {other}; expected one of "
+                "them"
+            )
+
     @classmethod
     def validate(cls) -> None:
         """Check the class attributes of a new system.
@@ -396,13 +468,14 @@ class System(ABC):
         for name in ("state_names", "output_names", "scale", "setups"):
             if getattr(cls, name, None) is None:
                 raise TypeError(f"system {cls.__name__} has no class attribute {name!r}")
-        for name in ("f", "h"):
+        for name, expected in (("f", "t, x, u"), ("h", "t, x, u"), ("flow", "t0, t1, x, u")):
             taken = list(inspect.signature(getattr(cls, name)).parameters)
-            if len(taken) != 4:
+            if len(taken) != 1 + len(expected.split()):
                 raise TypeError(
                     f"system {cls.__name__}: {name}({', '.join(taken)}); "
-                    f"expected {name}(self, t, x, u)"
+                    f"expected {name}(self, {expected})"
                 )
+        cls._validate_motion()
         if "benchmark" not in cls.setups:
             raise TypeError(f"system {cls.__name__} has no setup named 'benchmark'")
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -13,7 +14,10 @@ from numpy.polynomial import chebyshev
 
 from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.driven import driven
+from pinnobs_gym.simulation.maps import Map
+from pinnobs_gym.simulation.motion import Interval
 from pinnobs_gym.simulation.noise import Noise, weighted
+from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import System, vector
 
 TOLERANCE = 3e-11
@@ -49,7 +53,8 @@ def truth(
     that polynomial, midway between nodes, controls the error: episodes whose local error exceeds
     `TOLERANCE` are simulated again with half the step. Episodes that no step satisfies (stiff or
     not smooth) are solved by an adaptive method, LSODA. The result of an episode does not depend on
-    the others in its batch.
+    the others in its batch. All episodes of a plant with `System.stiff` are solved by LSODA, and a
+    map is evaluated.
 
     Args:
         system: the plant; its parameters may be arrays (batch,), one value per episode.
@@ -70,6 +75,12 @@ def truth(
     times = np.asarray(times, dtype=float)
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
+    if system.discrete:
+        with np.errstate(all="ignore"):
+            for k in range(len(times) - 1):
+                x[k + 1] = Map().step(_between(system, times, inputs, k), x[k])
+        _check_finite(system, x0, x)
+        return x
     longest = max_step or float(times[-1] - times[0]) / 100
     if inputs is not None:  # they, or their slopes, jump at each sample
         for k in range(len(times) - 1):
@@ -90,6 +101,25 @@ def truth(
     return x
 
 
+def noise_shape(system: System, noise: Noise, dt: float, step: float) -> tuple[int, int, int]:
+    """Return how many standard normal numbers the process noise of an episode takes in each time
+    between samples: the parts of that time, the numbers for each component in a part, and the
+    components.
+
+    Args:
+        system: the plant.
+        noise: its noise.
+        dt: time between samples in s.
+        step: longest step of the model in s, see
+            `pinnobs_gym.simulation.runge_kutta.longest_step`.
+    """
+    if system.discrete:
+        return round(dt), 1, noise.L(0.0).shape[1]
+    if system.stiff:
+        return 1, 1, system.nx
+    return math.ceil(dt / step - 1e-6), 2, noise.L(0.0).shape[1]
+
+
 def disturbed_truth(
     system: System,
     noise: Noise,
@@ -105,15 +135,15 @@ def disturbed_truth(
     The law is that of `pinnobs_gym.simulation.model.noisy_model_step`: in each of equal parts of
     the intervals between samples, white noise is replaced by its projection on linear functions of
     time. The solver is that of `truth` with equal steps of at most ``max_step``. Its error is not
-    controlled, as it is far below any relevant noise.
+    controlled, as it is far below any relevant noise. Maps and stiff plants move as the model does.
 
     Args:
         system: as in `truth`.
         noise: the noise of the plant.
         x0: initial states, shape (batch, nx), in state units.
         times: sample times in s, ascending, shape (num_samples,).
-        draws: standard normal numbers, shape (num_samples - 1, num_parts, 2, batch, m), where m is
-            the number of columns of L.
+        draws: standard normal numbers, shape (num_samples - 1, num_parts, num_each, batch, m), see
+            `noise_shape`.
         max_step: longest step of the solver in s; a hundredth of the time span if None.
         out: array for the result.
         inputs: as in `truth`.
@@ -131,6 +161,9 @@ def disturbed_truth(
     stages[0] = x0
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
+            if system.discrete or system.stiff:
+                x[k + 1] = _moved(_between(system, times, inputs, k), noise, x[k], draws[k])
+                continue
             plant = system
             if inputs is not None:
                 plant = driven(system, times[k : k + 2], inputs[k : k + 2])
@@ -141,6 +174,22 @@ def disturbed_truth(
             x[k + 1] = stages[0]
     _check_finite(system, x0, x)
     return x
+
+
+def _between(system: System, times: np.ndarray, inputs: np.ndarray | None, k: int) -> Interval:
+    """Return the interval that follows sample k, with the inputs (num_samples, batch, nu) at the
+    samples or, if they are None, those that the system defines."""
+    plant = replace(system, measured_input=inputs is not None)
+    ends = (None, None) if inputs is None else (inputs[k], inputs[k + 1])
+    return Interval(plant, float(times[k]), float(times[k + 1]), *ends)
+
+
+def _moved(between: Interval, noise: Noise, x: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Return the states of a map or a stiff plant with process noise at the end of an interval,
+    from x (batch, nx) at its start, given numbers (num_parts, 1, batch, m)."""
+    motion = Map() if between.system.discrete else Stiff()
+    drawn = iter(draws)
+    return motion.noisy(between, noise, x[None], lambda size: next(drawn))[0]
 
 
 @dataclass(frozen=True)
@@ -229,7 +278,7 @@ def _solve_interval(
     rows = np.arange(len(x0))
     with np.errstate(all="ignore"):
         # Simulate the remaining episodes; those over the tolerance continue with half the step.
-        for _ in range(_HALVINGS):
+        for _ in range(0 if system.stiff else _HALVINGS):
             plant = rows_of(system, rows)
             everything = len(rows) == len(x0)
             part = out if everything else np.empty((len(times), len(rows), x0.shape[1]))

@@ -88,6 +88,7 @@ class FeedThrough(Linear):
     modulation: ClassVar[float] = 0.0
     """m."""
     input_names = ("u1",)
+    input_hold = "linear"
 
     def h(self, t, x, u):
         xp, u1 = array_namespace(x), u[..., 0]

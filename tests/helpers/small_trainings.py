@@ -35,6 +35,7 @@ class Spring(System):
     state_names = ("q", "v")
     output_names = ("q",)
     input_names = ("force",)
+    input_hold = "linear"
     scale = (1.0, 1.0)
     setups: ClassVar = {"benchmark": box(2)}
     model_step = 0.01
@@ -56,6 +57,7 @@ class Mixer(System):
     state_names = ("a", "b", "c")
     output_names = ("y1", "y2")
     input_names = ("u1", "u2")
+    input_hold = "linear"
     scale = (1.0, 1.0, 1.0)
     setups: ClassVar = {"benchmark": box(3)}
 

@@ -312,20 +312,18 @@ class Battery(System):
 
 def battery_records(rows, R0):
     """States of charge and noisy records of drives, by closed forms. The current changes every 20 s
-    and is linear between samples, as the model takes it."""
+    and is held between samples."""
     rng, plant = np.random.default_rng(0), Battery()
     t = plant.setups["benchmark"].times
     i = rng.uniform(-3, 6, (rows, len(t) // 20 + 1)).repeat(20, axis=1)[:, : len(t)]
     charge = 3600 * plant.capacity
-    i += (0.7 * charge / t[-1] - np.trapezoid(i, t, axis=1) / t[-1])[:, None]  # from 0.9 to 0.2
-    used = np.cumsum((i[:, 1:] + i[:, :-1]) / 2, axis=1)
+    i += (0.7 * charge / t[-1] - i[:, :-1].mean(axis=1))[:, None]  # from 0.9 to 0.2
+    used = np.cumsum(i[:, :-1], axis=1)
     soc = 0.9 - np.concatenate([np.zeros((rows, 1)), used], axis=1) / charge
-    # V1 of a current that is linear over 1 s
+    # V1 of a current that is constant over 1 s
     v1, decay = np.zeros(i.shape), np.exp(-1 / 30)
     for k in range(1, len(t)):
-        before, rise = i[:, k - 1], i[:, k] - i[:, k - 1]
-        driven = (1 - decay) * before + (1 - 30 * (1 - decay)) * rise
-        v1[:, k] = decay * v1[:, k - 1] + 0.02 * driven
+        v1[:, k] = decay * v1[:, k - 1] + 0.02 * (1 - decay) * i[:, k - 1]
     y = plant.ocv(soc) - v1 - R0[:, None] * i + 5e-3 * rng.standard_normal(i.shape)
     return t, soc, y[..., None], (i + 0.02 * rng.standard_normal(i.shape))[..., None]
 

@@ -180,7 +180,7 @@ def test_check_system_compares_the_model_with_the_truth() -> None:
         omega: float = 10.0
         model_step = DT
 
-    with pytest.warns(UserWarning, match=r"in steps of 0\.1 s, is off by (\S+) of scale") as found:
+    with pytest.warns(UserWarning, match=r"\(1 Runge-Kutta step per sample\) is off by") as found:
         SYSTEM_CHECKS["model_step"](OneStep)
     (warning,) = found
     off = float(str(warning.message).split("off by ")[1].split()[0])

@@ -240,6 +240,7 @@ class Blowup(VanDerPol):
 class Linear(VanDerPol):
     """A linear plant with an input."""
 
+    input_hold = "linear"
     input_names = ("u1",)
     A: ClassVar = np.array([[0.0, 1.0], [-4.0, -0.3]])
     B: ClassVar = np.array([0.0, 1.0])

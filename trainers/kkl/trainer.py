@@ -222,6 +222,12 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
 
 def _check(system: System, record: Record) -> None:
     """Check that a system and a record can be trained on."""
+    if system.discrete or system.stiff:
+        kind = "a map" if system.discrete else "stiff"
+        raise ValueError(
+            f"{type(system).__name__} is {kind}; a KKL observer needs a rate of change that can be "
+            "integrated backwards"
+        )
     if system.measured_input:
         raise ValueError(
             f"{type(system).__name__} has a measured input; a KKL observer is trained on simulated "

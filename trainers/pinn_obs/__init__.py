@@ -276,6 +276,9 @@ def _check(system: System, record: Record, config: PinnObsConfig) -> None:
         ValueError: in one line, with the value found and the value expected.
     """
     name = type(system).__name__
+    if system.discrete or system.stiff:
+        kind = "a map" if system.discrete else "stiff"
+        raise ValueError(f"{name} is {kind}; PINN-Obs needs a rate of change that is not stiff")
     if (np.diff(record.t.astype(config.dtype)) <= 0).any():
         raise ValueError(
             f"sample times from t={record.t[0]} s on are the same in {config.dtype}; subtract the"

@@ -57,7 +57,7 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
     halves = np.diff(times) / (t[-1] - t[0]) / 2
     weights = np.append(halves, 0.0) + np.append(0.0, halves)
     output = weights[:, None] * present
-    u = on_lines(times, t, record.u[0]) if system.measured_input else system.input(times)
+    u = _measured(system, times, record) if system.measured_input else system.input(times)
     points = Points(
         times,
         np.asarray(u),
@@ -91,6 +91,15 @@ def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:
         output * (system.ny / max(output.sum(), 1.0)),
         record.prior.mean[0],
     )
+
+
+def _measured(system: System, times: np.ndarray, record: Record) -> np.ndarray:
+    """Return measured inputs (num_times, nu) at times within a record of one episode, as
+    `System.input_hold` says."""
+    if system.input_hold == "linear":
+        return on_lines(times, record.t, record.u[0])
+    last = np.searchsorted(record.t, times, side="right") - 1
+    return record.u[0, np.clip(last, 0, record.num_samples - 1)]
 
 
 def on_lines(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any
 from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.leaderboard.applicable import applies
 from pinnobs_gym.leaderboard.jobs.job import Job, called
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import trainer_class
@@ -35,7 +36,8 @@ def default_estimators() -> tuple[Entry, ...]:
 def jobs_of(suite: Suite, folder: Path) -> list[Job]:
     """Return the jobs of a suite in a folder.
 
-    Jobs with training come first, since they take longest. The others are ordered by game, since
+    An estimator has none in a game whose system it does not take, see `BaseEstimator.takes`. Jobs
+    with training come first, since they take longest. The others are ordered by game, since
     the references of episodes are cached from one job to the next. Estimators that train on each
     record play fewer episodes, with one job per episode.
 
@@ -52,6 +54,8 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
     quick, long = [], []
     for system in suite.systems or tuple(SYSTEMS.classes()):
         for planned, (entry, cls) in product(_planned_games(suite, system), chosen):
+            if not applies(cls, planned.game):
+                continue
             if cls.needs_training or cls.trains_on_record:
                 if not planned.untrained_only:
                     long += _learning(suite, entry, cls, planned.game, folder)

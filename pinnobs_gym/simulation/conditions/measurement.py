@@ -47,7 +47,9 @@ class SampleTime(Condition):
         return f"time between samples × {self.factor:g}"
 
     def setup(self, system: System, setup: Setup) -> Setup:
-        return replace(setup, dt=self.factor * setup.dt)
+        changed = replace(setup, dt=self.factor * setup.dt)
+        system.check_times(changed)
+        return changed
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,11 @@ class _Lateness(Unknowns):
         self, system: System, t: np.ndarray, x: np.ndarray, u: np.ndarray
     ) -> np.ndarray:
         """Return −dh/dt along the trajectory: the central difference along its tangent, whose error
-        is of second order in a step of a thousandth of the delay."""
+        is of second order in a step of a thousandth of the delay. Of a map, it is the change of
+        the output in a step."""
+        if system.discrete:
+            after = system.h(t + 1, system.f(t, x, u), np.asarray(system.input(t + 1)))
+            return (system.h(t, x, u) - after)[..., None]
         step, rate = 1e-3 * self.std[0], system.f(t, x, u)
         earlier, later = (
             system.h(t + s, x + s * rate, np.asarray(system.input(t + s))) for s in (-step, step)

@@ -19,7 +19,7 @@ class Mismatch(Condition):
     sign per parameter and episode.
 
     `System.uncertain` selects the parameters. If there are none, the rates of change are changed
-    instead: ẋᵢ = (1 ± fraction)·fᵢ.
+    instead: ẋᵢ = (1 ± fraction)·fᵢ or, of a map, xᵢ⁺ − xᵢ = (1 ± fraction)·(fᵢ − xᵢ).
     """
 
     part: float
@@ -63,7 +63,8 @@ class _RelativeDeviations(Unknowns):
 
 @dataclass(frozen=True)
 class OtherRates(System):
-    """A plant with the rate of change of each state multiplied by a factor."""
+    """A plant with the rate of change of each state multiplied by a factor, or that of a map its
+    change in a step."""
 
     plant: System
     """The original plant."""
@@ -95,8 +96,26 @@ class OtherRates(System):
         """Longest Runge-Kutta step of the original plant in s."""
         return longest_step(self.plant)
 
+    @property
+    def discrete(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the original plant is a map."""
+        return self.plant.discrete
+
+    @property
+    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the original plant is stiff."""
+        return self.plant.stiff
+
     def f(self, t: Array, x: Array, u: Array) -> Array:
-        return self.factors * self.plant.f(t, x, u)
+        rate = self.plant.f(t, x, u)
+        return x + self.factors * (rate - x) if self.discrete else self.factors * rate
+
+    def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
+        A = self.plant.f_jacobian(t, x, u)
+        if not self.discrete:
+            return self.factors[..., None] * A
+        unit = np.eye(x.shape[-1])
+        return unit + self.factors[..., None] * (A - unit)
 
     def h(self, t: Array, x: Array, u: Array) -> Array:
         return self.plant.h(t, x, u)

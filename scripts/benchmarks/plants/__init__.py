@@ -12,4 +12,4 @@ from benchmarks import Figure
 def figures(repeats: int) -> Iterator[Figure]:
     """Measure what the estimators reach on the plants of each module; seeds are fixed."""
     for module in sorted(each.name for each in pkgutil.iter_modules(__path__)):
-        yield from importlib.import_module(f"{__name__}.{module}").figures()
+        yield from importlib.import_module(f"{__name__}.{module}").figures(repeats)

@@ -29,7 +29,7 @@ FIELD = (0.112, 15.64, -40.94)
 """The earth's magnetic field at the place of the log, in µT."""
 
 
-def figures() -> Iterator[Figure]:
+def figures(repeats: int) -> Iterator[Figure]:
     """Measure what estimators reach on the logs."""
     if LOGS.exists():
         yield from attitude()

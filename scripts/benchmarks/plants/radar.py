@@ -95,7 +95,7 @@ def tracks(estimator: str, runs: int = RUNS) -> np.ndarray:
     return error[:, record.num_samples // 2 :]
 
 
-def figures() -> Iterator[Figure]:
+def figures(repeats: int) -> Iterator[Figure]:
     """Tracks lost, and the error of the position: the root mean square over the second half of a
     track, its median over the tracks."""
     for name in ("ekf", "ukf", "enkf", "mhe"):
