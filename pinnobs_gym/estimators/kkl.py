@@ -16,6 +16,7 @@ from pinnobs_gym.estimation.learned.kkl_maps import Activation
 from pinnobs_gym.estimation.learned.perceptron import Layers, perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
+from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Array, System
@@ -131,7 +132,7 @@ class KKL(LearnedEstimator, Estimator):
 
     knows = ("model", "noise", "initial set", "simulated true states")
     exempt_from = {"model_alone": "its estimate is a function of z, which knows no prior"}
-    takes = frozenset({"own_flow", "process_noise", "full_noise", "sampled_noise", "state_period"})
+    takes = EVERYTHING - {"maps", "stiff", "output_period", "held_input"}
     equations = r"""
 \dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
 \hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial t} + \tfrac{\partial T}{\partial x}\,

@@ -51,7 +51,7 @@ class Luenberger(RecursiveEstimator):
     """Decay rate of errors in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "luenberger"
-    takes = EVERYTHING - {"maps", "bounds"}  # its gain is that of a rate of change
+    takes = EVERYTHING - {"maps"}  # its gain is that of a rate of change
     equations = r"""
 \hat x_k &= \hat x_k^- + K\, (y_k - h(t_k, \hat x_k^-, u_k)) \\
 K &= \Delta t\, L\, (I + \Delta t\, H L)^{-1}, \qquad

@@ -89,8 +89,8 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         start = mean if box is None else nearest(mean, P0, box)
         stochastic, R = self.noise.told.stochastic, self.noise.R(0.0)
         roots, rows, wide = prior_root(self.system, prior, R), np.arange(0), None
-        # Noise that differs between rows is that of all rows, not of some.
-        by_row = self.noise.samples is not None or R.shape[-1] > 1
+        # A noise of one's own that differs between rows is that of all rows, not of some.
+        by_row = self.noise.samples is None and R.shape[-1] > 1
         if stochastic or (roots is not None and by_row):
             roots = root(P0.transpose(1, 2, 0)).transpose(2, 0, 1)
             window = MovingWindow(mean, roots, start[None], exact=not stochastic)
@@ -121,6 +121,8 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         """Return the state after a sample, in the rows of whose windows all states are unknown."""
         system, noise, window = self.system, self.noise, memory.whole
         assert window is not None
+        if memory.exact is not None:
+            noise = noise.rows(memory.rows)
         window = window.extended(system, t, y, u)
         if len(window.t) > self.window:
             window = window.shortened(system, noise)

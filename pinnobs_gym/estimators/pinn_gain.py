@@ -73,7 +73,7 @@ class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
     """The trained network."""
 
     name = "pinn_gain"
-    takes = EVERYTHING - {"bounds"}
+    takes = EVERYTHING
     equations = r"""
 K &= P_k^- H^\top S^{-1}, \qquad s_j = \bigl( (H P_k^- H^\top)_{jj} / S_{jj} \bigr)^{3/4} \\
 K'_{ij} &= K_{ij}\, 8^{\tanh(a_{ij} s_j)}

@@ -236,7 +236,7 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     exempt_from = {
         **OfflineEstimator.exempt_from,
         **dict.fromkeys(
-            ("shapes", "rows_independent", "purity", "save_load"),
+            ("shapes", "rows_independent", "purity", "save_load", "periods"),
             "it takes no record but that of its training",
         ),
     }

@@ -20,6 +20,7 @@ from pinnobs_gym.estimation.linear_window import linear_window, smoothed, whiten
 from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.smoother import backward, forward
 from pinnobs_gym.estimation.square_root import carried, prior_root
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 
 
@@ -55,31 +56,31 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
         R = self.noise.R(0.0)
         roots = prior_root(self.system, record.prior, R)
         rows = np.arange(0) if roots is None else carried(roots)
-        # Noise that differs between rows is that of all rows, not of some.
-        by_row = self.noise.samples is not None or R.shape[-1] > 1
+        # A noise of one's own that differs between rows is that of all rows, not of some.
+        by_row = self.noise.samples is None and R.shape[-1] > 1
         if not self.noise.stochastic or (len(rows) and by_row):
             rows = np.arange(record.batch)
         with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             if len(rows) == record.batch:
-                return self._by_roots(record)
+                return self._by_roots(record, self.noise)
             path = backward(forward(self.system, record, self.noise))
             xhat, P = path.xhat.swapaxes(0, 1), path.P.transpose(3, 0, 1, 2)
             if len(rows):
-                wide = self._by_roots(record.rows(rows))
+                wide = self._by_roots(record.rows(rows), self.noise.rows(rows))
                 xhat, P = xhat.copy(), P.copy()
                 xhat[rows], P[rows] = wide.xhat, wide.P
         return Estimates(xhat, P)
 
-    def _by_roots(self, record: Record) -> Estimates:
+    def _by_roots(self, record: Record, noise: Noise) -> Estimates:
         """Return the estimates, computed by roots in all rows."""
         t, y, u = record.t, record.y.swapaxes(0, 1), record.u.swapaxes(0, 1)
         system = self.system
         roots = root(record.prior.cov.transpose(1, 2, 0)).transpose(2, 0, 1)
-        before, after = self._filtered(record, roots)
-        window = linear_window(self.system, self.noise, t.tolist(), list(y), list(u), after)
+        before, after = self._filtered(record, roots, noise)
+        window = linear_window(self.system, noise, t.tolist(), list(y), list(u), after)
         # The filter linearises h about its predictions, not its estimates.
         for k in range(len(t)):
-            e, H = whitened(self.system, self.noise, (float(t[k]), y[k], u[k]), before[k])
+            e, H = whitened(self.system, noise, (float(t[k]), y[k], u[k]), before[k])
             moved = (system.state_residual(after[k], before[k])[:, None] @ H.swapaxes(1, 2))[:, 0]
             window.e[k], window.H[k] = e - moved, H
         first = system.state_residual(record.prior.mean, window.r[0])
@@ -87,10 +88,12 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
         P = states.root @ states.root.swapaxes(-1, -2)
         return Estimates(states.x.swapaxes(0, 1), P.swapaxes(0, 1))
 
-    def _filtered(self, record: Record, roots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _filtered(
+        self, record: Record, roots: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the predictions and the estimates (num_samples, batch, nx) of the extended Kalman
         filter, by roots of the covariances, given those of the prior (batch, nx, nx)."""
-        system, noise, box = self.system, self.noise, self.system.state_box
+        system, box = self.system, self.system.state_box
         state, before, after = State(record.prior.mean, P=record.prior.cov, root=roots), [], []
         for k, t in enumerate(record.t):
             y, u = record.y[:, k], record.u[:, k]

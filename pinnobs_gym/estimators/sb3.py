@@ -130,7 +130,7 @@ class Sb3(LearnedEstimator, Estimator):
     """The trained agent."""
 
     name = "sb3"
-    takes = EVERYTHING - {"bounds", "sampled_noise"}
+    takes = EVERYTHING - {"sampled_noise"}
     equations = r"""
 \hat x_k &= \hat x_k^- + \sigma(k) \odot \rho_k\, \bigl( e_k \oslash \sqrt{S(k)} \bigr), \qquad
 e_k = y_k - h(t_k, \hat x_k^-, u_k) \\

@@ -44,7 +44,7 @@ class SlidingMode(RecursiveEstimator):
 
     name = "sliding_mode"
     knows = ("model", "prior", "noise", "initial set")
-    takes = EVERYTHING - {"maps", "bounds"}  # its gain is that of a rate of change
+    takes = EVERYTHING - {"maps"}  # its gain is that of a rate of change
     equations = r"""
 e &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
 s_j = 1 + \frac{\rho_j}{\varepsilon_j} \min\Bigl( 1, \frac{\varepsilon_j}{|e_j|} \Bigr) \\

@@ -298,7 +298,7 @@ def test_a_prior_mean_without_derivative_is_warned_of() -> None:
         (CoupledRows, "rows_independent", "f: a row of a batch and alone differ"),
         (WrongInvariant, "invariants", "invariants .* 'benchmark' differ by"),
         (WrongTwin, "indistinguishable", "outputs of indistinguishable states"),
-        (EmptySet, "initial_states", "0 of .* states of the box are admissible"),
+        (EmptySet, "initial_states", "0 of .* states of the setup's law are admissible"),
         (Explosive, "initial_states", "leaves the finite numbers"),
         (NoScale, "attributes", r"scale=\(1.0, 0.0\); expected positive"),
         (NotDecorated, "attributes", "expected @dataclass"),

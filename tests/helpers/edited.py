@@ -56,7 +56,7 @@ EDITS = {
     "f": ("plant.py", "RATE = 0.3", "RATE = 0.4"),
     "h": ("plant.py", "return x[..., :1]", "return 2 * x[..., :1]"),
     "the scale": ("plant.py", "scale = (1.0, 1.0)", "scale = (1.0, 2.0)"),
-    "the setup": ("plant.py", "2.0, 0.1, 0.05", "2.0, 0.1, 0.06"),
+    "the setup": ("plant.py", "noise_std=0.05", "noise_std=0.06"),
 }
 """What is edited: the file, what stood there and what stands there then."""
 

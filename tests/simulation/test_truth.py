@@ -488,7 +488,7 @@ def test_a_truth_disturbed_by_nothing_is_the_truth(condition):
     source = EpisodeSource("InductionMotor", condition=condition)
     rngs = [np.random.default_rng(seed) for seed in range(3)]
     plant = source.condition.plant(source.system, rngs)
-    x0 = np.random.default_rng(0).uniform(source.x0_low, source.x0_high, (3, 5))
+    x0 = np.random.default_rng(0).uniform(*source.start.corners, (3, 5))
     expected = truth(plant, x0, source.times, source.setup.truth_step)
     noise = source.system.noise(process_noise=1.0)
     draws = np.zeros((len(source.times) - 1, 2, 2, 3, 5))

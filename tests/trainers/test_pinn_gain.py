@@ -308,7 +308,7 @@ def test_training_sees_a_record_alone(monkeypatch):
     game = Game.of("ReverseDuffing")
     record = game.record(range(TRAINING_SEED, TRAINING_SEED + 10))
     assert record.batch == 10
-    assert [f.name for f in fields(record)] == ["t", "y", "u", "prior"]
+    assert [f.name for f in fields(record)] == ["t", "y", "u", "prior", "noise_std"]
     record = Record(record.t[:50], record.y[:, :50], record.u[:, :50], record.prior)
 
     def refuse(*args, **kwargs):

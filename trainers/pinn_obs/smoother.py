@@ -34,7 +34,7 @@ def smooth(system: System, record: Record, noise: np.ndarray, caution: float) ->
     """
     narrowed = _WIDE * _NARROWING ** np.arange(2 * _PASSES)
     drifts = (*[DRIFT] * (1 + _PASSES), *np.maximum(narrowed, DRIFT))
-    noises = {drift: _noise(system, record, noise, drift) for drift in drifts}
+    noises = {drift: law_of(system, record, noise, drift) for drift in drifts}
     passes = [noises[drift] for drift in drifts]
     return smoother.iterated(system, record, passes, caution=caution, settled=_SETTLED)
 
@@ -58,10 +58,10 @@ def forward(
         drift: standard deviation of the process noise per sample, over the scale.
         caution: fraction of HPHᵀ that is added to the covariance of the output noise.
     """
-    return smoother.forward(system, record, _noise(system, record, noise, drift), about, caution)
+    return smoother.forward(system, record, law_of(system, record, noise, drift), about, caution)
 
 
-def _noise(system: System, record: Record, std: np.ndarray, drift: float) -> Noise:
+def law_of(system: System, record: Record, std: np.ndarray, drift: float) -> Noise:
     """Return the noise with these standard deviations of outputs, and with a drift from one sample
     to the next, on average."""
     step = (record.t[-1] - record.t[0]) / max(1, record.num_samples - 1)
