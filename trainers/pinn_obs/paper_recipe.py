@@ -28,7 +28,8 @@ class PaperRecipe(Recipe):
     ) -> None:
         self.config, self.system, self.record = config, system, record
         sizes = (system.nx, system.ny, config.depth, config.width)
-        self.architecture = Architecture(*sizes, config.activation, config.dtype)
+        start = float(record.t[0])
+        self.architecture = Architecture(*sizes, config.activation, config.dtype, start=start)
         # A random split of the samples into training and validation.
         order = np.random.default_rng(config.seed).permutation(record.num_samples)
         count = max(1, round(config.train_fraction * len(order)))
