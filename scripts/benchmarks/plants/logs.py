@@ -194,9 +194,10 @@ class Car(System):
         return stack(x, x[..., 0], x[..., 1], x[..., 3])
 
 
-def car_run(name: str) -> tuple[np.ndarray, Estimates]:
-    """Return the sample times of the log, and the estimates of an estimator."""
+def car_run(name: str, until: float = np.inf) -> tuple[np.ndarray, Estimates]:
+    """Return the sample times of the log up to a time (s), and the estimates of an estimator."""
     log = columns("car/log.csv")
+    log = {column: values[log["t"] <= until] for column, values in log.items()}
     y = np.stack([log[n] for n in Car.output_names], axis=-1)
     u = np.stack([log[n] for n in Car.input_names], axis=-1)
     setup = Car.setups["benchmark"]
@@ -211,14 +212,19 @@ def car_run(name: str) -> tuple[np.ndarray, Estimates]:
     return log["t"], made.run(record)
 
 
+def off_fixes(t: np.ndarray, found: Estimates) -> np.ndarray:
+    """Return the errors (m) of estimates at times t (s), at the fixes that were held out."""
+    fixes = columns("car/held_out_fixes.csv")
+    within = fixes["t"] <= t[-1]
+    at = [np.interp(fixes["t"][within], t, found.xhat[0, :, i]) for i in range(2)]
+    return np.hypot(at[0] - fixes["px"][within], at[1] - fixes["py"][within])
+
+
 def car() -> Iterator[Figure]:
     """The error of the position at the fixes that were held out: its root mean square."""
-    fixes = columns("car/held_out_fixes.csv")
     for name, asked in (("ekf", 3.4), ("rts_smoother", 2.1), ("enkf", None)):
         t, found = car_run(name)
-        at = [np.interp(fixes["t"], t, found.xhat[0, :, i]) for i in range(2)]
-        error = np.hypot(at[0] - fixes["px"], at[1] - fixes["py"])
-        rms = float(np.sqrt(np.mean(error**2)))
+        rms = float(np.sqrt(np.mean(off_fixes(t, found) ** 2)))
         what = f"car, {name}: position at held-out fixes"
         yield Figure(what, rms, "m", "", None) if asked is None else at_most(what, rms, "m", asked)
         if name == "enkf":
