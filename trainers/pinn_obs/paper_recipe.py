@@ -21,7 +21,12 @@ from trainers.pinn_obs.recipe import Recipe
 
 
 class PaperRecipe(Recipe):
-    """Adam on all training samples at once, with the config's weights of the loss terms."""
+    """Adam on all training samples at once, with the config's weights of the loss terms.
+
+    The network's input is the time in s as in the paper, whose records begin at zero, but counted
+    from the record's first sample. At the time 1000 s all neurons of the first layer would be
+    saturated, and training would find nothing but a constant.
+    """
 
     def __init__(
         self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray

@@ -34,7 +34,13 @@ class Spring(System):
     scale = (1.0, 2.0)
     setups = {
         "benchmark": Setup(
-            (-1, -1), (1, 1), 3.0, 0.1, noise_std=0.1, xhat0=(0.5, 0.0), P0=independent(1.0, 2.0)
+            (-1, -1),
+            (1, 1),
+            duration=3.0,
+            dt=0.1,
+            noise_std=0.1,
+            xhat0=(0.5, 0.0),
+            P0=independent(1.0, 2.0),
         )
     }
 
