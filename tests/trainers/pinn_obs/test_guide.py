@@ -60,16 +60,24 @@ def irregular_record(system, samples=25, seed=0):
     return Record(t, y, u, Prior.of(system, system.setups["benchmark"], 1))
 
 
+def drift_of(system, record):
+    """Process noise of `DRIFT` of the scale from one sample to the next, on average."""
+    step = (record.t[-1] - record.t[0]) / (record.num_samples - 1)
+    return system.noise(1.0, DRIFT * np.asarray(system.scale) / np.sqrt(step))
+
+
 def weighted_squares(system, record, noise):
     """Residuals of all states in one vector, each over its standard deviation, as a function."""
-    n, scale = record.num_samples, np.asarray(system.scale)
+    n, drift = record.num_samples, drift_of(system, record)
     root = np.linalg.cholesky(np.linalg.inv(record.prior.cov[0])).T
 
     def residuals(flat):
         x = flat.reshape(n, -1)
-        ends = flows(system, record.t, x[:, None], record.u.swapaxes(0, 1))[0][:, 0]
+        ends, _, Q = flows(system, drift, record.t, x[:, None], record.u.swapaxes(0, 1))
+        roots = np.linalg.cholesky(np.linalg.inv(Q[..., 0])).swapaxes(1, 2)
         innovation = (record.y[0] - system.h(record.t, x, record.u[0])) / noise
-        parts = (root @ (x[0] - record.prior.mean[0]), (x[1:] - ends) / (DRIFT * scale))
+        defects = (roots @ (x[1:] - ends[:, 0])[..., None])[..., 0]
+        parts = (root @ (x[0] - record.prior.mean[0]), defects)
         return np.concatenate([p.ravel() for p in parts] + [innovation[~np.isnan(innovation)]])
 
     return residuals
@@ -103,7 +111,8 @@ def test_on_a_nonlinear_plant_nothing_near_is_more_likely():
     def cost(path):
         return float((residuals(path.ravel()) ** 2).sum())
 
-    ends = flows(system, record.t, x[:, None], record.u.swapaxes(0, 1))[0][:, 0]
+    drift = drift_of(system, record)
+    ends = flows(system, drift, record.t, x[:, None], record.u.swapaxes(0, 1))[0][:, 0]
     least = cost(x)
     assert least < cost(truth[:40])
     for _ in range(20):  # along what the model allows, where the cost is flattest
@@ -120,7 +129,7 @@ def test_all_flows_at_once_are_those_one_by_one():
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(1e-4, 2e-3, 6))
     x = rng.normal(size=(6, 2, 5)) * system.scale
-    ends, F = flows(system, t, x, np.zeros((6, 2, system.nu)))
+    ends, F, _ = flows(system, system.noise(), t, x, np.zeros((6, 2, system.nu)))
     for k in range(5):
         one, flow = model_step_jacobian(system, t[k], t[k + 1], x[k])
         np.testing.assert_allclose(ends[k], one, rtol=1e-4, atol=1e-6)  # other substeps
