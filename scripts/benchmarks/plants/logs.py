@@ -54,8 +54,8 @@ class Attitude(System):
     orientation: 0.53 m/s² and 0.75 µT in the log. Their errors last from sample to sample.
     White noise with the same effect is larger by √(1 + 2Σρ), where ρ are their autocorrelations up
     to the first below zero: 1.9 and 3.7 times, which is 1.0 m/s² and 2.8 µT. The likelihood of the
-    innovations would choose 0.4 m/s² and 0.9 µT, since it takes these errors for white. The process noise
-    stands for the noise of the gyroscope, half of 0.1 °/s per √Hz.
+    innovations would choose 0.4 m/s² and 0.9 µT, since it takes these errors for white. The process
+    noise stands for that of the gyroscope, half of 0.1 °/s per √Hz.
     """
 
     state_names = ("qw", "qx", "qy", "qz", "bx", "by", "bz")
@@ -161,7 +161,7 @@ class Car(System):
     """A car in the plane; gyroscope and accelerometer, each with a bias, are its inputs.
 
     The levels of noise were chosen by the likelihood of an EKF's innovations over the log, among
-    1,200 draws about three guesses, and rounded. The error of a satellite receiver drifts, and the
+    1,200 draws, and rounded. The error of a satellite receiver drifts, and the
     position here includes that drift, 0.8 m in a second: its log likelihood is -360, and -765 with
     white noise of 2 m in its place. The likelihood goes on rising with less white noise (-301 at
     0.1 m), so that 0.5 m is no maximum but a floor. The held-out fixes are of the same receiver and
