@@ -8,6 +8,7 @@ from types import ModuleType
 
 from docstring_parser import parse_from_object
 
+from pinnobs_gym.cli.told_section import jacobians, told
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
@@ -51,6 +52,9 @@ def page(cls: type[System], env_id: str) -> str:
         *_repeating(system, system.output_names, system.output_period),
         "\n## Motion of the Model\n",
         _motion(system, setup),
+        jacobians(system, setup),
+        "\n## What the Outputs Tell\n",
+        told(system, setup),
         "\n## Reward\n",
         "−mean(((x̂ − x)/scale)²) of the true state behind the observation that the action answers; "
         f"{NOT_FINITE_REWARD:g} for an action that is not finite.\n",
@@ -92,7 +96,8 @@ def _motion(system: System, setup: Setup) -> str:
     held = "held from the last sample on"
     joined = "joined by straight lines"
     between = held if system.input_hold == "previous" else joined
-    return f"{moves[0].upper()}{moves[1:]}; the inputs of a log are {between}.\n"
+    whose = "inputs, drawn anew in each episode," if system.draws_input else "inputs of a log"
+    return f"{moves[0].upper()}{moves[1:]}; the {whose} are {between}.\n"
 
 
 def _unit(cls: type[System], name: str) -> str:
@@ -110,7 +115,7 @@ def _repeating(system: System, names: Sequence[str], periods: Periods | None) ->
 
 
 def _setups(cls: type[System]) -> str:
-    lines = []
+    lines, time = [], "step" if cls.discrete else "√s"
     for name in cls.setups:
         system, setup = cls.configured(name)
         xhat0, P0 = (moments.tolist() for moments in prior_moments(system, setup))
@@ -121,7 +126,7 @@ def _setups(cls: type[System]) -> str:
         lines.append(
             f"- `{name}`: {start}; x̂₀ = {xhat0}, P₀ = {P0}; output "
             f"noise {noise}"
-            + (f"; process noise {process.tolist()} per √s" if process.any() else "")
+            + (f"; process noise {process.tolist()} per {time}" if process.any() else "")
             + (f"; {dict(setup.parameters)}" if setup.parameters else "")
         )
         if setup.poor_prior is not None:

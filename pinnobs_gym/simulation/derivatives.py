@@ -61,6 +61,19 @@ def traced_jacobian(system: System, name: str, t: Array, x: np.ndarray, u: Array
             return None
 
 
+def origin(system: System, name: str, t: Array, x: np.ndarray, u: Array) -> str:
+    """Return in a few words where the Jacobian of ``f`` or ``h`` comes from, given the arguments
+    of a call."""
+    if getattr(type(system), f"{name}_jacobian") is not getattr(System, f"{name}_jacobian"):
+        return "written by hand"
+    with np.errstate(all="ignore"):
+        try:
+            _traced(system, name, t, x, u)
+        except ValueError as error:
+            return f"found by finite differences, because it cannot be traced ({error})"
+    return "derived from its equations"
+
+
 def central_differences(
     function: Callable[[np.ndarray], Any],
     x: np.ndarray,

@@ -21,14 +21,20 @@ from trainers.pinn_obs.recipe import Recipe
 
 
 class PaperRecipe(Recipe):
-    """Adam on all training samples at once, with the config's weights of the loss terms."""
+    """Adam on all training samples at once, with the config's weights of the loss terms.
+
+    The network's input is the time in s as in the paper, whose records begin at zero, but counted
+    from the record's first sample. At the time 1000 s all neurons of the first layer would be
+    saturated, and training would find nothing but a constant.
+    """
 
     def __init__(
         self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
     ) -> None:
         self.config, self.system, self.record = config, system, record
         sizes = (system.nx, system.ny, config.depth, config.width)
-        self.architecture = Architecture(*sizes, config.activation, config.dtype)
+        start = float(record.t[0])
+        self.architecture = Architecture(*sizes, config.activation, config.dtype, start=start)
         # A random split of the samples into training and validation.
         order = np.random.default_rng(config.seed).permutation(record.num_samples)
         count = max(1, round(config.train_fraction * len(order)))

@@ -92,8 +92,9 @@ def unflattened(architecture: Architecture, theta: np.ndarray) -> Layers:
 def inputs_of(architecture: Architecture, t: np.ndarray) -> np.ndarray:
     """Return the inputs of the first layer at times t (num_points,) in s, and then their time
     derivatives; shape (num_features, 2 · num_points)."""
-    value, rate = architecture.features(t.astype(architecture.dtype))
-    return np.concatenate([value.T, rate.T], axis=1)
+    # In double precision: late times of a log are differences of large numbers.
+    value, rate = architecture.features(t.astype(float))
+    return np.concatenate([value.T, rate.T], axis=1).astype(architecture.dtype)
 
 
 def _layers(architecture: Architecture, theta: Array) -> list[Array]:

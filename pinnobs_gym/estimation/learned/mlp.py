@@ -36,8 +36,11 @@ class Architecture:
     dtype: Precision = "float32"
     """Precision of the weights and of everything computed with them."""
     span: tuple[float, float] | None = None
-    """First and last time in s, which are scaled to −1 and 1; if None, the input is the time in s,
-    as in the paper."""
+    """First and last time in s, which are scaled to −1 and 1; if None, the input is the time in s
+    since ``start``, as in the paper."""
+    start: float = 0.0
+    """Time in s from which the input counts without a ``span``: the first of the record, so that
+    activations do not saturate on a record that begins late."""
     decays: tuple[float, ...] = ()
     """Time constants τ in s of additional inputs exp(−(t − t₀)/τ), with t₀ the first time of the
     span."""
@@ -78,7 +81,7 @@ class Architecture:
         (..., num_features) each, as arrays of t's library."""
         xp = array_namespace(t)
         if self.span is None:
-            return t[..., None], xp.ones_like(t)[..., None]
+            return (t - self.start)[..., None], xp.ones_like(t)[..., None]
         start, end = self.span
         since, rate = t - start, 2 / (end - start)
         values, rates = [rate * since - 1], [rate * xp.ones_like(t)]
@@ -98,7 +101,8 @@ def evaluate(
     """Return x̂ (..., nx) in state units and L (..., nx, ny) at times t (...) in s, in float64
     (Farkane et al., PINN-Obs, "Proposed Adaptive PINN-Based Model").
 
-    As in the paper, the network's input is the time in s, unless the architecture has a ``span``.
+    As in the paper, the network's input is the time in s since the record's first sample, unless
+    the architecture has a ``span``.
     """
     features, _ = architecture.features(np.asarray(t, dtype=float))
     out = perceptron(layers, architecture.activation, features)

@@ -631,3 +631,19 @@ def test_times_that_single_precision_cannot_tell_apart_are_refused():
     late = Record(record.t + 1.7e9, record.y, record.u, record.prior)
     with pytest.raises(ValueError, match="are the same in float32; subtract the first"):
         train_pinn_obs(system, SMALL, record=late)
+
+
+def test_a_record_that_begins_late_is_trained_on_as_one_from_zero():
+    """With times that are exact in binary, the inputs of the network are the same to the last bit,
+    and so is what an autonomous plant's training finds."""
+    system, record = duffing(dt=0.125)
+    late = replace(record, t=record.t + 1024.0)
+    config = replace(SMALL, iterations=5)
+    first, second = (train_pinn_obs(system, config, record=each) for each in (record, late))
+    inputs = [
+        inputs_of(found.architecture, each.t) for found, each in ((first, record), (second, late))
+    ]
+    assert (inputs[0] == inputs[1]).all()
+    assert (inputs[0][0, 0], inputs[0][0, -1]) == (0.0, 1.0)
+    assert same_weights(first, second)
+    assert (first.xhat(record.t) == second.xhat(late.t)).all()
