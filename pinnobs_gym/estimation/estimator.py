@@ -266,6 +266,7 @@ class OfflineEstimator(BaseEstimator):
         "irregular_times": "it may need equal steps",
         "diverging_row": "it may refuse a record that is not finite",
         "model_alone": "it may need outputs",
+        "blank_rows": "it may need an output at every row",
     }
 
 

@@ -44,6 +44,7 @@ class SlidingMode(RecursiveEstimator):
 
     name = "sliding_mode"
     knows = ("model", "prior", "noise", "initial set")
+    exempt_from = {"sampled_noise": "the noise changes the width of its layer, not its gain within"}
     takes = EVERYTHING - {"maps", "bounds"}  # its gain is that of a rate of change
     equations = r"""
 e &= y_k - h(t_k, \hat x_k^-, u_k), \qquad
