@@ -335,10 +335,12 @@ def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "periods")
 def _estimator_periods(estimator: BaseEstimator) -> None:
     """An output moved by whole periods changes no estimate, for a system that declares periods."""
-    system, record = estimator.system, short_record(estimator)
-    rng = np.random.default_rng(4)
+    system = estimator.system
+    if system.output_period is None:
+        return
+    record, rng = short_record(estimator), np.random.default_rng(4)
     run, scale = estimator.run(record), vector(system.scale, system.nx, "scale")
-    for i, period in enumerate(system.output_period or ()):
+    for i, period in enumerate(system.output_period):
         if period is None:
             continue
         moved = copied(record)

@@ -267,6 +267,8 @@ class OfflineEstimator(BaseEstimator):
         "diverging_row": "it may refuse a record that is not finite",
         "model_alone": "it may need outputs",
         "blank_rows": "it may need an output at every row",
+        "sampled_noise": "it may need every sample",
+        "held_input": "it may need outputs",
     }
 
 
