@@ -209,8 +209,9 @@ def _check_hold(estimator: BaseEstimator) -> None:
         changed = copied(record)
         changed.u[:, sample] += 1 + abs(record.u).max()
         off = abs(estimator.run(changed).xhat[:, k + 1] - first[:, k + 1]) / scale
+        t0, t1 = record.t[k : k + 2]
         ends = [
-            model_step(system, *record.t[k : k + 2], first[:, k], *np.moveaxis(u[:, k:], 1, 0))
+            model_step(system, t0, t1, first[:, k], u[:, k], u[:, k + 1])
             for u in (record.u, changed.u)
         ]
         moves = (abs(ends[1] - ends[0]) / scale).max() > SAME

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 from kinds import untrained
+from linear import Modulated
 
 from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator
@@ -61,6 +62,7 @@ def test_what_an_estimator_is_exempt_from_it_cannot_pass(estimator: str, check: 
 def check_on_all(estimator: str, check: str) -> None:
     for system in ON:
         ESTIMATOR_CHECKS[check](on(system, estimator))
+    ESTIMATOR_CHECKS[check](ESTIMATORS.resolve(estimator)(Modulated()))
 
 
 def on(system: str, estimator: str) -> BaseEstimator:
@@ -565,7 +567,7 @@ class HiddenConstant(EKF):
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         new = super().predict(state, t, u)
-        return replace(new, P=new.P + 1e-14 * np.eye(self.system.nx))
+        return replace(new, P=np.asarray(new.P) + 1e-14 * np.eye(self.system.nx))
 
 
 @dataclass(frozen=True)
