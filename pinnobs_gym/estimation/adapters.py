@@ -36,7 +36,10 @@ class PerEpisode(Estimator):
     title: str = field(default="per_episode", kw_only=True)
     """Name in tables."""
 
-    exempt_from = {"model_alone": "what it adapts may know neither the model nor the prior"}
+    exempt_from = {
+        "model_alone": "what it adapts may know neither the model nor the prior",
+        "units": "what it adapts may have settings in one unit",
+    }
 
     @property
     def label(self) -> str:

@@ -14,7 +14,9 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
+from pinnobs_gym.estimation.check_records import copied, short_record
 from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates, Estimator, State
+from pinnobs_gym.estimation.plant_checks import PLANT_CHECKS
 from pinnobs_gym.estimation.takes import EVERYTHING, FEATURES
 from pinnobs_gym.simulation.conformance import (
     Found,
@@ -27,7 +29,6 @@ from pinnobs_gym.simulation.conformance import (
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System, initial_states, output_scale, vector
-from pinnobs_gym.simulation.truth import truth
 
 ROUNDING = 1e-10
 """Largest difference, over scale, between two runs of the same estimator. Matrix products round
@@ -37,8 +38,6 @@ MODEL_STEP = 1e-6
 """Largest difference, over scale, between an estimator's own integration of the model and ours."""
 PERIODS = 1e-9
 """Largest difference, over scale, between estimates from outputs that differ by whole periods."""
-NUM_SAMPLES = 40
-"""Number of samples of the records on which estimators are checked."""
 
 ESTIMATOR_CHECKS: dict[str, Callable[[BaseEstimator], None]] = {}
 """The checks of an estimator, by name. Each raises `CheckFailed`, also for an estimator that is
@@ -82,28 +81,6 @@ def check_estimator(estimator: BaseEstimator) -> None:
         if name not in left_out or name == "exemptions"
     }
     run_all(held_to, estimator)
-
-
-def _record(estimator: BaseEstimator, batch: int = 3, *, irregular: bool = False) -> Record:
-    """Simulate a short record of the estimator's system, with the benchmark's initial states and
-    noise.
-
-    An env is not used, because it would register a system that is only being checked.
-    """
-    system = estimator.system
-    setup = system.setups["benchmark"]
-    rng = np.random.default_rng(2)
-    steps = np.full(NUM_SAMPLES - 1, float(setup.dt))
-    if irregular:
-        steps *= rng.uniform(0.3, 2.0, len(steps))
-        steps = np.maximum(np.round(steps), 1.0) if system.discrete else steps
-    t = np.append(0.0, np.cumsum(steps))
-    x = truth(system, initial_states(system, setup, batch), t).swapaxes(0, 1)
-    noise = system.noise(setup.noise_std, setup.process_noise)
-    u = np.broadcast_to(system.input(t), (batch, len(t), system.nu)).copy()
-    drawn = rng.standard_normal((len(t), batch, system.ny))
-    y = system.h(t, x, u) + noise.outputs(t, drawn).swapaxes(0, 1)
-    return Record(t, y, u, Prior.of(system, setup, batch))
 
 
 def _updates(estimator: Estimator, record: Record) -> Iterator[State]:
@@ -163,7 +140,7 @@ def _estimator_exemptions(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "shapes")
 def _estimator_shapes(estimator: BaseEstimator) -> None:
     """Estimates, covariances and innovations have their shapes and are finite."""
-    record = _record(estimator)
+    record = short_record(estimator)
     batch, n, nx, ny = record.batch, record.num_samples, estimator.system.nx, estimator.system.ny
     expected = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
     for k, state in enumerate(
@@ -200,7 +177,7 @@ def _check_values(
 @add_check(ESTIMATOR_CHECKS, "rows_independent")
 def _estimator_rows_independent(estimator: BaseEstimator) -> None:
     """A row of a batch gives the same estimates as that row alone."""
-    record = _record(estimator)
+    record = short_record(estimator)
     together = estimator.run(record)
     for i in range(record.batch):
         row = slice(i, i + 1)
@@ -219,8 +196,8 @@ def _rows(estimates: Estimates, rows: slice) -> Estimates:
 @add_check(ESTIMATOR_CHECKS, "purity")
 def _estimator_purity(estimator: BaseEstimator) -> None:
     """The same record gives the same estimates, and neither it nor earlier states are modified."""
-    record = _record(estimator)
-    before = _copy(record)
+    record = short_record(estimator)
+    before = copied(record)
     first = estimator.run(record)
     given = {"t": record.t, "y": record.y, "u": record.u, **vars(record.prior)}
     kept = {"t": before.t, "y": before.y, "u": before.u, **vars(before.prior)}
@@ -229,7 +206,7 @@ def _estimator_purity(estimator: BaseEstimator) -> None:
     again = estimator.run(record)
     _require_same(estimator, again, first, 0.0, "a second run and the first")
     if isinstance(estimator, Estimator):
-        states = [(state, state.xhat.copy()) for state in _updates(estimator, _copy(record))]
+        states = [(state, state.xhat.copy()) for state in _updates(estimator, copied(record))]
         for k, (state, xhat) in enumerate(states):
             same = np.array_equal(state.xhat, xhat, equal_nan=True)
             require(same, f"xhat of state {k} is modified by a later update; expected a new array")
@@ -249,18 +226,13 @@ def _check_arguments(estimator: Estimator, record: Record) -> None:
             require(same, f"update modifies its argument {name}")
 
 
-def _copy(record: Record) -> Record:
-    prior = Prior(record.prior.mean.copy(), record.prior.cov.copy())
-    return Record(record.t.copy(), record.y.copy(), record.u.copy(), prior, record.noise_std)
-
-
 @add_check(ESTIMATOR_CHECKS, "causality")
 def _estimator_causality(estimator: BaseEstimator) -> None:
     """A change of later outputs changes no earlier estimate."""
-    record = _record(estimator)
+    record = short_record(estimator)
     xhat = estimator.run(record).xhat
     for k in (1, record.num_samples // 2, record.num_samples - 1):
-        changed = _copy(record)
+        changed = copied(record)
         changed.y[:, k:] += 3 * abs(changed.y).max()
         same = estimator.run(changed).xhat[:, :k] == xhat[:, :k]
         if not same.all():
@@ -271,7 +243,7 @@ def _estimator_causality(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "missing_samples")
 def _estimator_missing_samples(estimator: BaseEstimator) -> None:
     """A NaN in y is a missing output and makes no estimate NaN, even if all outputs are missing."""
-    record = _record(estimator)
+    record = short_record(estimator)
     rng = np.random.default_rng(3)
     ny = estimator.system.ny
     cases = {
@@ -298,7 +270,7 @@ def _estimator_missing_samples(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "model_alone")
 def _estimator_model_alone(estimator: BaseEstimator) -> None:
     """Where all outputs are missing, the estimates are the model's from the prior's mean."""
-    system, record = estimator.system, _record(estimator)
+    system, record = estimator.system, short_record(estimator)
     # A benchmark's mean may be an equilibrium, at which every estimate stays.
     x = initial_states(system, system.setups["benchmark"], record.batch)
     prior = Prior(x, record.prior.cov)
@@ -320,7 +292,7 @@ def _estimator_bounds(estimator: BaseEstimator) -> None:
     box = estimator.system.state_box
     if box is None:
         return
-    record, size = _record(estimator), 10 * output_scale(estimator.system)
+    record, size = short_record(estimator), 10 * output_scale(estimator.system)
     for change in (0.0, size, -size):
         found = estimator.run(replace(record, y=record.y + change)).xhat
         outside = box.outside(found)
@@ -335,7 +307,7 @@ def _estimator_bounds(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "irregular_times")
 def _estimator_irregular_times(estimator: BaseEstimator) -> None:
     """Estimates are finite for samples at irregular times."""
-    record = _record(estimator, irregular=True)
+    record = short_record(estimator, irregular=True)
     xhat = estimator.run(record).xhat
     require_shape(xhat, (record.batch, record.num_samples, estimator.system.nx), "xhat")
     require(np.isfinite(xhat).all(), "xhat is not finite on a record of irregular times")
@@ -347,7 +319,7 @@ def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
     if not isinstance(estimator, Estimator):
         raise Found(f"{type(estimator).__name__} has no update")
     for irregular in (False, True):
-        record = _record(estimator, irregular=irregular)
+        record = short_record(estimator, irregular=irregular)
         states = list(_updates(estimator, record))[1:]
         columns = {
             f.name: np.stack([getattr(state, f.name) for state in states], axis=1)
@@ -363,13 +335,15 @@ def _estimator_run_equals_updates(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "periods")
 def _estimator_periods(estimator: BaseEstimator) -> None:
     """An output moved by whole periods changes no estimate, for a system that declares periods."""
-    system, record = estimator.system, _record(estimator)
-    rng = np.random.default_rng(4)
+    system = estimator.system
+    if system.output_period is None:
+        return
+    record, rng = short_record(estimator), np.random.default_rng(4)
     run, scale = estimator.run(record), vector(system.scale, system.nx, "scale")
-    for i, period in enumerate(system.output_period or ()):
+    for i, period in enumerate(system.output_period):
         if period is None:
             continue
-        moved = _copy(record)
+        moved = copied(record)
         moved.y[..., i] += period * rng.integers(-2, 3, moved.y.shape[:2])
         found = estimator.run(moved)
         what = f"with {system.output_names[i]} moved by whole periods and without"
@@ -382,11 +356,11 @@ def _estimator_periods(estimator: BaseEstimator) -> None:
 @add_check(ESTIMATOR_CHECKS, "diverging_row")
 def _estimator_diverging_row(estimator: BaseEstimator) -> None:
     """A diverging row neither raises an error nor affects the other rows."""
-    record = _record(estimator)
+    record = short_record(estimator)
     others = np.array([0, 2])
     benign = estimator.run(record)
     for value in (1e300, -1e300):  # a record with infinite outputs is refused
-        diverging = _copy(record)
+        diverging = copied(record)
         diverging.y[1, 5:] = value
         estimates = estimator.run(diverging)
         for name in ("xhat", "P"):
@@ -413,7 +387,7 @@ def _estimator_save_load(estimator: BaseEstimator) -> None:
         f"{cls.__name__} has no {' and no '.join(lacking)}; expected save and load, {why}",
     )
     assert isinstance(estimator, Saved)
-    record = _record(estimator)
+    record = short_record(estimator)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "saved"
         estimator.save(path)
@@ -432,3 +406,6 @@ def _estimator_takes(estimator: BaseEstimator) -> None:
     )
     unknown = sorted(map(str, declared - EVERYTHING))
     require(not unknown, f"takes names {', '.join(unknown)}; known are {', '.join(FEATURES)}")
+
+
+ESTIMATOR_CHECKS.update(PLANT_CHECKS)

@@ -266,6 +266,9 @@ class OfflineEstimator(BaseEstimator):
         "irregular_times": "it may need equal steps",
         "diverging_row": "it may refuse a record that is not finite",
         "model_alone": "it may need outputs",
+        "blank_rows": "it may need an output at every row",
+        "sampled_noise": "it may need every sample",
+        "held_input": "it may need outputs",
     }
 
 

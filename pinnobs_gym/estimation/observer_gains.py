@@ -235,7 +235,9 @@ def lmi_gain(system: System, rate: float, grid: int = 5) -> np.ndarray:
     u = np.asarray(system.input(now))
     A = np.asarray(system.f_jacobian(now, x, u)) * scale / scale[:, None]
     H = np.asarray(system.h_jacobian(now, x, u)) * scale / output_scale(system)[:, None]
-    A, kept = np.unique(np.round(A, 12), axis=0, return_index=True)
+    size = max(abs(A).max(), np.finfo(float).tiny)
+    _, kept = np.unique(np.round(A / size, 12), axis=0, return_index=True)
+    A = A[kept]
     # One inequality per vertex of the polytope; the trace keeps P small.
     P, Y = cp.Variable((nx, nx), symmetric=True), cp.Variable((nx, system.ny))
     constraints: list[Any] = [P >> np.eye(nx)]

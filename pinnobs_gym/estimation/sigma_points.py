@@ -56,7 +56,10 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     a turn of that at x̂, so that their mean and deviations are those of numbers.
     """
 
-    exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
+    exempt_from = {
+        "model_alone": "its mean is that of points that the model has moved apart",
+        "blank_rows": "it draws its points anew at every row",
+    }
     equations = r"""
 \chi_i^- &= \varphi(\hat x_{k-1} + \sqrt{P_{k-1}}\, \xi_i), \qquad
 \hat x_k^- = \sum_i w_i \chi_i^- \\

@@ -68,7 +68,10 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """Seed of the random numbers."""
 
     name = "enkf"
-    exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
+    exempt_from = {
+        "model_alone": "its mean is that of points that the model has moved apart",
+        "blank_rows": "its random numbers are drawn row by row",
+    }
     equations = r"""
 x_k^{i-} &= \varphi(x_{k-1}^i, w_i) \quad
 \text{with } dx = f\, dt + L\, dw_i \text{ between the samples} \\

@@ -22,6 +22,19 @@ from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
+class HighGainMemory:
+    """What the limit of P follows from, shape (batch,) each. Sizes are sums of variances over
+    scale²."""
+
+    largest: np.ndarray
+    """Size beyond which P is not to grow by forgetting."""
+    size: np.ndarray
+    """Size of P after the last sample with an output."""
+    last: np.ndarray
+    """Time of that sample in s, or of the first one."""
+
+
+@dataclass(frozen=True)
 class HighGain(RecursiveEstimator, GaussianEstimator):
     """The high-gain observer with exponential forgetting (Bornard, Couenne & Celle 1989; Deza et
     al. 1992): x̂' = f(t, x̂, u) + S⁻¹HᵀR⁻¹(y − h(t, x̂, u)), Ṡ = −θS − AᵀS − SA + HᵀR⁻¹H.
@@ -29,8 +42,9 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     S⁻¹ = P is propagated as a covariance: it becomes ΦPΦᵀ·exp(θ·dt) between samples, and the update
     at a sample has Joseph's form. Forgetting of old outputs at the rate θ takes the place of
     process noise. Without a limit, P would grow without bound in directions that the outputs do not
-    determine. The factor exp(θ·dt) is therefore omitted where it would make P larger than
-    P₀ + diag(scale²), as measured by the sum of the variances over scale².
+    determine. From the last sample with an output on, the factor is therefore no larger than that
+    which makes the P of this sample as large as P₀ + diag(scale²), as measured by the sum of the
+    variances over scale². Samples without any output do not change what is forgotten.
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, the noise is the known
     one, and a benchmark episode lasts 20 time constants 1/θ.
@@ -44,9 +58,10 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     name = "high_gain"
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u), \qquad
-P_k^- = e^{\theta (t_k - t_{k-1})}\, \Phi P_{k-1} \Phi^\top + Q \\
-& \text{without the factor where } \textstyle\sum_i P_{ii} / \mathrm{scale}_i^2
-\text{ would exceed that of } P_0 + \operatorname{diag}(\mathrm{scale}^2) \\
+P_k^- = g\, \Phi P_{k-1} \Phi^\top + Q \\
+g &= \min\Bigl( e^{\theta (t_k - t_{k-1})}, \max\Bigl( 1,
+\frac{p(P_0 + \operatorname{diag}(\mathrm{scale}^2))}{p(P_{k-1})} \Bigr) \Bigr), \qquad
+p(P) = \textstyle\sum_i P_{ii} / \mathrm{scale}_i^2 \\
 K &= P_k^- H^\top (H P_k^- H^\top + R)^{-1} \\
 \hat x_k &= \hat x_k^- + K\, (y_k - h(t_k, \hat x_k^-, u_k)) \\
 P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
@@ -60,26 +75,36 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
-        largest = self._size(prior.cov.transpose(1, 2, 0)) + self.system.nx
+        size = self._size(prior.cov.transpose(1, 2, 0))
+        memory = HighGainMemory(size + self.system.nx, size, np.full(len(size), np.nan))
         L = prior_root(self.system, prior, self.noise.R(0.0))
-        return State(prior.mean, P=prior.cov, memory=largest, root=L)
+        return State(prior.mean, P=prior.cov, memory=memory, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        P, largest = covariances(state), state.memory
         assert state.t is not None
-        theta = default_rate(self.system) if self.theta is None else self.theta
-        grown = P * np.exp(theta * (t - state.t))
-        forgets = self._size(grown) < largest
-        P = np.where(forgets, grown, P)
+        growth = self._growth(state.memory, t) - self._growth(state.memory, state.t)
+        P = covariances(state) * np.exp(growth)
         if state.root is not None:
-            factor = np.where(forgets, np.exp(0.5 * theta * (t - state.t)), 1.0)
-            state = replace(state, root=state.root * factor[:, None, None])
+            state = replace(state, root=state.root * np.exp(growth / 2)[:, None, None])
         return predicted(self.system, state, P, self.noise, t, u)
+
+    def _growth(self, memory: HighGainMemory, t: float) -> np.ndarray:
+        """Return the logarithms (batch,) of the factors by which P has grown at time t (s) since
+        the last sample with an output."""
+        theta = default_rate(self.system) if self.theta is None else self.theta
+        with np.errstate(divide="ignore", invalid="ignore"):  # a size is 0 if all states are known
+            allowed = np.maximum(np.log(memory.largest / memory.size), 0.0)
+        return np.minimum(theta * (t - memory.last), allowed)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         P, R = covariances(state), self.noise.R(t, y)
         innovation, H = observe(self.system, t, state.xhat, y, u)
-        return corrected(state, (t, u), P, innovation, H, R)
+        new = corrected(state, (t, u), P, innovation, H, R)
+        memory: HighGainMemory = state.memory
+        seen = ~np.isnan(y).all(axis=1) | np.isnan(memory.last)
+        size = np.where(seen, self._size(covariances(new)), memory.size)
+        memory = replace(memory, size=size, last=np.where(seen, t, memory.last))
+        return replace(new, memory=memory)
 
     def _size(self, P: np.ndarray) -> np.ndarray:
         """Return the sum of the variances in P (nx, nx, batch) over scale², shape (batch,)."""

@@ -63,6 +63,7 @@ class MHE(Estimator, GaussianEstimator):
     """Gauss-Newton steps per sample; one is the real-time iteration of Diehl et al. 2005."""
 
     name = "mhe"
+    exempt_from = {"blank_rows": "its window is a number of rows, and each of them takes a step"}
     equations = r"""
 \text{process noise: } & x_{k-N+1}, \ldots, \hat x_k = \arg\min
 \| x_{k-N+1} - \bar x \|^2_{\bar P^{-1}}

@@ -91,7 +91,10 @@ class ParticleFilter(RecursiveEstimator):
     """Seed of the random numbers."""
 
     name = "particle"
-    exempt_from = {"model_alone": "its mean is that of points that the model has moved apart"}
+    exempt_from = {
+        "model_alone": "its mean is that of points that the model has moved apart",
+        "blank_rows": "its random numbers are drawn row by row",
+    }
     equations = r"""
 x_i &:= \varphi(x_i, w_i) \quad \text{with } dx = f\, dt + L\, dw_i \\
 w_i &:\propto w_i \exp\bigl( -\tfrac12 e_i^\top R^{-1} e_i \bigr), \qquad

@@ -73,6 +73,10 @@ class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
     """The trained network."""
 
     name = "pinn_gain"
+    exempt_from = {
+        "noise_matrix": "the variant gru sees the outputs' standard deviations alone",
+        "sampled_noise": "its network remembers the sizes of innovations, however uncertain",
+    }
     takes = EVERYTHING
     equations = r"""
 K &= P_k^- H^\top S^{-1}, \qquad s_j = \bigl( (H P_k^- H^\top)_{jj} / S_{jj} \bigr)^{3/4} \\
@@ -134,6 +138,7 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         seen = nearest(xhat, 0.0, self.system.state_period)
         x, e = np.ascontiguousarray(seen.T), np.ascontiguousarray(innovation.T)
         known_noise = np.broadcast_to(std, e.shape)
-        K, memory = recurrent_gain(self.trained.layers, scale, size, x, e, known_noise, memory)
+        K, new = recurrent_gain(self.trained.layers, scale, size, x, e, known_noise, memory)
+        memory = np.where(np.isnan(y).all(axis=1), memory, new)  # a row without outputs is no step
         xhat = xhat + mapped(K, innovation)
         return State(xhat, t, u, innovation=innovation, memory=(fixed, memory))

@@ -132,6 +132,10 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u) + L(t)\, (y - h(t, \hat x, u)), \qquad \hat x(t_0) = \hat x_0
 """
+    exempt_from = {
+        "blank_rows": "an output counts only between two rows that both have it",
+        "units": "its gain was learned in the units of its training",
+    }
     knows = ("model", "prior")
     needs_training = "pinn_obs"
     recipe = MappingProxyType({"preset": "transfer"})
@@ -216,7 +220,8 @@ class PinnObsReplay(LearnedEstimator, Estimator):
         x = np.repeat(self.trained.xhat(t)[:, None], u.shape[1], axis=1)
         H = np.asarray(self.system.h_jacobian(t[:, None], x, u))
         largest = abs(np.linalg.eigvals(H @ self.trained.gain(t)[:, None])).max(axis=(0, 2))
-        return np.clip(largest, 1e-9, MOST_STEPS * STEP / (end - start))
+        once = STEP / (end - start)  # the rate for which the interval is one step
+        return np.clip(largest, once, MOST_STEPS * once)
 
 
 @dataclass(frozen=True)
@@ -236,7 +241,7 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     exempt_from = {
         **OfflineEstimator.exempt_from,
         **dict.fromkeys(
-            ("shapes", "rows_independent", "purity", "save_load", "periods"),
+            ("shapes", "rows_independent", "purity", "save_load", "units", "noise_matrix"),
             "it takes no record but that of its training",
         ),
     }

@@ -139,7 +139,11 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
 """
     needs_training = "rl"
     knows = ("model", "prior", "noise", "initial set", "true states in training")
-    exempt_from = {"model_alone": "an agent's action may move the estimate at any time"}
+    exempt_from = {
+        "model_alone": "an agent's action may move the estimate at any time",
+        "blank_rows": "its agent acts once per row",
+        "units": "its agent sees numbers in the units of its training",
+    }
 
     @cached_property
     def _form(self) -> Form:

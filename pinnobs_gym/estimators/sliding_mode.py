@@ -44,6 +44,10 @@ class SlidingMode(RecursiveEstimator):
 
     name = "sliding_mode"
     knows = ("model", "prior", "noise", "initial set")
+    exempt_from = {
+        "noise_matrix": "its layer is as wide as each output's own noise",
+        "sampled_noise": "the noise changes the width of its layer, not its gain within",
+    }
     takes = EVERYTHING - {"maps"}  # its gain is that of a rate of change
     equations = r"""
 e &= y_k - h(t_k, \hat x_k^-, u_k), \qquad

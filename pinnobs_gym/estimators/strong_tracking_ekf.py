@@ -43,6 +43,9 @@ class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
     """Factor with which HPHᵀ is added to R."""
 
     name = "strong_tracking_ekf"
+    exempt_from = {
+        "sampled_noise": "an innovation ends the growth by the one before, however uncertain it is"
+    }
     equations = r"""
 Q_k &= Q + \frac{\gamma}{n_y} e_{k-1}^\top R^{-1} e_{k-1}
 \operatorname{diag}(\mathrm{scale}^2) \\

@@ -10,15 +10,23 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 from kinds import untrained
+from linear import Modulated
 
 from pinnobs_gym.estimation.adapters import PerEpisode
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator
-from pinnobs_gym.estimation.estimator import Estimates, Estimator, OfflineEstimator, State
+from pinnobs_gym.estimation.estimator import (
+    BaseEstimator,
+    Estimates,
+    Estimator,
+    OfflineEstimator,
+    State,
+)
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.simulation.checks import SYSTEM_CHECKS, check_system
 from pinnobs_gym.simulation.conformance import CheckFailed
+from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent, matrix, stack
 from pinnobs_gym.systems import SYSTEMS
@@ -37,13 +45,30 @@ def test_system_conforms(system: str, check: str) -> None:
 @pytest.mark.parametrize("system", ON)
 @pytest.mark.parametrize("estimator", untrained())
 def test_estimator_conforms(estimator: str, system: str, check: str) -> None:
-    plant = SYSTEMS.resolve(system)
-    made = ESTIMATORS.resolve(estimator).for_setup(plant(), plant.setups["benchmark"])
-    if check in made.exempt_from:  # which says why, and has to be so
-        with pytest.raises(CheckFailed):
-            ESTIMATOR_CHECKS[check](made)
-    else:
+    made = on(system, estimator)
+    if check not in made.exempt_from:
         ESTIMATOR_CHECKS[check](made)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "check"),
+    [(name, check) for name in untrained() for check in ESTIMATORS.resolve(name).exempt_from],
+)
+def test_what_an_estimator_is_exempt_from_it_cannot_pass(estimator: str, check: str) -> None:
+    with pytest.raises(CheckFailed, match=f"^{check}: "):
+        check_on_all(estimator, check)
+
+
+def check_on_all(estimator: str, check: str) -> None:
+    for system in ON:
+        ESTIMATOR_CHECKS[check](on(system, estimator))
+    ESTIMATOR_CHECKS[check](ESTIMATORS.resolve(estimator)(Modulated()))
+
+
+def on(system: str, estimator: str) -> BaseEstimator:
+    """An estimator of a system with its benchmark's noise."""
+    plant = SYSTEMS.resolve(system)
+    return ESTIMATORS.resolve(estimator).for_setup(plant(), plant.setups["benchmark"])
 
 
 @dataclass(frozen=True)
@@ -84,6 +109,25 @@ class QuickPendulum(Pendulum):
 
     def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
         return matrix(x, [[np.cos(x[..., 0]), 0.0]])
+
+
+@dataclass(frozen=True)
+class Pushed(QuickPendulum):
+    """The same with a force, and two outputs."""
+
+    output_names = ("y1", "y2")
+    input_names = ("force",)
+
+    def f(self, t: Any, x: Any, u: Any) -> Any:
+        angle, rate = x[..., 0], x[..., 1]
+        pull = -array_namespace(x).sin(angle) - self.damping * rate
+        return stack(x, rate, pull + u[..., 0])
+
+    def h(self, t: Any, x: Any, u: Any) -> Any:
+        return stack(x, array_namespace(x).sin(x[..., 0]), x[..., 1])
+
+    def h_jacobian(self, t: Any, x: Any, u: Any) -> Any:
+        return matrix(x, [[np.cos(x[..., 0]), 0.0], [0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -508,6 +552,61 @@ class TrainedUnsaved(EKF):
     needs_training = "pinn_gain"
 
 
+@dataclass(frozen=True)
+class CountsRows(EKF):
+    """Its covariance grows with each row."""
+
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        new = super().predict(state, t, u)
+        return replace(new, P=1.001 * np.asarray(new.P))
+
+
+@dataclass(frozen=True)
+class HiddenConstant(EKF):
+    """A little is added to variances, in one unit."""
+
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        new = super().predict(state, t, u)
+        return replace(new, P=np.asarray(new.P) + 1e-14 * np.eye(self.system.nx))
+
+
+@dataclass(frozen=True)
+class DiagonalNoise(EKF):
+    """It uses the standard deviations alone."""
+
+    def run(self, record: Record) -> Estimates:
+        std = np.sqrt(np.diag(self.noise.R(0.0)[..., 0]))
+        return EKF(self.system, std.tolist()).run(record)
+
+
+@dataclass(frozen=True)
+class CommonNoise(EKF):
+    """It takes the usual noise for that of each sample."""
+
+    def run(self, record: Record) -> Estimates:
+        level: Any = self.noise_std
+        if isinstance(level, SampledLevel):
+            level = np.median(level.std, axis=(0, 1)).tolist()
+        return EKF(self.system, level).run(replace(record, noise_std=None))
+
+
+@dataclass(frozen=True)
+class LaterInput(EKF):
+    """It holds the input of the second of two samples between them."""
+
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        return super().predict(replace(state, u=u), t, u)
+
+
+@dataclass(frozen=True)
+class AlwaysHolds(EKF):
+    """It holds inputs whatever the plant says."""
+
+    def predict(self, state: State, t: float, u: np.ndarray) -> State:
+        assert state.u is not None
+        return super().predict(state, t, state.u)
+
+
 class Mutable(EKF):
     pass
 
@@ -516,9 +615,27 @@ class Mutable(EKF):
 class Offline(OfflineEstimator):
     """A sound one: the first output as the estimate of all states."""
 
+    exempt_from: ClassVar = {
+        **OfflineEstimator.exempt_from,
+        "units": "it takes an output for a state",
+    }
+
     def run(self, record: Record) -> Estimates:
         nx = self.system.nx
         return Estimates(np.repeat(np.nan_to_num(record.y[..., :1]), nx, axis=-1))
+
+
+@dataclass(frozen=True)
+class TimeInSeconds(Offline):
+    """It settles within a second, whatever the plant."""
+
+    exempt_from: ClassVar = OfflineEstimator.exempt_from
+
+    def run(self, record: Record) -> Estimates:
+        scale = np.asarray(self.system.scale)
+        return Estimates(
+            scale * (1 - np.exp(-record.t))[:, None] + 0 * np.nan_to_num(record.y[..., :1])
+        )
 
 
 @dataclass(frozen=True)
@@ -617,6 +734,32 @@ def test_broken_estimator_fails(make: Callable[[System], Estimator], check: str,
     assert "\n" not in str(failure.value)
     with pytest.raises(CheckFailed, match=rf"(?m)^{check}: "):
         check_estimator(estimator)
+
+
+@pytest.mark.parametrize(
+    ("make", "check", "says"),
+    [
+        (CountsRows, "blank_rows", "estimates with 3 rows without outputs between any two samp"),
+        (HiddenConstant, "units", "estimates in units that make states 9e-10, outputs 1e\\+09 and"),
+        (TimeInSeconds, "units", "estimates in units that make states 1e\\+09, outputs 9e-10 and"),
+        (DiagonalNoise, "noise_matrix", "estimates are the same for output noise with a correla"),
+        (CommonNoise, "sampled_noise", "estimates with y1 at sample 5 told to have 1e\\+06 times"),
+        (LaterInput, "held_input", "depends on the input at the second of the two samples, by"),
+        (AlwaysHolds, "held_input", "does not depend on the input at the second of the two sam"),
+    ],
+)
+def test_what_takes_a_plant_for_another_is_found(
+    make: Callable[[System], BaseEstimator], check: str, says: str
+) -> None:
+    estimator = make(Pushed())
+    with pytest.raises(CheckFailed, match=f"^{check}: .*{says}") as failure:
+        check_estimator(estimator)
+    assert "\n" not in str(failure.value)  # no other check fails
+
+
+@pytest.mark.parametrize("name", untrained())
+def test_estimators_of_a_plant_with_an_input_and_two_outputs_conform(name: str) -> None:
+    check_estimator(ESTIMATORS.resolve(name)(Pushed()))
 
 
 def test_a_check_by_name_knows_of_no_exemption() -> None:

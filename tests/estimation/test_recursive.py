@@ -1,6 +1,7 @@
 """An estimator in two steps."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ L = np.array([[0.4, 0.1], [-0.2, 0.3]])
 @dataclass(frozen=True)
 class ConstantGain(RecursiveEstimator):
     """x̂ = x̂⁻ + L(y − h), of which a missing output is left out."""
+
+    exempt_from: ClassVar = {"units": "its gain is in one unit"}
 
     def reset(self, prior):
         return State(prior.mean)

@@ -113,9 +113,7 @@ def test_the_replay_of_pinn_obs_interpolates_angles_the_shorter_way():
 
 
 def test_a_kkl_observer_of_an_angle_is_refused():
-    with pytest.raises(
-        ValueError, match="KKLSupervised does not take Compass: it takes no out"
-    ):
+    with pytest.raises(ValueError, match="KKLSupervised does not take Compass: it takes no out"):
         KKLSupervised(Compass(), trained=None)  # pyright: ignore[reportArgumentType]
 
 

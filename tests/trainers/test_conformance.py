@@ -50,7 +50,14 @@ def test_it_passes_every_check_that_it_is_held_to(name):
 
 @pytest.mark.parametrize(
     ("name", "check"),
-    [(name, check) for name in trained() for check in ESTIMATORS.resolve(name).exempt_from],
+    [
+        (name, check)
+        for name in trained()
+        for check in ESTIMATORS.resolve(name).exempt_from
+        # ReverseDuffing has one output and no input. The exemptions of pinn_gain are those of other
+        # weights and of another variant, see its own tests.
+        if check not in ("noise_matrix", "held_input") and name != "pinn_gain"
+    ],
 )
 def test_what_it_is_exempt_from_it_cannot_pass(name, check):
     with pytest.raises(CheckFailed, match=f"^{check}: "):

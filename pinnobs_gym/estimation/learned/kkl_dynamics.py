@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -75,6 +76,9 @@ class Dynamics:
         Raises:
             ValueError: in one line, in discrete time, if I + hA is not Schur.
         """
+        # Intervals that differ by the rounding of times share a step in the cache. To round to ten
+        # significant digits at least leaves short intervals what they are.
+        h = round(h, max(12, 10 - math.floor(math.log10(h))))
         return _step(self.A.tobytes(), self.B.tobytes(), self.size, self.mode, h)
 
     def filtered(self, t: np.ndarray, y: np.ndarray, z0: np.ndarray | float = 0.0) -> np.ndarray:
@@ -82,7 +86,7 @@ class Dynamics:
         (num_samples, batch, ny); shape (num_samples, batch, nz)."""
         z = np.empty((*y.shape[:2], self.size))
         z[0] = z0
-        for k, h in enumerate(np.round(np.diff(t), 12)):  # equal intervals share a cached step
+        for k, h in enumerate(np.diff(t)):
             flow, before, after = self.step(float(h))
             z[k + 1] = z[k] @ flow.T + y[k] @ before.T + y[k + 1] @ after.T
         return z
