@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.estimation.projection import kept_inside
-from pinnobs_gym.simulation.noise import Noise, SampledLevel
+from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.simulation.record import Record
 
 
@@ -31,20 +31,12 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
     def checked(self: Any, record: Record) -> Any:
         record.check_fits(self.system)
         if record.noise_std is not None and not isinstance(self.noise_std, SampledLevel):
-            told = self.system.noise(self.noise_std, self.process_noise)
-            level = SampledLevel(record.t, _filled(told, record.t, record.noise_std))
+            level = SampledLevel(record.t, record.noise_std, self.noise_std)
             self = replace(self, noise_std=level)
         result, box = run(self, record), self.system.state_box
         return result if box is None else kept_inside(result, box)
 
     return checked
-
-
-def _filled(told: Noise, t: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (batch, num_samples, ny) of the output noise by sample, where
-    they are NaN those of the noise that an estimator is told."""
-    common = [np.sqrt(np.einsum("iib->bi", told.R(float(now)))) for now in t]
-    return np.where(np.isnan(std), np.stack(common, axis=1), std)
 
 
 def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.maps import Map
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
 from pinnobs_gym.simulation.motion import Interval, Motion, inputs_at
 from pinnobs_gym.simulation.noise import Noise
-from pinnobs_gym.simulation.own_flow import OwnFlow, differences
+from pinnobs_gym.simulation.own_flow import OwnFlow
 from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
 from pinnobs_gym.simulation.stiff import Stiff
-from pinnobs_gym.simulation.system import Array, System
+from pinnobs_gym.simulation.system import Array, System, vector
 
 _STAGES = np.array([0, 1, 1, 2])
 """Index into (start, middle, end) of the step for each of the four Runge-Kutta stages."""
@@ -217,7 +219,10 @@ def flow_jacobian(
     """Return the derivative (batch, nx, nx) of `System.flow` at x (batch, nx): by central
     differences if the class overrides it, and that of `model_step` otherwise."""
     if system.own_flow:
-        return differences(lambda at: system.flow(t0, t1, at, u), system, x)
+        scale = vector(system.scale, system.nx, "scale")
+        return central_differences(
+            lambda at: system.flow(t0, t1, at, u), x, scale, periods=system.state_period
+        )
     return model_step_jacobian(system, t0, t1, x, u, u)[1]
 
 
@@ -290,6 +295,10 @@ def substeps(
     xp = np if isinstance(x, np.ndarray) else array_namespace(x)
     longest = min(longest, longest_step(system))
     by_row = getattr(t0, "ndim", 0) > 0
+    breaks = system.breakpoints()
+    if breaks:
+        yield from _between_breaks(system, breaks, (t0, t1), (u0, u1), longest)
+        return
     whole = t1 - t0
     count = max(1, math.ceil(float(whole.max() if by_row else whole) / longest - 1e-6))
     # All rows take the number of steps that the longest interval needs.
@@ -300,3 +309,31 @@ def substeps(
         after = part * step
         t = t0 + (after.T if by_row else after)
         yield t, step, inputs_at(system, t, part / count, u0, u1)
+
+
+def _between_breaks(
+    system: System,
+    breaks: Sequence[float],
+    times: tuple[Array, Array],
+    inputs: tuple[Array | None, Array | None],
+    longest: float,
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield steps as `substeps` does, none of which crosses one of the times (s) at which f or the
+    input jumps. Rows without such a time in a part have a step of length zero there."""
+    t0, t1 = (np.asarray(t, dtype=float) for t in times)
+    inside = [b for b in sorted(breaks) if (t0 < b).any() and (b < t1).any()]
+    ends = [t0, *(np.clip(b, t0, t1) for b in inside), t1]
+    whole = np.maximum(t1 - t0, np.finfo(float).tiny)
+    for start, end in pairwise(ends):
+        count = max(1, math.ceil(float((end - start).max()) / longest - 1e-6))
+        step = (end - start) / count
+        # At its end, a part has the left limit of what jumps there.
+        last = np.where(np.isin(end, breaks) & (end > start), np.nextafter(end, start), end)
+        for k in range(count):
+            t = np.minimum(start + np.multiply.outer(_PARTS + k, step), last)
+            part = (t - t0) / whole
+            yield (
+                t,
+                step[:, None] if step.ndim else float(step),
+                inputs_at(system, t, part, *inputs),
+            )

@@ -62,7 +62,7 @@ def inputs_at(system: System, t: Array, part: Array, u0: Array | None, u1: Array
     Args:
         system: the model.
         t: the times in s.
-        part: their positions in the interval, from 0 to 1, shape (n,).
+        part: their positions in the interval, from 0 to 1, shape (n,) or (n, batch).
         u0: inputs at the first sample, shape (..., nu); see `Interval`.
         u1: inputs at the second.
     """
@@ -72,7 +72,7 @@ def inputs_at(system: System, t: Array, part: Array, u0: Array | None, u1: Array
     if system.input_hold == "previous":
         xp: Any = np if isinstance(before, np.ndarray) else array_namespace(before)
         return xp.broadcast_to(before, (len(part), *before.shape))
-    weight = part.reshape(len(part), *([1] * before.ndim))
+    weight = part[..., None] if part.ndim == 2 else part.reshape(len(part), *([1] * before.ndim))
     return (1 - weight) * before + weight * required(system, u1)
 
 

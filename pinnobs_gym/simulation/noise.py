@@ -82,6 +82,8 @@ class SampledLevel:
     std: np.ndarray
     """Standard deviations in output units, shape (batch, num_samples, ny); NaN where that of the
     other samples holds."""
+    base: Level | None = None
+    """The noise of the other samples; that of the setup ``benchmark`` if None."""
 
     def at(self, t: float) -> np.ndarray | None:
         """Return the standard deviations (batch, ny) at a time, None if it is that of no sample."""
@@ -90,7 +92,7 @@ class SampledLevel:
 
     def rows(self, rows: np.ndarray | slice) -> SampledLevel:
         """Return the noise of some rows of the batch."""
-        return SampledLevel(self.t, self.std[rows])
+        return SampledLevel(self.t, self.std[rows], self.base)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,8 @@ class Noise:
     output: np.ndarray
     """G, shape (ny, m), in output units."""
     samples: SampledLevel | None = None
-    """Output noise by sample, if it is known; it replaces G."""
+    """Standard deviations of the output noise by sample, if they are known; they scale the rows of
+    G, so that correlations stay."""
 
     @cached_property
     def _L(self) -> np.ndarray:
@@ -140,7 +143,12 @@ class Noise:
         if std is None:
             return self._G
         common = np.sqrt((self._G**2).sum(axis=1))
-        return np.eye(len(common))[..., None] * np.where(np.isnan(std.T), common, std.T)
+        std = np.where(np.isnan(std.T), common, std.T)
+        # Rows of G are scaled, which keeps correlations; those of outputs without noise have none.
+        silent = common == 0
+        scaled = self._G * (std / np.where(silent, 1.0, common))[:, None]
+        own = np.eye(len(std))[..., None] * np.where(silent, std, 0.0)
+        return np.concatenate([scaled, own], axis=1) if silent.any() else scaled
 
     def R(self, t: float, y: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance R = GGᵀ of the output noise at time t (s), shape (ny, ny, batch or

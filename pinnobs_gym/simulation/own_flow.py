@@ -9,10 +9,8 @@ import numpy as np
 from pinnobs_gym.simulation.matrices import outer, product
 from pinnobs_gym.simulation.motion import Interval, Motion
 from pinnobs_gym.simulation.noise import Noise, weighted
-from pinnobs_gym.simulation.system import Array, System, vector
+from pinnobs_gym.simulation.system import Array
 
-_STEP = float(np.cbrt(np.finfo(float).eps))
-"""Relative step of central differences; the cube root of the rounding error minimises the error."""
 _WEIGHTS = (1 / 6, 4 / 6, 1 / 6)
 """Simpson's weights of the start, the middle and the end of an interval."""
 
@@ -62,21 +60,6 @@ class OwnFlow(Motion):
                 x = over.system.flow(times[i - 1], times[i], x, u)
             x = x + np.sqrt(w * (over.t1 - over.t0)) * weighted(M, kick)
         return x
-
-
-def differences(
-    function: Callable[[np.ndarray], np.ndarray], system: System, x: np.ndarray
-) -> np.ndarray:
-    """Return the derivative (batch, nx, nx) of a function of states x (batch, nx), by central
-    differences, whose error is about 1e-10 of the function's value.
-
-    The function is called once, with all shifted states, shape (2·nx, batch, nx).
-    """
-    nx = x.shape[-1]
-    steps = _STEP * np.maximum(abs(x), vector(system.scale, nx, "scale"))
-    shifts = np.eye(nx)[:, None] * steps
-    ends = np.asarray(function(np.concatenate([x + shifts, x - shifts])))
-    return np.moveaxis((ends[:nx] - ends[nx:]) / (2 * np.moveaxis(steps, -1, 0)[..., None]), 0, -1)
 
 
 def _innermost(jacobian: Array) -> np.ndarray:

@@ -108,8 +108,8 @@ class Record:
         map, that its times are whole numbers.
 
         Raises:
-            ValueError: in one line that names the array, its size and the size expected, or the
-                sample.
+            ValueError: in one line that names the array, its size and the size expected, the
+                sample, or the input that differs from the one that the system defines.
         """
         kind, nx = type(system).__name__, system.nx
         if system.discrete and (self.t != np.round(self.t)).any():
@@ -125,6 +125,16 @@ class Record:
                 raise ValueError(
                     f"{name} has {array.shape[2]} column(s) in the record; {kind} has "
                     f"n{last}={size}"
+                )
+        if system.nu and not system.measured_input:
+            known = np.asarray(system.input(self.t))
+            size = np.maximum(abs(known).max(axis=0), abs(self.u).max(axis=(0, 1)))
+            other = (abs(self.u - known) > 1e-6 * size).any(axis=(0, 1))
+            if other.any():
+                name = system.input_names[int(np.flatnonzero(other)[0])]
+                raise ValueError(
+                    f"input {name} of the record is not that of {kind}.input, which the model "
+                    f"uses; expected the same, or {kind}(measured_input=True) for the record's"
                 )
         for name, size in (("mean", (nx,)), ("cov", (nx, nx))):
             shape, expected = getattr(self.prior, name).shape, (self.batch, *size)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.matrices import (
     cholesky,
     identity,
@@ -17,7 +18,6 @@ from pinnobs_gym.simulation.matrices import (
 )
 from pinnobs_gym.simulation.motion import Interval, Motion
 from pinnobs_gym.simulation.noise import Noise
-from pinnobs_gym.simulation.own_flow import differences
 from pinnobs_gym.simulation.rosenbrock import Rows, rosenbrock
 from pinnobs_gym.simulation.system import vector
 
@@ -131,7 +131,11 @@ def _steps(over: Interval, x: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np
 def _step_jacobian(rows: Rows, x: np.ndarray) -> np.ndarray:
     """Return the derivative (batch, nx, nx) of a step from x (batch, nx), of given length."""
     with np.errstate(all="ignore"):
-        jacobian = differences(lambda at: rosenbrock(rows, at)[0], rows.over.system, x)
+        system = rows.over.system
+        scale = vector(system.scale, system.nx, "scale")
+        jacobian = central_differences(
+            lambda at: rosenbrock(rows, at)[0], x, scale, periods=system.state_period
+        )
     return np.where((rows.step > 0)[:, None, None], jacobian, np.eye(x.shape[-1]))
 
 

@@ -422,7 +422,7 @@ class System(ABC):
         """
         own, name = self.setups["benchmark"], type(self).__name__
         samples = noise_std if isinstance(noise_std, SampledLevel) else None
-        given = None if isinstance(noise_std, SampledLevel) else noise_std
+        given = noise_std.base if isinstance(noise_std, SampledLevel) else noise_std
         level = own.noise_std if given is None else given
         output = noise_root(level, self.ny, f"noise_std of {name}")
         if output.shape != (self.ny, self.ny):

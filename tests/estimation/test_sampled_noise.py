@@ -147,3 +147,16 @@ def test_levels_of_a_record_are_checked(change, message):
     record = replace(linear_record(), noise_std=LEVELS[..., :1])
     with pytest.raises(ValueError, match=r"noise_std has 1 column\(s\) in the record; ByHand has"):
         EKF(ByHand()).run(record)
+
+
+def test_levels_that_are_not_given_keep_the_correlation():
+    """A column without any number tells nothing."""
+    G = ((0.1, 0.0), (0.09, 0.03))
+    record = linear_record()
+    plain = EKF(ByHand(), G).run(record)
+    empty = EKF(ByHand(), G).run(replace(record, noise_std=np.full(record.y.shape, np.nan)))
+    np.testing.assert_allclose(empty.xhat, plain.xhat, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(empty.P, plain.P, rtol=0, atol=1e-12)
+    told = np.broadcast_to(np.sqrt(np.sum(np.square(G), axis=1)), record.y.shape)
+    same = EKF(ByHand(), G).run(replace(record, noise_std=told))
+    np.testing.assert_allclose(same.xhat, plain.xhat, rtol=0, atol=1e-12)

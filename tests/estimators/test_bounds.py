@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from benchmarks.plants.reactor import NOISE, QuietReactor, Reactor, reactor_record
 from kinds import untrained
 from linear import Linear, linear_record
-from reactor import NOISE, QuietReactor, Reactor, reactor_record
 from scipy.optimize import least_squares
 
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator

@@ -95,6 +95,8 @@ def random_record(system, num_samples=40, batch=1, seed=3):
     t = np.cumsum(rng.uniform(0.01, 0.09, num_samples)) + 0.5
     y = rng.standard_normal((batch, num_samples, system.ny))
     u = rng.standard_normal((batch, num_samples, system.nu))
+    if not system.measured_input:
+        u = np.broadcast_to(np.asarray(system.input(t)), u.shape)
     mean = rng.standard_normal((batch, system.nx))
     return Record(
         t, y, u, Prior(mean, np.broadcast_to(np.eye(system.nx), (batch,) + (system.nx,) * 2))

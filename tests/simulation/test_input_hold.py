@@ -1,13 +1,15 @@
 """Measured inputs between samples: held from the last one, or on straight lines."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from benchmarks.plants.motion import Reactor, reactor_error, reactor_run
+from linear import FeedThrough, record_of
 
 from pinnobs_gym.cli.system_page import page
+from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.augmented import augmented
 from pinnobs_gym.simulation.augmented_system import Unknown
@@ -132,3 +134,14 @@ def test_points_of_a_record_have_the_inputs_of_the_model(cls):
     if cls is Cart:
         expected = record.u[0, np.searchsorted(record.t, points.t, side="right") - 1, 0]
     np.testing.assert_allclose(points.u[:, 0], expected, rtol=0, atol=1e-12)
+
+
+def test_inputs_that_the_model_would_not_use_are_refused():
+    """Without measured inputs, the model has those of `System.input`."""
+    record = record_of(EpisodeSource(FeedThrough), 2)
+    EKF(FeedThrough()).run(record)
+    other = replace(record, u=record.u + 0.5)
+    with pytest.raises(ValueError, match=r"input u1 .* is not that of FeedThrough\.input") as error:
+        EKF(FeedThrough()).run(other)
+    assert "\n" not in str(error.value)
+    EKF(FeedThrough(measured_input=True)).run(other)

@@ -68,16 +68,16 @@ class Unbounded(Reactor):
 
 
 @dataclass(frozen=True)
-class Quiet(Reactor):
+class QuietReactor(Reactor):
     """The reactor without process noise."""
 
     setups = {"benchmark": replace(Reactor.setups["benchmark"], process_noise=0.0)}
 
 
-def played() -> tuple[np.ndarray, Record]:
-    """Return true states (RUNS, SAMPLES, 2) of the reactor, and their record."""
-    system, rng, t = Reactor(), np.random.default_rng(0), np.arange(SAMPLES) * DT
-    noise, x = system.noise(), np.empty((SAMPLES, RUNS, 2))
+def reactor_record(system: System, batch: int, seed: int = 0) -> tuple[np.ndarray, Record]:
+    """Return true states (batch, SAMPLES, 2) of a reactor, and their record."""
+    rng, t = np.random.default_rng(seed), np.arange(SAMPLES) * DT
+    noise, x = system.noise(), np.empty((SAMPLES, batch, 2))
     x[0] = (3.0, 1.0)
     for k in range(1, SAMPLES):
         x[k] = noisy_model_step(
@@ -88,16 +88,16 @@ def played() -> tuple[np.ndarray, Record]:
             x[k - 1][None],
             None,
             None,
-            lambda m: rng.standard_normal((1, RUNS, m)),
+            lambda m: rng.standard_normal((1, batch, m)),
         )[0]
-    y = x.sum(axis=-1, keepdims=True) + NOISE * rng.standard_normal((SAMPLES, RUNS, 1))
-    prior = Prior.of(system, system.setups["benchmark"], RUNS)
-    return x.swapaxes(0, 1), Record(t, y.swapaxes(0, 1), np.zeros((RUNS, SAMPLES, 0)), prior)
+    y = x.sum(axis=-1, keepdims=True) + NOISE * rng.standard_normal((SAMPLES, batch, 1))
+    prior = Prior.of(system, system.setups["benchmark"], batch)
+    return x.swapaxes(0, 1), Record(t, y.swapaxes(0, 1), np.zeros((batch, SAMPLES, 0)), prior)
 
 
 def figures(repeats: int) -> Iterator[Figure]:
     """Measure estimates of the reactor, and the time of the parts that bounds need."""
-    x, record = played()
+    x, record = reactor_record(Reactor(), RUNS)
     lowest = np.inf
     for name in NAMES:
         cls = ESTIMATORS.resolve(name)
@@ -108,7 +108,7 @@ def figures(repeats: int) -> Iterator[Figure]:
         yield at_least(f"2A=B reactor, {name}, the same without bounds", other, "", None)
     yield at_least("2A=B reactor, lowest pressure of any estimator", lowest, "", 0.0)
     yield from moving_horizon(x, record)
-    mhe, quiet, ekf = MHE(Reactor()), MHE(Quiet()), EKF(Reactor())
+    mhe, quiet, ekf = MHE(Reactor()), MHE(QuietReactor()), EKF(Reactor())
     ratio = median_ratio(lambda: quiet.run(record), lambda: mhe.run(record), repeats)
     yield at_least("MHE, speed with process noise over without, 20 rows", ratio, "x", None)
     free = EKF(Unbounded())
