@@ -45,7 +45,7 @@ class SigmaPoints:
         values: np.ndarray,
         function: Callable[[np.ndarray], np.ndarray],
         jacobian: Callable[[], np.ndarray],
-        notice: str,
+        notice: Callable[[], str],
     ) -> np.ndarray:
         """Return the values of a function at the original points, shape (num_points, batch, m).
 
@@ -60,7 +60,7 @@ class SigmaPoints:
             function: takes states (any number, batch, nx), and returns values (any number, batch,
                 m).
             jacobian: returns the Jacobians of the function at the estimates, shape (m, nx, batch).
-            notice: the line for the log.
+            notice: returns the line for the log.
         """
         used, points = self.used, self.original
         if not math.isfinite(values.sum()):
@@ -69,7 +69,7 @@ class SigmaPoints:
             bad = np.logical_and(defined, ~np.isfinite(values).all(axis=(0, 2)))
             if bad.any():
                 used, values = _closer(function, self.centre, used, values, bad)
-                say_once(notice)
+                say_once(notice())
         if used is points:
             return values
         moved = np.flatnonzero((used != points).any(axis=(0, 2)))

@@ -96,7 +96,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         whole = np.concatenate([state.xhat[None], sigma.used])
         values, F, Q = model_step_moments(self.system, self.noise, *times, whole, *inputs)
         step = partial(_step, self.system, times, inputs)
-        points = sigma.images(values[1:], step, lambda: F, self._notice("f"))
+        points = sigma.images(values[1:], step, lambda: F, partial(self._notice, "f"))
         points = nearest(points, values[0], self.system.state_period)
         points = np.ascontiguousarray(points.transpose(2, 0, 1))
         mean = product(points, mean_weights)[:, 0]  # (nx, batch)
@@ -118,7 +118,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
             output(sigma.used),
             output,
             lambda: self.system.h_jacobian(t, xhat, u).transpose(1, 2, 0),
-            self._notice("h"),
+            partial(self._notice, "h"),
         )
         if (period := self.system.output_period) is not None:  # angles near that of the centre
             outputs = nearest(outputs, self.system.h(t, xhat, u), period)

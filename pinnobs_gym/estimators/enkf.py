@@ -15,8 +15,9 @@ from pinnobs_gym.estimation.kalman import gain_of_deviations
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.localisation import tapers
 from pinnobs_gym.estimation.projection import nearest_points
+from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.simulation.matrices import divide, outer, product, spread, total
+from pinnobs_gym.simulation.matrices import divide, einsum, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
 
@@ -109,6 +110,8 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + spread(L, self._normal(0)(self.system.nx))
         members = self._inside(gathered(members, self.system.state_period))
+        # With the batch innermost in memory, noise that rows share is added several times faster.
+        members = np.ascontiguousarray(members.swapaxes(1, 2)).swapaxes(1, 2)
         return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
@@ -138,7 +141,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         # v = Gw with G of R, for each member.
         G = self.noise.G(t)
         normal = self._normal(2 * memory.sample + 2)
-        noise = np.einsum("pmb,nm->nbp", G, normal(G.shape[1]))
+        noise = einsum("pmb,nm->nbp", G, normal(G.shape[1]))
         weight = 1 / np.sqrt(self.members - 1)
         X = weight * (members - mean).transpose(2, 0, 1)
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
@@ -202,11 +205,14 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
     def _normal(self, stream: int) -> Callable[[int], np.ndarray]:
         """Return a function that draws normal numbers (members, size) with mean zero and unit
         variance over the ensemble, one after another from a random stream."""
-        rng = np.random.default_rng([self.seed, stream])
+        rng, members = generator(self.seed, stream), self.members
 
         def normal(size: int) -> np.ndarray:
-            draws = rng.standard_normal((self.members, size))
-            draws -= draws.mean(axis=0)
-            return draws / draws.std(axis=0, ddof=1)
+            draws = rng.standard_normal((members, size))
+            draws -= np.add.reduce(draws) / members
+            # The sum of the rest is rounding; as in `numpy.std`, which takes twice the time.
+            rest = draws - np.add.reduce(draws) / members
+            rest *= rest
+            return draws / np.sqrt(np.add.reduce(rest) / (members - 1))
 
         return normal

@@ -11,6 +11,7 @@ from pinnobs_gym.estimation.circular import gathered
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.matrices import cholesky, factor, moments, spread, total, weighted_mean
 from pinnobs_gym.simulation.model import noisy_model_step
@@ -118,9 +119,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         L = root(prior.cov.transpose(1, 2, 0))
-        draws = np.random.default_rng([self.seed, 0]).standard_normal(
-            (self.particles, self.system.nx)
-        )
+        draws = generator(self.seed, 0).standard_normal((self.particles, self.system.nx))
         particles = prior.mean + spread(L, draws)
         log_weights = np.full(particles.shape[:2], -np.log(self.particles))
         return State(prior.mean, P=prior.cov, memory=ParticleMemory(particles, log_weights))
@@ -128,7 +127,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
         memory: ParticleMemory = state.memory
-        rng = np.random.default_rng([self.seed, 2, memory.sample])
+        rng = generator(self.seed, 2, memory.sample)
         x = noisy_model_step(
             self.system,
             self.noise,
@@ -251,7 +250,7 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         """Resample the particles of the given episodes to equal weights, with their mean and
         covariance preserved in expectation. The stream identifies the random numbers of this
         resampling."""
-        rng = np.random.default_rng([self.seed, 1, *stream])
+        rng = generator(self.seed, 1, *stream)
         # `take` keeps the order in memory, on which that of sums depends; indexing changes it.
         old, weights, count = x.take(rows, 1), np.exp(log_weights.take(rows, 1)), self.particles
         old = gathered(old, self.system.state_period, weights)

@@ -15,7 +15,7 @@ from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.maps import Map
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
 from pinnobs_gym.simulation.motion import Interval, Motion, inputs_at
-from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.noise import Noise, Root
 from pinnobs_gym.simulation.own_flow import OwnFlow
 from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
 from pinnobs_gym.simulation.stiff import Stiff
@@ -26,6 +26,8 @@ _STAGES = np.array([0, 1, 1, 2])
 
 _PARTS = np.array([0.0, 0.5, 1.0])
 """A step's start, middle and end, in steps."""
+
+_ROOT3 = math.sqrt(3)
 
 _MAP, _STIFF, _OWN_FLOW = Map(), Stiff(), OwnFlow()
 
@@ -108,24 +110,31 @@ def noisy_model_step(
     if motion is not None:
         return motion.noisy(Interval(system, t0, t1, u0, u1), noise, x, normal)
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
-        L = [noise.L(float(now))[..., 0].T for now in t]
+        roots = _roots(noise, t)
         rate = partial(_rate, system, t, u)
-        if len(L[0]):
-            forces = _forces(L, float(step), normal)
+        if size := roots[0].L.shape[1]:
+            forces = _forces(roots, float(step), normal(2 * size))
             rate = partial(_forced, rate, forces)
         x = runge_kutta(rate, x, step)
     return x
 
 
-def _forces(
-    L: Sequence[np.ndarray], step: float, normal: Callable[[int], np.ndarray]
-) -> tuple[np.ndarray, ...]:
-    """Return Lẇ (num_points, 1, nx) at the four stages of a step (s), given the transposes of L at
-    its start, middle and end, (m, nx) each."""
-    drawn = normal(2 * len(L[0])) / np.sqrt(step)
-    even, odd = np.split(drawn, 2, axis=-1)
-    middle = even @ L[1]
-    return (even - np.sqrt(3) * odd) @ L[0], middle, middle, (even + np.sqrt(3) * odd) @ L[2]
+def _roots(noise: Noise, t: np.ndarray) -> Sequence[Root]:
+    """Return L of the process noise at each of the times t (3,) or (3, batch) in s."""
+    if noise.constant:
+        return (noise.root(0.0),) * 3
+    return [noise.root(now) for now in (t if t.ndim == 2 else t.tolist())]
+
+
+def _forces(roots: Sequence[Root], step: float, drawn: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return Lẇ (num_points, 1, nx) at the four stages of a step (s), given L at its start, middle
+    and end, and standard normal numbers (num_points, 1, 2m)."""
+    start, middle, end = roots
+    drawn = drawn / math.sqrt(step)
+    size = drawn.shape[-1] // 2
+    even, odd = drawn[..., :size], _ROOT3 * drawn[..., size:]
+    halfway = middle.times(even)
+    return start.times(even - odd), halfway, halfway, end.times(even + odd)
 
 
 def _forced(
@@ -196,21 +205,34 @@ def model_step_moments(
     F, Q = None, None
     for end, flow, A, (t, h) in _linearised_steps(system, t0, t1, x, u0, u1):
         x, F = end, flow if F is None else product(flow, F)  # chain rule over the substeps
-        start, middle, last = t if t.ndim == 2 else t.tolist()
-        if noise.L(start).shape[1] == 0:
-            continue
-        # Simpson's weights are 1/6, 4/6 and 1/6; this is twice Ψ at the middle.
-        twice = A[3] - product(flow, A[0])
-        twice *= h / 4
-        twice += flow
-        twice += identity(*flow.shape[1:])
-        parts = np.concatenate([noise.mapped(flow, start), noise.mapped(twice, middle)], axis=1)
-        added = outer(parts, parts)
-        added += noise.density(last)
-        added *= h / 6
-        Q = added if Q is None else sandwich(flow, Q) + added
+        roots = _roots(noise, t)
+        if roots[0].L.shape[1]:
+            added = _accumulated(roots, flow, A, h)
+            Q = added if Q is None else sandwich(flow, Q) + added
     assert F is not None  # there is at least one substep
     return x, F, np.zeros((len(F), len(F), 1)) if Q is None else Q
+
+
+def _accumulated(roots: Sequence[Root], flow: np.ndarray, A: np.ndarray, h: Array) -> np.ndarray:
+    """Return the covariance (nx, nx, batch) of the process noise over one substep.
+
+    Args:
+        roots: L at the start, the middle and the end of the substep.
+        flow: the Jacobian of the substep, shape (nx, nx, batch).
+        A: those of f at its four stages, shape (4, nx, nx, batch).
+        h: its length in s, a number or one for each row (batch,).
+    """
+    start, middle, end = roots
+    # Simpson's weights are 1/6, 4/6 and 1/6; this is twice Ψ at the middle.
+    twice = A[3] - product(flow, A[0])
+    twice *= h / 4
+    twice += flow
+    twice += identity(*flow.shape[1:])
+    parts = np.concatenate([start.mapped(flow), middle.mapped(twice)], axis=1)
+    added = outer(parts, parts)
+    added += end.density
+    added *= h / 6
+    return added
 
 
 def flow_jacobian(

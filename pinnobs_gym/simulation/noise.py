@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from pinnobs_gym.simulation.notices import say_once
 
 if TYPE_CHECKING:
     from pinnobs_gym.simulation.system import System
+
+T = TypeVar("T")
 
 Level: TypeAlias = Sequence[Sequence[float]] | Sequence[float] | float
 """Noise of several components: a standard deviation for all, one for each, or the rows of a matrix
@@ -66,11 +68,45 @@ def weighted(M: np.ndarray, w: np.ndarray) -> np.ndarray:
     return total
 
 
-def _scales(L: np.ndarray) -> np.ndarray:
-    """Return the diagonal (nx, batch or 1) of L (nx, m, batch or 1), an empty array if L is not
-    diagonal."""
-    scales = np.einsum("iib->ib", L) if L.shape[0] == L.shape[1] else L[:0, 0]
-    return scales if np.count_nonzero(L) == np.count_nonzero(scales) else scales[:0]
+def _correlated(R: np.ndarray) -> bool:
+    """Return whether R (ny, ny, batch or 1) has an entry beside the diagonal."""
+    return bool(R[~np.eye(len(R), dtype=bool)].any())
+
+
+@dataclass(frozen=True, eq=False)
+class Root:
+    """L of the process noise at a time, with what is made of it, computed once."""
+
+    L: np.ndarray
+    """Shape (nx, m, batch or 1)."""
+
+    @cached_property
+    def density(self) -> np.ndarray:
+        """LLᵀ, shape (nx, nx, batch or 1)."""
+        return outer(self.L, self.L)
+
+    @cached_property
+    def _scales(self) -> np.ndarray | None:
+        """The diagonal of L, (nx, batch or 1), None if L is not diagonal."""
+        L = self.L
+        if L.shape[0] != L.shape[1]:
+            return None
+        scales = np.einsum("iib->ib", L)
+        return scales if np.count_nonzero(L) == np.count_nonzero(scales) else None
+
+    @cached_property
+    def _rows(self) -> np.ndarray:
+        return self.L[..., 0].T
+
+    def mapped(self, M: np.ndarray) -> np.ndarray:
+        """Return ML, (n, m, batch), for matrices M (n, nx, batch)."""
+        scales = self._scales  # a diagonal L takes no matrix product
+        return product(M, self.L) if scales is None else M * scales
+
+    def times(self, w: np.ndarray) -> np.ndarray:
+        """Return Lw (..., nx) for w (..., m), with L the same in all rows."""
+        scales = self._scales
+        return w @ self._rows if scales is None else w * scales[:, 0]
 
 
 @dataclass(frozen=True)
@@ -127,15 +163,20 @@ class Noise:
         Without process noise, m is zero."""
         return self._L
 
-    def density(self, t: float | np.ndarray) -> np.ndarray:
-        """Return LLᵀ at time t (s), shape (nx, nx, batch or 1)."""
-        return self._derived("density", self.L(t), lambda L: outer(L, L))
+    def root(self, t: float | np.ndarray) -> Root:
+        """Return L at time t (s) with what is made of it; the same object as before if L is."""
+        if (fixed := self._fixed) is not None:
+            return fixed
+        return self._derived("root", self.L(t), Root)
 
-    def mapped(self, M: np.ndarray, t: float | np.ndarray) -> np.ndarray:
-        """Return ML, (n, m, batch), for matrices M (n, nx, batch) and L at time t (s)."""
-        L = self.L(t)
-        scales = self._derived("scales", L, _scales)  # a diagonal L takes no matrix product
-        return M * scales if scales.size else product(M, L)
+    @cached_property
+    def _fixed(self) -> Root | None:
+        return Root(self.L(0.0)) if self.constant else None
+
+    @cached_property
+    def constant(self) -> bool:
+        """Whether L is the same at all times."""
+        return type(self).L is Noise.L
 
     def G(self, t: float) -> np.ndarray:
         """Return G at time t (s), shape (ny, m, batch or 1)."""
@@ -155,25 +196,25 @@ class Noise:
         1). Given outputs y (batch, ny), their covariances with missing ones, which are NaN, are
         zero, so that these do not count in an update."""
         R = self._derived("R", self.G(t), lambda G: outer(G, G))
-        if y is None or len(R) == 1 or not np.isnan(y).any() or not self._correlated(R):
+        if y is None or len(R) == 1 or not self._derived("correlated", R, _correlated):
+            return R
+        if not np.isnan(y).any():
             return R
         present = ~np.isnan(y.T)
         kept = (present[:, None] & present) | np.eye(len(R), dtype=bool)[..., None]
         return np.where(kept, R, 0.0)
 
-    def _correlated(self, R: np.ndarray) -> bool:
-        """Return whether R has an entry beside the diagonal."""
-        return bool(R[~np.eye(len(R), dtype=bool)].any())
-
-    def _derived(
-        self, name: str, source: np.ndarray, make: Callable[[np.ndarray], np.ndarray]
-    ) -> np.ndarray:
+    def _derived(self, name: str, source: np.ndarray, make: Callable[[np.ndarray], T]) -> T:
         """Return what is made of an array, from memory if it is the same object as before."""
-        before: tuple[np.ndarray, np.ndarray] | None = self.__dict__.get(f"_{name}_of")
+        kept = self._memory
+        before = kept.get(name)
         if before is None or before[0] is not source:
-            before = source, make(source)
-            self.__dict__[f"_{name}_of"] = before
+            before = kept[name] = source, make(source)
         return before[1]
+
+    @cached_property
+    def _memory(self) -> dict[str, tuple[np.ndarray, Any]]:
+        return {}
 
     def outputs(self, t: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the noise Gv (num_samples, batch, ny) of outputs at times t (num_samples,) in s,
@@ -205,6 +246,10 @@ class _Sum(Noise):
     own: Noise
     further: np.ndarray
     """Its L, shape (nx, m, 1)."""
+
+    @cached_property
+    def constant(self) -> bool:
+        return self.own.constant
 
     def L(self, t: float | np.ndarray) -> np.ndarray:
         return self._derived("L", self.own.L(t), self._both)
@@ -266,6 +311,10 @@ class AssumedNoise(Noise):
             )
         own = told.process, told.output, told.samples
         return AssumedNoise(*own, told=told, extra=extra, floor=floor)
+
+    @cached_property
+    def constant(self) -> bool:
+        return self.told.constant
 
     def L(self, t: float | np.ndarray) -> np.ndarray:
         return self._derived("L", self.told.L(t), self._enlarged)

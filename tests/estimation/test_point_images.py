@@ -48,7 +48,7 @@ def points(batch=3):
 
 def images(function, centre, deviations, bounds):
     sigma = SigmaPoints.of(centre, deviations, *(bounds or (None, None)))
-    return sigma.images(function(sigma.used), function, jacobian, LINE)
+    return sigma.images(function(sigma.used), function, jacobian, lambda: LINE)
 
 
 def jacobian():
