@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pinnobs_gym.simulation.matrices import product
 from pinnobs_gym.simulation.motion import Interval
 
 _GAMMA = 0.25
@@ -46,6 +47,23 @@ _C = (
 """Weights of the earlier increments over the step on the right-hand side of each stage."""
 _PART = 1e-5
 """Part of the step by which time is shifted in the differences for ∂f/∂t."""
+_PARTS = np.array([0.0, _PART, 2 * _PART, *_TIMES[1:]])
+"""Positions in the step at which f is evaluated."""
+
+
+def _by_increment() -> np.ndarray:
+    """Return the weights (5, 2, 6, 1, 1) of each increment but the last: in the state of each
+    stage, and on its right-hand side."""
+    weights = np.zeros((5, 2, 6, 1, 1))
+    for i, row in enumerate((*_A, (*_A[-1], 1.0))):
+        weights[: len(row), 0, i, 0, 0] = row
+    for i, row in enumerate(_C):
+        weights[: len(row), 1, i, 0, 0] = row
+    weights[:, 1] *= _GAMMA
+    return weights
+
+
+_WEIGHTS = _by_increment()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +75,17 @@ class Rows:
     """Time of each row in s, shape (...)."""
     step: np.ndarray
     """Length of the step in s, shape (...); zero for a row that stays."""
+    last: np.ndarray | float = np.inf
+    """Latest time in s at which f is evaluated, shape (...): the left limit of a time at which f or
+    the input jumps, where a step ends at one."""
 
-    def rate(self, part: float, x: np.ndarray) -> np.ndarray:
-        """Return f (..., nx) at states x (..., nx), a part of the step after its start."""
-        t = self.t + part * self.step
-        return np.asarray(self.over.system.f(t, x, self.over.input(t)))
-
-    def jacobian(self, part: float, x: np.ndarray) -> np.ndarray:
-        """Return ∂f/∂x, (..., nx, nx), at such states."""
-        t = self.t + part * self.step
-        return np.asarray(self.over.system.f_jacobian(t, x, self.over.input(t)))
+    def at(self, parts: np.ndarray, axes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the times t (n, ...) and the inputs (n, ..., nu) at n parts of the steps, to be
+        broadcast against states (n, ..., nx) of rows with a number of axes."""
+        parts = parts.reshape(-1, *(1,) * axes)
+        t = np.minimum(self.t + parts * self.step, self.last)
+        u = np.asarray(self.over.input(t))
+        return t, _broadcast(u, (*t.shape, u.shape[-1]))
 
 
 def rosenbrock(rows: Rows, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,41 +95,55 @@ def rosenbrock(rows: Rows, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         The states (..., nx) at the end of the step, and the difference (..., nx) from those by the
         embedded method. Both are NaN in rows whose linear system has no solution.
     """
-    h = rows.step[..., None]
-    rate = rows.rate(0.0, x)
-    inverse = _inverse(np.eye(x.shape[-1]) - _GAMMA * h[..., None] * rows.jacobian(0.0, x))
+    system, (*shape, nx) = rows.over.system, x.shape
+    first, last = (len(shape), *range(len(shape))), (*range(1, len(shape) + 1), 0)
+
+    def flat(values: np.ndarray) -> np.ndarray:
+        """Return (nx, number of rows), which is faster for small matrices, of (..., nx)."""
+        return _broadcast(values, x.shape).transpose(first).reshape(nx, -1)
+
+    def rate(stage: slice | int, at: np.ndarray) -> np.ndarray:
+        return np.asarray(system.f(t[stage], at, u[stage]))
+
+    t, u = rows.at(_PARTS, len(shape))
+    h = _GAMMA * _broadcast(rows.step, tuple(shape))
+    matrices = np.eye(nx) - h[..., None, None] * np.asarray(system.f_jacobian(t[0], x, u[0]))
+    inverse = _inverse(matrices).reshape(-1, nx, nx).transpose(1, 2, 0)
+    h, inverse = h.reshape(-1), np.ascontiguousarray(inverse)
     # ∂f/∂t by one-sided differences of second order, since f may jump at the start of the step.
-    ahead, further = (rows.rate(n * _PART, x) for n in (1, 2))
-    slope = (4 * ahead - 3 * rate - further) / (2 * _PART)  # times the step
-    increments: list[np.ndarray] = []
-    point = x
+    rates = rate(slice(3), np.broadcast_to(x, (3, *x.shape)))
+    rates = _broadcast(rates, (3, *x.shape))
+    now, ahead, further = (flat(each) for each in rates)
+    slope = h * (4 * ahead - 3 * now - further) / (2 * _PART)  # times γ and the square of the step
+    sums = np.zeros((2, 6, nx, h.size))  # of earlier increments, in states and right-hand sides
+    sums[0] += flat(x)
     for i in range(6):
-        if i == 5:
-            point = point + increments[-1]
-        elif i:
-            point = x + _sum(_A[i], increments)
         if i:
-            rate = rows.rate(_TIMES[i], point)
+            at = sums[0, i].reshape(nx, *shape).transpose(last)
+            now = flat(rate(i + 2, at))
         # (I − γhA)uᵢ = γ(h f + Σ cᵢⱼ uⱼ + γᵢ h² ∂f/∂t): the book's equations times γh, for h = 0.
-        right = h * (rate + _SLOPES[i] * slope)
-        right = _GAMMA * (right + _sum(_C[i], increments) if i else right)
-        columns = (inverse[..., j] * right[..., j, None] for j in range(x.shape[-1]))
-        increments.append(sum(columns, np.zeros(())))  # in one order, in any batch
-    return point + increments[-1], increments[-1]
+        right = h * now + sums[1, i]
+        if _SLOPES[i]:
+            right += _SLOPES[i] * slope
+        increment = product(inverse, right[:, None])[:, 0]
+        if i < 5:
+            sums[:, i + 1 :] += _WEIGHTS[i][:, i + 1 :] * increment
+    end, error = sums[0, 5] + increment, increment
+    return end.reshape(nx, *shape).transpose(last), error.reshape(nx, *shape).transpose(last)
 
 
-def _sum(weights: tuple[float, ...], parts: list[np.ndarray]) -> np.ndarray:
-    """Return the weighted sum of arrays, in their order."""
-    total = weights[0] * parts[0]
-    for weight, part in zip(weights[1:], parts[1:], strict=True):
-        total = total + weight * part
-    return total
+def _broadcast(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array of that shape; NumPy's function takes microseconds where nothing changes."""
+    return values if values.shape == shape else np.broadcast_to(values, shape)
 
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
     """Return inverses (..., n, n); NaN where there is none."""
-    usable = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
-    usable &= np.linalg.det(np.where(usable[..., None, None], matrices, 0.0)) != 0
-    result = np.full_like(matrices, np.nan)
-    result[usable] = np.linalg.inv(matrices[usable])
-    return result
+    try:
+        return np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:  # at least one is singular
+        usable = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
+        usable &= np.linalg.det(np.where(usable[..., None, None], matrices, 0.0)) != 0
+        result = np.full_like(matrices, np.nan)
+        result[usable] = np.linalg.inv(matrices[usable])
+        return result
