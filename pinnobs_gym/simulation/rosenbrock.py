@@ -117,6 +117,7 @@ def rosenbrock(rows: Rows, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     slope = h * (4 * ahead - 3 * now - further) / (2 * _PART)  # times γ and the square of the step
     sums = np.zeros((2, 6, nx, h.size))  # of earlier increments, in states and right-hand sides
     sums[0] += flat(x)
+    increment = sums[1, 0]
     for i in range(6):
         if i:
             at = sums[0, i].reshape(nx, *shape).transpose(last)
