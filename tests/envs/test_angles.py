@@ -106,7 +106,7 @@ def test_lines_of_a_wrapped_heading_have_gaps(known):
     turns twice; one that counts turns has no gap, however fast it is."""
     heading, record, _ = north_record(Compass())
     x = np.stack([np.angle(np.exp(1j * heading[2])), np.zeros(len(record.t))], axis=-1)
-    xhat = x + [1e-3, 0.0]
+    xhat = x + np.array([1e-3, 0.0])
     shown = {"x": x} if known else {}
     figure = state_figure(Compass(), record.t, xhat, **shown)
     for line in figure.axes[0].lines:

@@ -42,7 +42,7 @@ def test_lines_of_an_angle_have_a_gap_where_it_jumps():
     """A heading wrapped at half a turn, 1 rad a second; the estimate is 0.2 rad ahead."""
     t = np.arange(8.0)
     x = np.stack([np.angle(np.exp(1j * t)), np.sin(t)], axis=-1)
-    example = Example(0, t, x, x + [0.2, 0.1], x[:, :1], np.full(x.shape, 0.25))
+    example = Example(0, t, x, x + np.array([0.2, 0.1]), x[:, :1], np.full(x.shape, 0.25))
     own = curves(np.ones((1, 8)), t=t)
     own = replace(own, example=example, state_period=(2 * np.pi, None))
     found = over_samples.states({"a": own})
