@@ -306,7 +306,10 @@ class Joint(StartLaw):
 def check_covariance(rows: Sequence[Sequence[float]], name: str) -> None:
     """Raise ValueError, in one line, unless the rows are those of a covariance; zero variances are
     allowed."""
-    P = np.array(rows, dtype=float)
+    try:
+        P = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}={rows!r}; expected a covariance, rows of numbers") from None
     if P.ndim != 2 or P.shape[0] != P.shape[1]:
         raise ValueError(f"{name}={rows}; expected a covariance, as many rows as columns")
     size = abs(P).max(initial=0.0)

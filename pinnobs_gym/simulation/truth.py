@@ -88,7 +88,7 @@ def truth(
             truth(plant, x[k], times[k : k + 2], longest, x[k : k + 2])
         return x
     # Integrate each interval between breakpoints separately, since f is smooth only within it.
-    ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
+    ends = [b for b in _breakpoints(system) if times[0] < b < times[-1]] + [times[-1]]
     start, state = float(times[0]), np.asarray(x0, dtype=float)
     done = 1
     for end in ends:
@@ -99,6 +99,11 @@ def truth(
         done, start, state = stop, float(end), last
     _check_finite(system, x0, x)
     return x
+
+
+def _breakpoints(system: System) -> list[float]:
+    """Return the system's breakpoints in s, ascending and each once."""
+    return sorted(set(system.breakpoints()))
 
 
 def noise_shape(system: System, noise: Noise, dt: float, step: float) -> tuple[int, int, int]:
@@ -217,7 +222,7 @@ def _through_part(
 ) -> None:
     """Advance the state in ``stages`` from one time to another, in steps no longer than ``longest``
     (s) that begin anew at each breakpoint."""
-    ends = [b for b in system.breakpoints() if start < b < end] + [end]
+    ends = [b for b in _breakpoints(system) if start < b < end] + [end]
     for part in ends:
         steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
         step = round((part - start) / steps, 15)
