@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.motion import check_steps
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System
 
 _ROUNDING = 1e-6
@@ -276,6 +278,7 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
     if len(wrong):
         number, later, earlier = rows[wrong[0] + 2][0], t[wrong[0] + 1], t[wrong[0]]
         raise ValueError(f"log {path}, line {number}: t={later} after {earlier}; t must increase")
+    _check_gaps(system, t, [f"log {path}, line {number}" for number, _ in rows[1:]])
     y = np.stack([table[name] for name in outputs], axis=-1)[None]
     if np.isnan(y).all():
         raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
@@ -292,6 +295,19 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
         unknown = np.full(len(t), np.nan)
         std = np.stack([table.get(f"{output}_std", unknown) for output in outputs], axis=-1)[None]
     return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior, std)
+
+
+def _check_gaps(system: System, t: np.ndarray, places: list[str]) -> None:
+    """Raise ValueError, with the place of the sample after it, if the model would take too many
+    steps through the longest gap between times t (num_samples,) in s."""
+    if len(t) < 2 or system.own_flow:
+        return
+    k = int(np.argmax(np.diff(t)))
+    longest = longest_step(system)
+    try:
+        check_steps(system, t[k], t[k + 1], float(t[k + 1] - t[k]) / longest, longest)
+    except ValueError as error:
+        raise ValueError(f"{places[k + 1]}: {error}") from None
 
 
 def _kept(values: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from pinnobs_gym.simulation.matrices import (
     product,
     sandwich,
 )
-from pinnobs_gym.simulation.motion import Interval, Motion
+from pinnobs_gym.simulation.motion import Interval, Motion, check_steps
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.rosenbrock import Rows, rosenbrock
 from pinnobs_gym.simulation.system import vector
@@ -102,6 +102,9 @@ def _steps(over: Interval, x: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np
     t = np.broadcast_to(np.asarray(over.t0, dtype=float), shape).copy()
     end = np.broadcast_to(np.asarray(over.t1, dtype=float), shape)
     whole = end - t
+    if system.model_step is not None:
+        count = float(whole.max(initial=0.0)) / system.model_step
+        check_steps(system, t, end, count, system.model_step)
     step = np.minimum(whole, system.model_step or np.inf)
     for _ in range(_ATTEMPTS):
         with np.errstate(all="ignore"):  # a step may be too long for f to be finite

@@ -15,7 +15,7 @@ from numpy.polynomial import chebyshev
 from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.driven import driven
 from pinnobs_gym.simulation.maps import Map
-from pinnobs_gym.simulation.motion import Interval
+from pinnobs_gym.simulation.motion import Interval, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
 from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import System, vector
@@ -69,6 +69,7 @@ def truth(
         States, shape (num_samples, batch, nx).
 
     Raises:
+        ValueError: in one line, if it would take too many steps between two samples.
         FloatingPointError: in one line, if a state is not finite, or the adaptive method cannot go
             on beyond some time.
     """
@@ -82,6 +83,7 @@ def truth(
         _check_finite(system, x0, x)
         return x
     longest = max_step or float(times[-1] - times[0]) / 100
+    _check_gaps(system, times, longest)
     if inputs is not None:  # they, or their slopes, jump at each sample
         for k in range(len(times) - 1):
             plant = driven(system, times[k : k + 2], inputs[k : k + 2])
@@ -101,6 +103,15 @@ def truth(
     return x
 
 
+def _check_gaps(system: System, times: np.ndarray, longest: float) -> None:
+    """Raise ValueError, in one line, if steps of at most ``longest`` (s) are too many between two
+    of the samples at these times (num_samples,)."""
+    if len(times) > 1 and not (system.discrete or system.stiff):
+        k = int(np.argmax(np.diff(times)))
+        count = float(times[k + 1] - times[k]) / longest
+        check_steps(system, times[k], times[k + 1], count, longest)
+
+
 def _breakpoints(system: System) -> list[float]:
     """Return the system's breakpoints in s, ascending and each once."""
     return sorted(set(system.breakpoints()))
@@ -117,7 +128,12 @@ def noise_shape(system: System, noise: Noise, dt: float, step: float) -> tuple[i
         dt: time between samples in s.
         step: longest step of the model in s, see
             `pinnobs_gym.simulation.runge_kutta.longest_step`.
+
+    Raises:
+        ValueError: in one line, if there would be too many parts.
     """
+    if not system.stiff:
+        check_steps(system, 0.0, dt, dt / step, step)
     if system.discrete:
         return round(dt), 1, noise.L(0.0).shape[1]
     if system.stiff:
@@ -157,11 +173,13 @@ def disturbed_truth(
         States, shape (num_samples, batch, nx).
 
     Raises:
+        ValueError: as `truth`.
         FloatingPointError: if a state is not finite.
     """
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
     longest = max_step or float(times[-1] - times[0]) / 100
+    _check_gaps(system, times, longest)
     stages = np.empty((1 + len(dop853.B), *x0.shape))
     stages[0] = x0
     with np.errstate(all="ignore"):
