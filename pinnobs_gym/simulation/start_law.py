@@ -122,8 +122,9 @@ class Box(StartLaw):
 class Gaussian(StartLaw):
     """Gaussian states N(x̂₀, P₀).
 
-    The prior that estimators are given is this Gaussian itself, even where `System.admissible`
-    restricts the states. Its set is the ellipsoid that holds 95 % of the states; the box about it
+    Where `System.admissible` restricts the states, the prior that estimators are given has the mean
+    and the covariance of those that are left (`pinnobs_gym.simulation.initial_set.prior_moments`).
+    Its set is the ellipsoid that holds 95 % of the states; the box about it
     extends three standard deviations to each side.
     """
 
