@@ -37,7 +37,7 @@ def state_figure(
 
     Args:
         system: names and units.
-        t: times in s, shape (num_samples,).
+        t: times in s, or steps of a map, shape (num_samples,).
         xhat: estimates, shape (num_samples, nx).
         x: true states (num_samples, nx), if known.
         y: outputs (num_samples, ny); those that directly measure a state are drawn as dots.
@@ -80,7 +80,7 @@ def state_figure(
         panel.grid(alpha=0.3)
     panels[0].set_title(title, fontsize=10)
     panels[0].legend(loc="upper right", fontsize=8, ncols=3)
-    panels[-1].set_xlabel("t (s)")
+    panels[-1].set_xlabel(f"t ({system.time_unit})")
     return figure
 
 

@@ -243,6 +243,11 @@ class System(ABC):
         return len(self.input_names)
 
     @property
+    def time_unit(self) -> str:
+        """The unit of time: the step of a map, and the second otherwise."""
+        return "steps" if self.discrete else "s"
+
+    @property
     def state_box(self) -> StateBox | None:
         """The states within `state_low` and `state_high`; None without bounds."""
         if self.state_low is None and self.state_high is None:

@@ -83,7 +83,8 @@ class Estimate:
             f"{name} = {value:.6g}"
             for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
         )
-        console.print(f"{record.num_samples} samples; at t = {record.t[-1]:g} s: {last}")
+        time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
+        console.print(f"{record.num_samples} samples; at t = {time}: {last}")
         console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
         return 0
 
