@@ -95,7 +95,7 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
         result, box = update(self, state, t, y, u), system.state_box
         return result if box is None else kept_inside(result, box)
 
-    checked.unchecked = unchecked  # pyright: ignore[reportFunctionMemberAccess]
+    checked.unchecked = unchecked  # pyright: ignore[reportAttributeAccessIssue]
     return checked
 
 
@@ -122,9 +122,9 @@ def _check_sample(
     prior = Prior(np.zeros((len(y), system.nx)), np.zeros((len(y), system.nx, system.nx)))
     if np.ndim(t):
         raise ValueError(f"t has shape {np.shape(t)}; expected one number for all rows")
-    given = (np.asarray(values)[:, None] for values in (y, u))
+    outputs, inputs = (np.asarray(values)[:, None] for values in (y, u))
     try:
-        record = Record(np.asarray(t)[None], *given, prior)
+        record = Record(np.asarray(t)[None], outputs, inputs, prior)
     except ValueError as error:
         line = str(error).replace(" at sample 0", f" at t={t}").replace("sample 0", "a sample")
         raise ValueError(line) from None
