@@ -23,7 +23,9 @@ def page(cls: type[System], env_id: str) -> str:
     """Return the env page of a system in Markdown under Gymnasium's headings, from its docstring
     and attributes."""
     system, setup = cls.configured()
-    number_of_actions = f"{setup.num_steps} actions, {setup.duration:g} s at {setup.dt:g} s"
+    number_of_actions = (
+        f"{setup.num_steps} actions, {_time(system, setup.duration)} at {_time(system, setup.dt)}"
+    )
     parts = [
         f"# {cls.__name__}: `{env_id}`\n",
         inspect.getdoc(cls) or "",
@@ -81,6 +83,12 @@ def page(cls: type[System], env_id: str) -> str:
         f"v{cls.version}: first version.",
     ]
     return "\n".join(parts) + "\n"
+
+
+def _time(system: System, length: float) -> str:
+    """Return a length of time with its unit, the step for a map."""
+    unit = system.time_unit
+    return f"{length:g} {'step' if system.discrete and length == 1 else unit}"
 
 
 def _bound(system: System) -> Sequence[float]:

@@ -32,12 +32,12 @@ def state_figure(
 ) -> Figure:
     """Return a figure of estimates over time, with a panel per state.
 
-    Angles are drawn without jumps: true states as they are, outputs and estimates by whole periods
-    nearest to them.
+    Of an angle, outputs and estimates are drawn at the values nearest to the true state. Where the
+    true state or the estimate jumps by a period its line is broken.
 
     Args:
         system: names and units.
-        t: times in s, shape (num_samples,).
+        t: times in s, or steps of a map, shape (num_samples,).
         xhat: estimates, shape (num_samples, nx).
         x: true states (num_samples, nx), if known.
         y: outputs (num_samples, ny); those that directly measure a state are drawn as dots.
@@ -61,16 +61,18 @@ def state_figure(
             dots = y[:, measured[i]]
             panel.plot(t, dots, ".", ms=2, color=MEASURED, label="measured")
         if x is not None:
-            panel.plot(t, x[:, i], color=TRUE, lw=1.5, label="true")
+            true = x[:, i]
+            line = broken(jumps(true, periods[i]), t, true)
+            panel.plot(*line, color=TRUE, lw=1.5, label="true")
         estimate = _drawable(xhat[:, i])
         kept = np.isfinite(estimate)
-        breaks = _breaks(estimate[kept], None if x is None else x[kept, i], periods[i])
-        line = _broken(breaks, t[kept], estimate[kept])
+        breaks = jumps(estimate[kept], periods[i], None if x is None else x[kept, i])
+        line = broken(breaks, t[kept], estimate[kept])
         panel.plot(*line, "--", color=ESTIMATE, lw=1.3, label="estimate")
         if P is not None:
             band = 2 * np.sqrt(_drawable(np.maximum(P[:, i, i], 0)))
-            breaks = _breaks(estimate, None if x is None else x[:, i], periods[i])
-            area = _broken(breaks, t, estimate - band, estimate + band)
+            breaks = jumps(estimate, periods[i], None if x is None else x[:, i])
+            area = broken(breaks, t, estimate - band, estimate + band)
             panel.fill_between(*area, color=ESTIMATE, alpha=0.15, lw=0)
         seen = x[:, i] if x is not None else estimate[kept]
         if len(seen):
@@ -78,7 +80,7 @@ def state_figure(
         panel.grid(alpha=0.3)
     panels[0].set_title(title, fontsize=10)
     panels[0].legend(loc="upper right", fontsize=8, ncols=3)
-    panels[-1].set_xlabel("t (s)")
+    panels[-1].set_xlabel(f"t ({system.time_unit})")
     return figure
 
 
@@ -94,15 +96,31 @@ def drawn_outputs(system: System, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return y
 
 
-def _breaks(estimate: np.ndarray, x: np.ndarray | None, period: float | None) -> np.ndarray:
-    """Return the samples at which the nearest value of an estimate (num_samples,) of an angle x
-    jumps by a period, since it has passed the angle's opposite."""
-    if period is None or x is None:
+def jumps(
+    curve: np.ndarray, period: float | None, nearest_to: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the samples at which a curve (num_samples,) of an angle jumps by a period.
+
+    Args:
+        curve: the angle, NaN where it is unknown.
+        period: its period in its unit; None if it does not repeat, and thus never jumps.
+        nearest_to: the true state (num_samples,) whose nearest value the curve is, if it is that of
+            an estimate. The curve jumps with it, and where the estimate passes its opposite.
+            Without it the curve jumps if it is wrapped: steps of more than half a period may also
+            be those of a fast rotation, which soon spans more than two periods.
+    """
+    if period is None:
         return np.empty(0, dtype=int)
-    return 1 + np.flatnonzero(abs(np.diff(estimate - x)) > period / 2)
+    if nearest_to is not None:
+        apart = 1 + np.flatnonzero(abs(np.diff(curve - nearest_to)) > period / 2)
+        return np.union1d(apart, jumps(nearest_to, period))
+    known = curve[np.isfinite(curve)]
+    if not len(known) or np.ptp(known) > 2 * period:
+        return np.empty(0, dtype=int)
+    return 1 + np.flatnonzero(abs(np.diff(curve)) > period / 2)
 
 
-def _broken(breaks: np.ndarray, t: np.ndarray, *curves: np.ndarray) -> list[np.ndarray]:
+def broken(breaks: np.ndarray, t: np.ndarray, *curves: np.ndarray) -> list[np.ndarray]:
     """Return times and curves (num_samples,) with gaps before the samples ``breaks``."""
     return [np.insert(t, breaks, t[breaks]), *(np.insert(c, breaks, np.nan) for c in curves)]
 
@@ -176,8 +194,9 @@ class EpisodePicture:
         curves = {"true": self._x, "estimate": self._xhat}
         for panel, state, label, line in self._lines:
             curve = curves[label][shown, state]
-            breaks = _breaks(curve, self._x[shown, state], self._periods[state])
-            line.set_data(*_broken(breaks, self._times[shown], curve))
+            true = None if label == "true" else self._x[shown, state]
+            breaks = jumps(curve, self._periods[state], true)
+            line.set_data(*broken(breaks, self._times[shown], curve))
             panel.draw_artist(line)
         image = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
         if self._mode == "human":

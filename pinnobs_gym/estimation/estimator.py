@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from pinnobs_gym.estimation.given import checked_run, checked_update
+from pinnobs_gym.estimation.given import checked_reset, checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
 from pinnobs_gym.registry import trainer_class
@@ -122,7 +122,8 @@ class BaseEstimator(ABC):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        for name, check in (("run", checked_run), ("update", checked_update)):
+        checks = {"run": checked_run, "reset": checked_reset, "update": checked_update}
+        for name, check in checks.items():
             if name in vars(cls) and not getattr(vars(cls)[name], "__isabstractmethod__", False):
                 setattr(cls, name, check(vars(cls)[name]))
 
@@ -218,23 +219,27 @@ class Estimator(BaseEstimator):
 
         Args:
             state: the state after the previous sample, or that of `reset`.
-            t: time of the sample in s, later than ``state.t``; steps may be irregular.
-            y: outputs, shape (batch, ny); NaN marks a missing output.
-            u: inputs, shape (batch, nu).
+            t: time of the sample in s, later than ``state.t``; steps may be irregular. That of a
+                map is a whole number.
+            y: outputs, shape (batch, ny), finite; NaN marks a missing output.
+            u: inputs, shape (batch, nu), finite: those that `System.input` defines, unless the
+                system has `System.measured_input`.
 
         Raises:
-            ValueError: in one line, if y or u has another shape. The check precedes the method of
-                any subclass.
+            ValueError: in one line, if an argument is not that, as for a `Record`. The check
+                precedes the method of any subclass.
         """
 
     def run(self, record: Record) -> Estimates:
         """Return the estimates for a batch of records, from one `update` per sample."""
         state = self._state_from("reset", self.reset(record.prior))
         columns: dict[str, np.ndarray] = {}
+        update = type(self).update
+        update = getattr(update, "unchecked", update)  # the record is checked as a whole
         y, u = np.moveaxis(record.y, 1, 0).copy(), np.moveaxis(record.u, 1, 0).copy()
         with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             for k, t in enumerate(record.t):
-                state = self._state_from("update", self.update(state, float(t), y[k], u[k]))
+                state = self._state_from("update", update(self, state, float(t), y[k], u[k]))
                 if k == 0:
                     columns = _empty_columns(state, record.num_samples)
                 for name, column in columns.items():

@@ -1,8 +1,9 @@
 """The check of what an estimator is given, noise by sample, and the bounds of what it returns, the
 same for all estimators.
 
-`BaseEstimator` applies both to the methods ``run`` and ``update`` that a class defines, so that no
-estimator has to, and none can broadcast outputs of another number.
+`BaseEstimator` applies them to the methods ``run``, ``reset`` and ``update`` that a class defines,
+so that no estimator has to, and none can broadcast outputs of another number. What is no sample of
+a record is no sample of ``update`` either.
 """
 
 from __future__ import annotations
@@ -13,10 +14,14 @@ from functools import wraps
 from typing import Any
 
 import numpy as np
+from numpy import vdot as _square
 
 from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.simulation.noise import SampledLevel
-from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.record import Prior, Record, check_use
+from pinnobs_gym.simulation.system import System
+
+_INF = float("inf")
 
 
 def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,29 +44,89 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
     return checked
 
 
-def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method ``update(state, t, y, u)`` with a check of the shapes of y and u before it,
-    and `kept_inside` after it if the system's states have bounds.
+def checked_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the method ``reset(prior)`` with `Prior.check_fits` before it."""
 
-    The check takes less than a microsecond. Values are checked once per record, by `Record`.
-    """
-
-    @wraps(update)
-    def checked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
-        system, batch = self.system, len(state.xhat)
-        if np.shape(y) != (batch, system.ny) or np.shape(u) != (batch, system.nu):
-            raise ValueError(_unfit(type(system).__name__, batch, system, y, u))
-        result, box = update(self, state, t, y, u), system.state_box
-        return result if box is None else kept_inside(result, box)
+    @wraps(reset)
+    def checked(self: Any, prior: Prior) -> Any:
+        prior.check_fits(self.system, len(prior.mean))
+        return reset(self, prior)
 
     return checked
 
 
-def _unfit(kind: str, batch: int, system: Any, y: Any, u: Any) -> str:
-    """Return the line that says which of y and u has not the shape of a sample."""
-    wrong = [
-        f"{name} has shape {np.shape(value)}; expected (batch, n{name})=({batch}, {size})"
-        for name, value, size in (("y", y, system.ny), ("u", u, system.nu))
-        if np.shape(value) != (batch, size)
-    ]
-    return f"{wrong[0]} for {kind}"
+def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the method ``update(state, t, y, u)`` with a check of the sample before it, and
+    `kept_inside` after it if the system's states have bounds.
+
+    The sample has to be what `Record` and `Record.check_fits` accept: a later time, a whole number
+    if the system is a map, outputs that are finite or NaN, finite inputs, and those that the system
+    defines if it uses no measured ones. The check takes about a microsecond, more for such a system
+    with inputs. The attribute ``unchecked`` is the method without it, for the samples of a record,
+    which are checked all at once.
+    """
+
+    @wraps(update)
+    def unchecked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
+        result, box = update(self, state, t, y, u), self.system.state_box
+        return result if box is None else kept_inside(result, box)
+
+    @wraps(update)
+    def checked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
+        system, batch, nu, before = self.system, len(state.xhat), self.system.nu, state.t
+        shapes = (batch, system.ny), (batch, nu)
+        try:
+            # A sum of squares is finite if all numbers are, unless some are huge.
+            usual = (
+                (y.shape, u.shape) == shapes
+                and y.dtype.kind != "c"
+                and not getattr(t, "ndim", 0)
+                and (before is None or t > before)
+                and -_INF < t < _INF
+                and _square(y, y) < _INF
+                and (not nu or _square(u, u) < _INF)
+            )
+        except (AttributeError, TypeError, ValueError):  # of what are no arrays of real numbers
+            usual = False
+        if not usual:
+            _check_sample(system, before, t, y, u, shapes)
+        if (nu and not system.measured_input) or system.discrete:
+            check_use(system, np.array([t], dtype=float), np.asarray(u, dtype=float)[:, None])
+        result, box = update(self, state, t, y, u), system.state_box
+        return result if box is None else kept_inside(result, box)
+
+    checked.unchecked = unchecked  # pyright: ignore[reportAttributeAccessIssue]
+    return checked
+
+
+def _check_sample(
+    system: System,
+    before: float | None,
+    t: Any,
+    y: Any,
+    u: Any,
+    shapes: tuple[tuple[int, int], tuple[int, int]],
+) -> None:
+    """Check the sample at t (s) after that at ``before``, None at the first, with outputs y and
+    inputs u of these shapes, (batch, ny) and (batch, nu).
+
+    Raises:
+        ValueError: in one line that names the value and what was expected.
+    """
+    for name, values, shape in zip("yu", (y, u), shapes, strict=True):
+        if np.shape(values) != shape:
+            raise ValueError(
+                f"{name} has shape {np.shape(values)}; expected (batch, n{name})={shape} for "
+                f"{type(system).__name__}"
+            )
+    prior = Prior(np.zeros((len(y), system.nx)), np.zeros((len(y), system.nx, system.nx)))
+    if np.ndim(t):
+        raise ValueError(f"t has shape {np.shape(t)}; expected one number for all rows")
+    outputs, inputs = (np.asarray(values)[:, None] for values in (y, u))
+    try:
+        record = Record(np.asarray(t)[None], outputs, inputs, prior)
+    except ValueError as error:
+        line = str(error).replace(" at sample 0", f" at t={t}").replace("sample 0", "a sample")
+        raise ValueError(line) from None
+    if before is not None and not record.t[0] > before:
+        raise ValueError(f"t must increase; a sample has t={t} after {before}")

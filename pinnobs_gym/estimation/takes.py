@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import System
-
-if TYPE_CHECKING:
-    from pinnobs_gym.estimation.estimator import BaseEstimator
 
 FEATURES = {
     "maps": "maps x⁺ = f(k, x, u)",
@@ -27,6 +24,13 @@ FEATURES = {
 """What a plant, its noise or its record may have beyond the usual, by name."""
 EVERYTHING = frozenset(FEATURES)
 """The names of all `FEATURES`."""
+
+
+class Taker(Protocol):
+    """An estimator or a trainer, which says what a plant may have."""
+
+    takes: ClassVar[frozenset[str]]
+    """Names of `FEATURES`."""
 
 
 class NotTaken(ValueError):
@@ -51,13 +55,14 @@ def features(system: System, noise: Noise) -> list[str]:
     return [name for name in FEATURES if found[name]]
 
 
-def lacking(cls: type[BaseEstimator], system: System, noise: Noise) -> list[str]:
-    """Return the names of the `FEATURES` that a plant has and an estimator does not take."""
+def lacking(cls: type[Taker], system: System, noise: Noise) -> list[str]:
+    """Return the names of the `FEATURES` that a plant has and an estimator or a trainer does not
+    take."""
     return [name for name in features(system, noise) if name not in cls.takes]
 
 
-def check_taken(cls: type[BaseEstimator], system: System, noise: Noise) -> None:
-    """Check that an estimator takes what a plant has.
+def check_taken(cls: type[Taker], system: System, noise: Noise) -> None:
+    """Check that an estimator or a trainer takes what a plant has.
 
     Raises:
         NotTaken: in one line that names the class, what the plant has and what the class takes.

@@ -105,19 +105,6 @@ class TrainedKKL(Trained):
         check_same(path, sizes, {"nx": system.nx, "ny": system.ny})
 
 
-def check_outputs(system: System) -> None:
-    """Check that z can be driven by the outputs of a system, without jumps.
-
-    Raises:
-        ValueError: in one line, if one of them repeats.
-    """
-    if system.output_period is not None:
-        raise ValueError(
-            f"{type(system).__name__} has output_period={system.output_period}; a KKL observer "
-            "filters the outputs themselves: measure the cosine and the sine instead"
-        )
-
-
 @dataclass(frozen=True)
 class KKL(LearnedEstimator, Estimator):
     """The base class of the learned KKL observers, ż = A_z z + B_z y and x̂ = T*(z).
@@ -145,7 +132,6 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_outputs(self.system)
 
     def reset(self, prior: Prior) -> State:
         return State(np.array(prior.mean, dtype=float))

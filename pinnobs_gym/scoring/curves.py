@@ -19,7 +19,7 @@ from pinnobs_gym.scoring.metrics import by_sample
 from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row, game_of
 from pinnobs_gym.scoring.thinning import kept, kept_of_example, rounded
-from pinnobs_gym.simulation.residual import nearest
+from pinnobs_gym.simulation.residual import Periods, nearest
 from pinnobs_gym.simulation.system import System
 
 
@@ -58,6 +58,8 @@ class Curves:
     """Names of the states, with units in brackets."""
     measured: dict[int, int]
     """Index of each directly measured state, with the index of its output."""
+    state_period: Periods | None = None
+    """Period of each state, as `System.state_period`."""
 
 
 def labels(system: System) -> tuple[str, ...]:
@@ -92,6 +94,7 @@ def curves_of(played: Played) -> Curves:
         ),
         states=labels(system),
         measured=measured_states(system),
+        state_period=system.state_period,
     )
 
 
@@ -113,6 +116,7 @@ def save(folder: Path, row: Row, curves: Curves) -> None:
         "states": curves.states,
         "measured": list(curves.measured.items()),
         "example_seed": int(curves.example.seed),
+        "state_period": curves.state_period,
     }
     example, optional = curves.example, {"reference": curves.reference, "std": curves.example.std}
     arrays: dict[str, Any] = {"t": curves.t, "seeds": curves.seeds, "error": curves.error}
@@ -167,6 +171,7 @@ def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
         example=min((part.example for part, _ in chosen), key=lambda example: example.seed),
         states=first.states,
         measured=first.measured,
+        state_period=first.state_period,
     )
 
 
@@ -188,6 +193,7 @@ def _from_arrays(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> Curves
         example=example,
         states=tuple(about["states"]),
         measured=dict(about["measured"]),
+        state_period=about.get("state_period"),
     )
 
 

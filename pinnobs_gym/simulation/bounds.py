@@ -41,6 +41,11 @@ def box(low: Bounds | None, high: Bounds | None, nx: int) -> StateBox | None:
     """
     if low is None and high is None:
         return None
+    for name, given in (("state_low", low), ("state_high", high)):
+        if given is not None and not isinstance(given, tuple | list):
+            raise ValueError(
+                f"{name}={given!r}; expected a number for each of {nx} states, None for no bound"
+            )
     return _made(low if low is None else tuple(low), high if high is None else tuple(high), nx)
 
 
@@ -53,12 +58,11 @@ def _made(
         bounds = (None,) * nx if given is None else given
         if len(bounds) != nx:
             raise ValueError(f"{name} has {len(bounds)} bounds; expected {nx}, None for no bound")
-        try:
-            side = np.array([missing if bound is None else bound for bound in bounds], dtype=float)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name}={bounds}; expected numbers, None for no bound") from None
-        if np.isnan(side).any():
-            raise ValueError(f"{name}={bounds}; expected numbers, None for no bound")
+        for bound in bounds:
+            number = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
+            if bound is not None and (not number or np.isnan(bound)):
+                raise ValueError(f"{name}={bounds}; expected numbers, None for no bound")
+        side = np.array([missing if bound is None else bound for bound in bounds], dtype=float)
         side.flags.writeable = False
         sides.append(side)
     wrong = np.flatnonzero(~(sides[0] < sides[1]))

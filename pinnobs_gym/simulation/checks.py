@@ -104,20 +104,6 @@ def _system_attributes(cls: type[System]) -> None:
     require(
         frozen and own, f"{cls.__name__} has parameters; expected @dataclass(frozen=True) above it"
     )
-    system = cls()
-    for kind in ("state_names", "output_names", "input_names"):
-        names = getattr(system, kind)
-        require(len(set(names)) == len(names), f"{kind}={names} has a name twice")
-    for name in ("scale", "state_bound"):
-        values = getattr(system, name)
-        if values is not None:
-            numbers = vector(values, system.nx, name)
-            ok = np.isfinite(numbers).all() and (numbers > 0).all()
-            require(ok, f"{name}={values}; expected positive numbers")
-    require(
-        cls.model_step is None or cls.model_step > 0,
-        f"model_step={cls.model_step}; expected a positive number of seconds",
-    )
 
 
 @add_check(SYSTEM_CHECKS, "equations")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
-from pinnobs_gym.simulation.motion import Interval, Motion
+from pinnobs_gym.simulation.motion import Interval, Motion, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
 
 
@@ -59,7 +59,7 @@ def _steps(over: Interval) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray 
     (batch, 1); None if all do.
 
     Raises:
-        ValueError: in one line, if a time is not a whole number.
+        ValueError: in one line, if a time is not a whole number, or the steps are too many.
     """
     t0, t1 = np.asarray(over.t0, dtype=float), np.asarray(over.t1, dtype=float)
     for t in (t0, t1):
@@ -68,6 +68,7 @@ def _steps(over: Interval) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray 
                 f"t={t[t != np.round(t)].flat[0]:g} of {type(over.system).__name__}, a map; "
                 "expected a whole number of steps"
             )
+    check_steps(over.system, t0, t1, float((t1 - t0).max(initial=0.0)), 1.0)
     count = (t1 - t0).astype(int)
     for j in range(int(count.max(initial=0))):
         k = np.asarray(t0 + j)

@@ -14,7 +14,7 @@ from array_api_compat import array_namespace
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.maps import Map
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
-from pinnobs_gym.simulation.motion import Interval, Motion, inputs_at
+from pinnobs_gym.simulation.motion import Interval, Motion, check_steps, inputs_at
 from pinnobs_gym.simulation.noise import Noise, Root
 from pinnobs_gym.simulation.own_flow import OwnFlow
 from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
@@ -313,6 +313,10 @@ def substeps(
     Each item holds the three times (s) at which f is evaluated, the length of the step, and the
     inputs at these times, (3, ..., nu). The times are (3,) or, where t0 and t1 are arrays (batch,),
     (3, batch), and the length is (batch, 1).
+
+    Raises:
+        ValueError: in one line, if they would be too many, see
+            `pinnobs_gym.simulation.motion.check_steps`.
     """
     xp = np if isinstance(x, np.ndarray) else array_namespace(x)
     longest = min(longest, longest_step(system))
@@ -323,6 +327,7 @@ def substeps(
         return
     whole = t1 - t0
     count = max(1, math.ceil(float(whole.max() if by_row else whole) / longest - 1e-6))
+    check_steps(system, t0, t1, count, longest)
     # All rows take the number of steps that the longest interval needs.
     step = whole[:, None] / count if by_row else float(whole) / count
     parts = _PARTS if xp is np else xp.asarray(_PARTS, dtype=x.dtype)
@@ -344,6 +349,7 @@ def _between_breaks(
     input jumps. Rows without such a time in a part have a step of length zero there."""
     t0, t1 = (np.asarray(t, dtype=float) for t in times)
     inside = [b for b in sorted(breaks) if (t0 < b).any() and (b < t1).any()]
+    check_steps(system, t0, t1, len(inside) + float((t1 - t0).max()) / longest, longest)
     ends = [t0, *(np.clip(b, t0, t1) for b in inside), t1]
     whole = np.maximum(t1 - t0, np.finfo(float).tiny)
     for start, end in pairwise(ends):

@@ -13,6 +13,35 @@ from array_api_compat import array_namespace
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import Array, System
 
+MOST_STEPS = 100_000
+"""Largest number of steps of the model or the truth between two samples."""
+
+
+def check_steps(system: System, t0: Array, t1: Array, count: float, longest: float) -> None:
+    """Check that a plant need not take more than `MOST_STEPS` from one sample to the next, which
+    would not end.
+
+    Args:
+        system: the plant.
+        t0: time of the first sample in s, or one for each row (batch,).
+        t1: time of the second.
+        count: number of steps.
+        longest: the longest step in s.
+
+    Raises:
+        ValueError: in one line with the times, the number of steps and what was expected.
+    """
+    if count <= MOST_STEPS:
+        return
+    start, end = np.broadcast_arrays(np.asarray(t0, dtype=float), np.asarray(t1, dtype=float))
+    row = int(np.argmax(end - start))
+    unit, of = ("", "") if system.discrete else (" s", f" of at most {longest:g} s")
+    raise ValueError(
+        f"from t={start.flat[row]:.15g}{unit} to t={end.flat[row]:.15g}{unit}, "
+        f"{type(system).__name__} would take {count:.3g} steps{of}; expected at most {MOST_STEPS} "
+        "between two samples, with all times of one clock and in the unit of the model"
+    )
+
 
 @dataclass(frozen=True, eq=False)
 class Interval:

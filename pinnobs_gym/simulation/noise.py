@@ -26,26 +26,28 @@ NOISE_FLOOR = 1e-3
 """Standard deviation that filters assume for outputs without noise, relative to their scale."""
 
 
-def noise_root(level: Level, size: int | None, name: str) -> np.ndarray:
+def noise_root(level: Level, size: int | None, name: str, plant: str = "") -> np.ndarray:
     """Return the matrix M (size, m) of the noise Mw, where w has independent components of unit
     variance; m is ``size`` unless a matrix is given. If ``size`` is None, any size is right.
+    Messages give the name of the level and, if there is one, of the plant.
 
     Raises:
         ValueError: in one line, if the level is not of the right size, or not of finite numbers,
             standard deviations at least 0.
     """
+    of = f" of {plant}" if plant else ""
     try:
         given = np.asarray(level, dtype=float)
     except (TypeError, ValueError):
         given = np.array(np.nan)
     if given.ndim < 2 and not (np.isfinite(given).all() and (given >= 0).all()):
-        raise ValueError(f"{name}={level}; expected numbers of at least 0")
+        raise ValueError(f"{name}={level!r}{of}; expected numbers of at least 0")
     if not np.isfinite(given).all():
-        raise ValueError(f"{name}={level}; expected a matrix of finite numbers")
+        raise ValueError(f"{name}={level!r}{of}; expected a matrix of finite numbers")
     rows = (given.shape or (1,))[0] if size is None else size
     if given.ndim > 2 or (given.ndim and len(given) != rows):
         raise ValueError(
-            f"{name} has shape {given.shape}; expected {rows} number(s), or a matrix of "
+            f"{name}{of} has shape {given.shape}; expected {rows} number(s), or a matrix of "
             f"{rows} row(s)"
         )
     return given if given.ndim == 2 else np.diag(np.broadcast_to(given, rows))

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.system import System, initial_states
+from pinnobs_gym.simulation.declared import check_declared
+from pinnobs_gym.simulation.system import System, initial_states, is_number
 
 
 class ModelError(TypeError):
@@ -34,12 +35,17 @@ def probe(cls: type[System]) -> None:
     benchmark's parameters.
 
     Raises:
-        ModelError: in one line, if one of them raises an exception, returns another shape than
-            expected, or returns other values when it is called again.
+        TypeError: in one line, if the class declares what it should not, see `check_declared`.
+        ModelError: in one line, if one of its functions raises an exception, returns another shape
+            than expected, or returns other values when it is called again.
     """
+    check_declared(cls)
     system, setup = cls.configured()
     times = np.linspace(0.0, setup.duration, 3)
     times = np.floor(times) if cls.discrete else times  # those of a map are whole numbers
+    _check_breakpoints(system)
+    if system.draws_input:
+        _check_drawn(system, setup.times)
     inputs = _call(system, "input", (system.nu,), t=times)
     _call(system, "admissible", (), x=np.zeros((3, system.nx)) + setup.start(system.nx).mean)
     states = initial_states(system, setup, 6)
@@ -89,6 +95,37 @@ def probe_torch(cls: type[System], name: str) -> None:
         raise where.failed(error, what) from error
     if not isinstance(value, torch.Tensor):
         raise where.returned(value, what)
+
+
+def _check_breakpoints(system: System) -> None:
+    """Raise ModelError unless the breakpoints are a tuple or a list of finite numbers."""
+    where = _Where(system, "breakpoints")
+    what = "; expected a tuple of finite times in s, () for none"
+    try:
+        times = system.breakpoints()
+    except Exception as error:  # whatever the user's function raises
+        raise where.failed(error, what.removeprefix("; ")) from error
+    if not isinstance(times, tuple | list) or not all(
+        is_number(t) and np.isfinite(t) for t in times
+    ):
+        raise where.found(f"returns {times!r}{what}")
+
+
+def _check_drawn(system: System, times: np.ndarray) -> None:
+    """Raise ModelError unless the inputs drawn at these times (num_samples,) are finite numbers,
+    shape (num_samples, nu)."""
+    where, shape = _Where(system, "draw_input"), (len(times), system.nu)
+    what = f"for times {times.shape}; expected finite numbers of shape {shape}"
+    try:
+        u = system.draw_input(np.random.default_rng(0), times)
+    except Exception as error:  # whatever the user's function raises
+        raise where.failed(error, what) from error
+    if np.shape(u) != shape:
+        raise where.returned(u, what)
+    array = np.asarray(u)
+    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+        wrong = array[~np.isfinite(array)][0] if array.dtype.kind in "biuf" else array.flat[0]
+        raise where.found(f"returns the input {wrong} {what}")
 
 
 def _call(system: System, name: str, shape: tuple[int, ...], **arguments: np.ndarray) -> np.ndarray:

@@ -11,15 +11,27 @@ from typing import Any
 import numpy as np
 
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.motion import check_steps
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System
 
+_ROUNDING = 1e-6
+"""Largest difference of an input from that which a system defines, relative to its size."""
+_TIMES = 200
+"""Number of times at which that size is found."""
+_SIZE = "_input_size"
+"""Key of the size among the attributes of a system."""
 _SHOWN = 60
 """Number of characters of a text that a message shows."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """The prior of the initial state of a batch of episodes."""
+    """The prior of the initial state of a batch of episodes.
+
+    Raises:
+        ValueError: in one line, if an array does not hold finite real numbers.
+    """
 
     mean: np.ndarray
     """Prior means x̂₀, shape (batch, nx), in state units."""
@@ -28,7 +40,26 @@ class Prior:
 
     def __post_init__(self) -> None:
         for name in ("mean", "cov"):
-            object.__setattr__(self, name, _real(f"the prior's {name}", getattr(self, name)))
+            array = _real(f"the prior's {name}", getattr(self, name))
+            if not np.isfinite(array).all():
+                wrong = float(array[~np.isfinite(array)][0])
+                raise ValueError(f"the prior's {name} has the entry {wrong}; expected finite ones")
+            object.__setattr__(self, name, array)
+
+    def check_fits(self, system: System, batch: int) -> None:
+        """Check that the prior is one of a system's states, for a number of episodes.
+
+        Raises:
+            ValueError: in one line that names the array, its shape and the shape expected.
+        """
+        nx = system.nx
+        for name, size in (("mean", (nx,)), ("cov", (nx, nx))):
+            shape, expected = getattr(self, name).shape, (batch, *size)
+            if shape != expected:
+                raise ValueError(
+                    f"the prior's {name} has shape {shape}; {type(system).__name__} has nx={nx}, "
+                    f"expected {expected}"
+                )
 
     @staticmethod
     def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
@@ -111,13 +142,7 @@ class Record:
             ValueError: in one line that names the array, its size and the size expected, the
                 sample, or the input that differs from the one that the system defines.
         """
-        kind, nx = type(system).__name__, system.nx
-        if system.discrete and (self.t != np.round(self.t)).any():
-            sample = int(np.flatnonzero(self.t != np.round(self.t))[0])
-            raise ValueError(
-                f"sample {sample} has t={self.t[sample]:g}; {kind} is a map, expected a whole "
-                "number of steps"
-            )
+        kind = type(system).__name__
         sizes = {"y": system.ny, "u": system.nu, "noise_std": system.ny}
         for name, size in sizes.items():
             array, last = getattr(self, name), "u" if name == "u" else "y"
@@ -126,22 +151,8 @@ class Record:
                     f"{name} has {array.shape[2]} column(s) in the record; {kind} has "
                     f"n{last}={size}"
                 )
-        if system.nu and not system.measured_input:
-            known = np.asarray(system.input(self.t))
-            size = np.maximum(abs(known).max(axis=0), abs(self.u).max(axis=(0, 1)))
-            other = (abs(self.u - known) > 1e-6 * size).any(axis=(0, 1))
-            if other.any():
-                name = system.input_names[int(np.flatnonzero(other)[0])]
-                raise ValueError(
-                    f"input {name} of the record is not that of {kind}.input, which the model "
-                    f"uses; expected the same, or {kind}(measured_input=True) for the record's"
-                )
-        for name, size in (("mean", (nx,)), ("cov", (nx, nx))):
-            shape, expected = getattr(self.prior, name).shape, (self.batch, *size)
-            if shape != expected:
-                raise ValueError(
-                    f"the prior's {name} has shape {shape}; {kind} has nx={nx}, expected {expected}"
-                )
+        check_use(system, self.t, self.u)
+        self.prior.check_fits(system, self.batch)
 
     @property
     def batch(self) -> int:
@@ -167,6 +178,45 @@ class Record:
         """Return the record of some of the samples."""
         std = None if self.noise_std is None else self.noise_std[:, chosen]
         return Record(self.t[chosen], self.y[:, chosen], self.u[:, chosen], self.prior, std)
+
+
+def check_use(system: System, t: np.ndarray, u: np.ndarray) -> None:
+    """Check that a system can use samples at times t (num_samples,), whole numbers for a map, and
+    uses the inputs u (batch, num_samples, nu) that it is given.
+
+    A system without measured inputs moves by those of its `System.input`. Others are refused;
+    differences by a millionth of their size may be those of rounding to single precision.
+
+    Raises:
+        ValueError: in one line that names the time or the input and what was expected.
+    """
+    kind = type(system).__name__
+    if system.discrete and (t != np.round(t)).any():
+        wrong = t[t != np.round(t)][0]
+        raise ValueError(f"a sample has t={wrong:g}; {kind} is a map, expected whole numbers")
+    if system.nu and not system.measured_input:
+        known = np.asarray(system.input(t))
+        size = np.maximum(abs(known).max(axis=0), abs(u).max(axis=(0, 1)))
+        other = abs(u - known) > _ROUNDING * np.maximum(size, _input_size(system))
+        if other.any():
+            row, sample, i = (int(index) for index in np.argwhere(other)[0])
+            raise ValueError(
+                f"input {system.input_names[i]}={u[row, sample, i]:.6g} at t={t[sample]:g} is not "
+                f"that of {kind}.input, {known[sample, i]:.6g}, which the model uses; expected the "
+                f"same, or {kind}(measured_input=True) to use those given"
+            )
+
+
+def _input_size(system: System) -> np.ndarray:
+    """Return the largest absolute value of each input (nu,) that the system defines over the
+    benchmark's duration. It is kept among the attributes of the instance."""
+    kept = vars(system)
+    if _SIZE not in kept:
+        t = np.linspace(0.0, system.setups["benchmark"].duration, _TIMES)
+        kept[_SIZE] = abs(np.asarray(system.input(np.floor(t) if system.discrete else t))).max(
+            axis=0
+        )
+    return kept[_SIZE]
 
 
 def _real(name: str, value: Any) -> np.ndarray:
@@ -228,6 +278,7 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
     if len(wrong):
         number, later, earlier = rows[wrong[0] + 2][0], t[wrong[0] + 1], t[wrong[0]]
         raise ValueError(f"log {path}, line {number}: t={later} after {earlier}; t must increase")
+    _check_gaps(system, t, [f"log {path}, line {number}" for number, _ in rows[1:]])
     y = np.stack([table[name] for name in outputs], axis=-1)[None]
     if np.isnan(y).all():
         raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
@@ -244,6 +295,19 @@ def read_log(path: str | Path, system: System, prior: Prior) -> tuple[System, Re
         unknown = np.full(len(t), np.nan)
         std = np.stack([table.get(f"{output}_std", unknown) for output in outputs], axis=-1)[None]
     return replace(system, measured_input=bool(inputs)), Record(t, y, u[None], prior, std)
+
+
+def _check_gaps(system: System, t: np.ndarray, places: list[str]) -> None:
+    """Raise ValueError, with the place of the sample after it, if the model would take too many
+    steps through the longest gap between times t (num_samples,) in s."""
+    if len(t) < 2 or system.own_flow:
+        return
+    k = int(np.argmax(np.diff(t)))
+    longest = longest_step(system)
+    try:
+        check_steps(system, t[k], t[k + 1], float(t[k + 1] - t[k]) / longest, longest)
+    except ValueError as error:
+        raise ValueError(f"{places[k + 1]}: {error}") from None
 
 
 def _kept(values: np.ndarray) -> np.ndarray:

@@ -122,8 +122,9 @@ class Box(StartLaw):
 class Gaussian(StartLaw):
     """Gaussian states N(x̂₀, P₀).
 
-    The prior that estimators are given is this Gaussian itself, even where `System.admissible`
-    restricts the states. Its set is the ellipsoid that holds 95 % of the states; the box about it
+    Where `System.admissible` restricts the states, the prior that estimators are given has the mean
+    and the covariance of those that are left (`pinnobs_gym.simulation.initial_set.prior_moments`).
+    Its set is the ellipsoid that holds 95 % of the states; the box about it
     extends three standard deviations to each side.
     """
 
@@ -306,7 +307,10 @@ class Joint(StartLaw):
 def check_covariance(rows: Sequence[Sequence[float]], name: str) -> None:
     """Raise ValueError, in one line, unless the rows are those of a covariance; zero variances are
     allowed."""
-    P = np.array(rows, dtype=float)
+    try:
+        P = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}={rows!r}; expected a covariance, rows of numbers") from None
     if P.ndim != 2 or P.shape[0] != P.shape[1]:
         raise ValueError(f"{name}={rows}; expected a covariance, as many rows as columns")
     size = abs(P).max(initial=0.0)

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pinnobs_gym.simulation.motion import Interval
+from pinnobs_gym.simulation.motion import Interval, check_steps
 from pinnobs_gym.simulation.rosenbrock import Rows, rosenbrock
 from pinnobs_gym.simulation.system import vector
 
@@ -38,6 +38,9 @@ def controlled_steps(over: Interval, x: np.ndarray) -> Iterator[Step]:
     end = np.broadcast_to(np.asarray(over.t1, dtype=float), shape)
     breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
     whole = end - t
+    if system.model_step is not None:
+        count = float(whole.max(initial=0.0)) / system.model_step
+        check_steps(system, t, end, count, system.model_step)
     wanted = np.minimum(_first(over, x, scale, _piece(breaks, t, end)), longest)
     for _ in range(_ATTEMPTS):
         stop, last = _piece(breaks, t, end)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
@@ -13,7 +12,7 @@ from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
-from pinnobs_gym.simulation.residual import Periods, check_periods, residual
+from pinnobs_gym.simulation.residual import Periods, residual
 from pinnobs_gym.simulation.start_law import Box, StartLaw, check_covariance
 
 Array: TypeAlias = Any
@@ -30,6 +29,7 @@ class PoorPrior:
     """Covariance P₀, nx rows of nx numbers, in products of state units."""
 
     def __post_init__(self) -> None:
+        _check_finite(self.xhat0, "xhat0 of the poor prior")
         check_covariance(self.P0, "P0")
 
 
@@ -88,11 +88,11 @@ class Setup:
     """Physical parameters that replace the system's defaults."""
 
     def __post_init__(self) -> None:
-        for name in ("dt", "duration", "transient"):
+        for name in ("dt", "duration", "transient", "truth_step"):
             value = getattr(self, name)
-            if name == "transient" and value is None:
+            if name in ("transient", "truth_step") and value is None:
                 continue
-            if not (isinstance(value, int | float | np.number) and 0 < value < np.inf):
+            if not (is_number(value) and 0 < value < np.inf):
                 raise ValueError(f"{name}={value} s; expected a positive number of seconds")
         if self.duration < self.dt * (1 - 1e-9):
             raise ValueError(
@@ -100,6 +100,14 @@ class Setup:
             )
         for name in ("noise_std", "process_noise"):
             noise_root(getattr(self, name), None, name)
+        for name, kind in (("x0_law", StartLaw), ("poor_prior", PoorPrior)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise ValueError(f"{name}={value!r}; expected None or a {kind.__name__}")
+        if not isinstance(self.parameters, Mapping):
+            raise ValueError(f"parameters={self.parameters!r}; expected values by name")
+        for name in ("x0_low", "x0_high", "xhat0"):
+            _check_finite(getattr(self, name), name)
         corners = [name for name in ("x0_low", "x0_high") if getattr(self, name) is not None]
         if len(corners) != (0 if self.x0_law else 2):
             given = ", ".join([*corners, *(["x0_law"] if self.x0_law else [])]) or "neither"
@@ -233,6 +241,11 @@ class System(ABC):
     def nu(self) -> int:
         """Number of inputs."""
         return len(self.input_names)
+
+    @property
+    def time_unit(self) -> str:
+        """The unit of time: the step of a map, and the second otherwise."""
+        return "steps" if self.discrete else "s"
 
     @property
     def state_box(self) -> StateBox | None:
@@ -424,13 +437,13 @@ class System(ABC):
         samples = noise_std if isinstance(noise_std, SampledLevel) else None
         given = noise_std.base if isinstance(noise_std, SampledLevel) else noise_std
         level = own.noise_std if given is None else given
-        output = noise_root(level, self.ny, f"noise_std of {name}")
+        output = noise_root(level, self.ny, "noise_std", name)
         if output.shape != (self.ny, self.ny):
             raise ValueError(
                 f"noise_std of {name} has shape {output.shape}; expected ({self.ny}, {self.ny})"
             )
         level = own.process_noise if process_noise is None else process_noise
-        return Noise(noise_root(level, self.nx, f"process_noise of {name}"), output, samples)
+        return Noise(noise_root(level, self.nx, "process_noise", name), output, samples)
 
     @property
     def own_flow(self) -> bool:
@@ -460,31 +473,22 @@ class System(ABC):
 
     @classmethod
     def validate(cls) -> None:
-        """Check the class attributes of a new system.
+        """Check the class attributes of a new system; see
+        `pinnobs_gym.simulation.declared.check_declared`.
 
         Raises:
             TypeError: in one line, naming the class and what is missing or has the wrong size.
         """
+        from pinnobs_gym.simulation.declared import check_declared
+
         for name in ("state_names", "output_names", "scale", "setups"):
             if getattr(cls, name, None) is None:
                 raise TypeError(f"system {cls.__name__} has no class attribute {name!r}")
-        for name, expected in (("f", "t, x, u"), ("h", "t, x, u"), ("flow", "t0, t1, x, u")):
-            taken = list(inspect.signature(getattr(cls, name)).parameters)
-            if len(taken) != 1 + len(expected.split()):
-                raise TypeError(
-                    f"system {cls.__name__}: {name}({', '.join(taken)}); "
-                    f"expected {name}(self, {expected})"
-                )
+        check_declared(cls)
         cls._validate_motion()
-        if "benchmark" not in cls.setups:
-            raise TypeError(f"system {cls.__name__} has no setup named 'benchmark'")
         try:
             for name in cls.setups:
                 system, setup = cls.configured(name)
-                vector(cls.scale, system.nx, "scale")
-                check_periods(system.output_period, system.ny, "output_period")
-                check_periods(system.state_period, system.nx, "state_period")
-                box(system.state_low, system.state_high, system.nx)
                 for part in ("x0_low", "x0_high"):
                     if getattr(setup, part) is not None:
                         vector(getattr(setup, part), system.nx, f"{part} of setup {name!r}")
@@ -497,6 +501,16 @@ class System(ABC):
         unknown = [name for name in cls.uncertain or () if name not in cls().parameters]
         if unknown:
             raise TypeError(f"system {cls.__name__}: uncertain names no parameter {unknown[0]!r}")
+
+
+def _check_finite(values: Any, name: str) -> None:
+    """Raise ValueError, naming the value, unless it is None, a number or several finite ones."""
+    try:
+        known = values is None or bool(np.isfinite(np.asarray(values, dtype=float)).all())
+    except (TypeError, ValueError):
+        known = False
+    if not known:
+        raise ValueError(f"{name}={values!r}; expected finite numbers")
 
 
 def _check_sizes(prior: Setup | PoorPrior, nx: int, where: str) -> None:

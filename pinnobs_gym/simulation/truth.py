@@ -15,7 +15,7 @@ from numpy.polynomial import chebyshev
 from pinnobs_gym.simulation import dop853
 from pinnobs_gym.simulation.driven import driven
 from pinnobs_gym.simulation.maps import Map
-from pinnobs_gym.simulation.motion import Interval
+from pinnobs_gym.simulation.motion import Interval, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
 from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import System, vector
@@ -69,6 +69,7 @@ def truth(
         States, shape (num_samples, batch, nx).
 
     Raises:
+        ValueError: in one line, if it would take too many steps between two samples.
         FloatingPointError: in one line, if a state is not finite, or the adaptive method cannot go
             on beyond some time.
     """
@@ -82,13 +83,14 @@ def truth(
         _check_finite(system, x0, x)
         return x
     longest = max_step or float(times[-1] - times[0]) / 100
+    _check_gaps(system, times, longest)
     if inputs is not None:  # they, or their slopes, jump at each sample
         for k in range(len(times) - 1):
             plant = driven(system, times[k : k + 2], inputs[k : k + 2])
             truth(plant, x[k], times[k : k + 2], longest, x[k : k + 2])
         return x
     # Integrate each interval between breakpoints separately, since f is smooth only within it.
-    ends = [b for b in system.breakpoints() if times[0] < b < times[-1]] + [times[-1]]
+    ends = [b for b in _breakpoints(system) if times[0] < b < times[-1]] + [times[-1]]
     start, state = float(times[0]), np.asarray(x0, dtype=float)
     done = 1
     for end in ends:
@@ -99,6 +101,20 @@ def truth(
         done, start, state = stop, float(end), last
     _check_finite(system, x0, x)
     return x
+
+
+def _check_gaps(system: System, times: np.ndarray, longest: float) -> None:
+    """Raise ValueError, in one line, if steps of at most ``longest`` (s) are too many between two
+    of the samples at these times (num_samples,)."""
+    if len(times) > 1 and not (system.discrete or system.stiff):
+        k = int(np.argmax(np.diff(times)))
+        count = float(times[k + 1] - times[k]) / longest
+        check_steps(system, times[k], times[k + 1], count, longest)
+
+
+def _breakpoints(system: System) -> list[float]:
+    """Return the system's breakpoints in s, ascending and each once."""
+    return sorted(set(system.breakpoints()))
 
 
 def noise_shape(system: System, noise: Noise, dt: float, step: float) -> tuple[int, int, int]:
@@ -112,7 +128,12 @@ def noise_shape(system: System, noise: Noise, dt: float, step: float) -> tuple[i
         dt: time between samples in s.
         step: longest step of the model in s, see
             `pinnobs_gym.simulation.runge_kutta.longest_step`.
+
+    Raises:
+        ValueError: in one line, if there would be too many parts.
     """
+    if not system.stiff:
+        check_steps(system, 0.0, dt, dt / step, step)
     if system.discrete:
         return round(dt), 1, noise.L(0.0).shape[1]
     if system.stiff:
@@ -152,11 +173,13 @@ def disturbed_truth(
         States, shape (num_samples, batch, nx).
 
     Raises:
+        ValueError: as `truth`.
         FloatingPointError: if a state is not finite.
     """
     x = np.empty((len(times), *x0.shape)) if out is None else out
     x[0] = x0
     longest = max_step or float(times[-1] - times[0]) / 100
+    _check_gaps(system, times, longest)
     stages = np.empty((1 + len(dop853.B), *x0.shape))
     stages[0] = x0
     with np.errstate(all="ignore"):
@@ -217,7 +240,7 @@ def _through_part(
 ) -> None:
     """Advance the state in ``stages`` from one time to another, in steps no longer than ``longest``
     (s) that begin anew at each breakpoint."""
-    ends = [b for b in system.breakpoints() if start < b < end] + [end]
+    ends = [b for b in _breakpoints(system) if start < b < end] + [end]
     for part in ends:
         steps = max(1, int(np.ceil((part - start) / longest - 1e-9)))
         step = round((part - start) / steps, 15)

@@ -13,6 +13,7 @@ import numpy as np
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.trained import Ending, Trained
 from pinnobs_gym.estimation.learned.trained_file import plain
+from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
 from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -65,6 +66,9 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
     """Name of the trainer, which its estimators give in ``needs_training``."""
     presets: ClassVar[Mapping[str, Callable[[], Any]]]
     """Functions by name, each of which returns a complete Config; the first is the default."""
+    takes: ClassVar[frozenset[str]] = EVERYTHING
+    """What a plant may have, as `BaseEstimator.takes` of the estimators that need the trainer. A
+    plant with anything else is refused before the training."""
     paced_by_budget: ClassVar[bool] = False
     """Whether `finished` takes the budget into account, because the schedule depends on it."""
 
@@ -86,6 +90,7 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         self.system, self.config = system, config
         self.levels = noise_std, process_noise
         self.noise = system.noise(*self.levels)
+        check_taken(type(self), system, self.noise)
         self.noise_std = np.sqrt(np.einsum("iib->i", self.noise.R(0.0)))
         self.episode = episode
         self.condition = condition if game is None else game.name.condition

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,21 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
     assert first[2][1] == "0.0,0.0,0.0"  # the initial estimate, untouched by the output
 
 
+@pytest.mark.parametrize("level", [(0.3,), (0.3, 0.3), (0.1, 0.0)])
+def test_estimate_with_process_noise(folder, level):
+    """As an EKF that is told it; one number is that of every state."""
+    source = EpisodeSource("ReverseDuffing", duration=1.0)
+    _, record = write_log(folder / "log.csv", source)
+    common = ("estimate", "--system", "ReverseDuffing", "--log", "log.csv")
+    assert run(*common, "--process-noise", *level) == 0
+    table = np.loadtxt(folder / "estimates.csv", delimiter=",", skiprows=1)
+    told = level if len(level) == 2 else level[0]
+    own = EKF.for_setup(source.system, replace(source.setup, process_noise=told)).run(record)
+    np.testing.assert_allclose(table[:, 1:3], own.xhat[0], rtol=1e-12)
+    without = EKF.for_setup(source.system, source.setup).run(record)
+    assert abs(own.xhat - without.xhat).max() > 1e-4
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -118,6 +134,22 @@ def test_estimate_with_settings_prior_and_another_estimator(folder):
             "deviations (-1.0",
         ),
         (["estimate", "--system", "Academic", "--log", "none_at_all.csv"], "no output at all"),
+        (
+            ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", "-1"],
+            "process_noise=-1.0 of Academic; expected numbers of at least 0",
+        ),
+        (
+            ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", "1", "nan"],
+            "process_noise=(1.0, nan) of Academic; expected numbers of at least 0",
+        ),
+        (
+            ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", *"123"],
+            "process_noise of Academic has shape (3,); expected 2 number(s)",
+        ),
+        (
+            ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", "x"],
+            "invalid",
+        ),
         (["estimate", "--system", "Academic", "--log", "twice.csv"], "has column y1 twice"),
         (["evaluate", "--system", "failing_plug_in:X"], "'failing_plug_in:X': SyntaxError"),
         (["evaluate", "--system", "Academic", "--set", "assumed_noise=a"], "expected a number"),

@@ -1,5 +1,6 @@
 """The page of a system."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,3 +80,13 @@ def test_the_page_says_where_jacobians_come_from():
     assert "The Jacobian of f is found by finite differences, because it cannot be traced (" in text
     assert "; that of h is written by hand." in text
     assert "process noise [0.1, 0.0] per step" in text
+
+
+def test_the_unit_of_time_of_a_map_is_the_step():
+    """Whatever the page says of time; seconds stay those of a plant in continuous time."""
+    text = page(Draughts, "pinnobs/Draughts-v0")
+    assert "Truncated after 10 actions, 10 steps at 1 step in the `benchmark` setup" in text
+    seconds = re.findall(r"[\d.]+ s\b[^|]*", text)
+    assert seconds == ["1 s (of a map: as many steps), at most 20 % of the time "]
+    assert "√s" not in text
+    assert "10 actions, 1 s at 0.1 s in" in page(Jar, "pinnobs/Jar-v0")

@@ -100,6 +100,27 @@ def test_a_figure_has_a_gap_where_the_estimate_passes_the_opposite():
     np.testing.assert_allclose(np.unique(np.round(y[~np.isnan(y)] - 3.0, 9)), [0, TURN, 2 * TURN])
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_lines_of_a_wrapped_heading_have_gaps(known):
+    """True states and estimates from −π to π, as those of a map may be, through which the heading
+    turns twice; one that counts turns has no gap, however fast it is."""
+    heading, record, _ = north_record(Compass())
+    x = np.stack([np.angle(np.exp(1j * heading[2])), np.zeros(len(record.t))], axis=-1)
+    xhat = x + np.array([1e-3, 0.0])
+    shown = {"x": x} if known else {}
+    figure = state_figure(Compass(), record.t, xhat, **shown)
+    for line in figure.axes[0].lines:
+        y = np.asarray(line.get_ydata())
+        crossed = int((abs(np.diff(x[:, 0])) > TURN / 2).sum())
+        assert np.isnan(y).sum() == crossed == 2
+        assert np.nanmax(abs(np.diff(y))) < 0.1
+    fast = np.stack([3.5 * np.arange(50.0), np.zeros(50)], axis=-1)
+    shown = {"x": fast} if known else {}
+    figure = state_figure(Compass(), record.t[:50], fast, **shown)
+    for line in figure.axes[0].lines:
+        assert not np.isnan(np.asarray(line.get_ydata())).any()
+
+
 def test_frames_draw_the_angle_nearest_to_the_heading():
     """The curves of the last frame, of an estimate half a degree ahead and some turns off."""
     heading, record, _ = north_record(Compass())

@@ -181,5 +181,5 @@ def test_what_is_no_input_is_refused(value):
         def draw_input(self, rng, times):
             return value
 
-    with pytest.raises(ValueError, match=r"Wrong.draw_input returned .* expected finite numbers"):
+    with pytest.raises(TypeError, match=r"Wrong.draw_input .* expected finite numbers"):
         played(Wrong)

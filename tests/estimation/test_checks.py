@@ -344,7 +344,7 @@ def test_a_prior_mean_without_derivative_is_warned_of() -> None:
         (WrongTwin, "indistinguishable", "outputs of indistinguishable states"),
         (EmptySet, "initial_states", "0 of .* states of the setup's law are admissible"),
         (Explosive, "initial_states", "leaves the finite numbers"),
-        (NoScale, "attributes", r"scale=\(1.0, 0.0\); expected positive"),
+        (NoScale, "attributes", r"scale=\(1.0, 0.0\); expected a positive"),
         (NotDecorated, "attributes", "expected @dataclass"),
     ],
 )

@@ -153,8 +153,8 @@ def test_hubers_weight_enlarges_the_variance_of_an_outlier_alone():
         ({"gate": 0.99, "patience": 0}, "patience=0; expected at least 1"),
         ({"huber": 0.0}, "huber=0.0; expected a positive number"),
         ({"assumed_noise": -1.0}, "assumed_noise=-1.0; expected a number of at least 0"),
-        ({"process_noise": -1.0}, "process_noise of Linear=-1.0; expected numbers of at least 0"),
-        ({"noise_std": -0.1}, "noise_std of Linear=-0.1; expected numbers of at least 0"),
+        ({"process_noise": -1.0}, "process_noise=-1.0 of Linear; expected numbers of at least 0"),
+        ({"noise_std": -0.1}, "noise_std=-0.1 of Linear; expected numbers of at least 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options, message):

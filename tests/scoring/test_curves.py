@@ -47,13 +47,14 @@ def row(seed=3):
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    curves.save(tmp_path, row(), one())
+    curves.save(tmp_path, row(), one(state_period=(6.5, None)))
     found = curves.read(tmp_path, NOISY)
     (back,) = found["4567", "0123"]
     np.testing.assert_array_equal(back.error, one().error)
     np.testing.assert_array_equal(back.example.x, one().example.x)
     assert (back.states, back.measured, back.example.seed) == (("a (m)", "b"), {0: 0}, 3)
     assert back.reference is None
+    assert back.state_period == [6.5, None]
     assert back.example.std is None
     assert curves.read(tmp_path, NOMINAL) == {}
 

@@ -14,6 +14,7 @@ from pinnobs_gym.estimators.mhe import MHE
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.initial_set import prior_moments, set_moments
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.start_law import Gaussian, Points
 from pinnobs_gym.simulation.system import PoorPrior, Setup, System, independent, stack
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.satellite import Satellite
@@ -130,6 +131,66 @@ def test_the_default_is_computed_as_precisely(name):
     assert (abs(cov - exact_cov) < 1e-4 * np.outer(std, std)).all()
     assert (mean[abs(exact_mean) < 1e-9] == 0).all()
     assert (cov[~np.eye(len(cov), dtype=bool)] == 0).all()
+
+
+@dataclass(frozen=True)
+class Half(Satellite):
+    """Only states whose first component is not negative are admissible."""
+
+    def admissible(self, x0):
+        return x0[..., 0] >= 0
+
+
+def half_normal(cov):
+    """Mean and covariance of N(0, cov) given that the first component is not negative, in which
+    the others are linear but for a remainder that is independent of it."""
+    slope = cov[:, 0] / cov[0, 0]
+    mean = slope * np.sqrt(2 * cov[0, 0] / np.pi)
+    return mean, cov - np.outer(slope, slope) * cov[0, 0] * 2 / np.pi
+
+
+@pytest.mark.parametrize(
+    "root",
+    [
+        [[1.5, 0.0, 0.0], [0.4, 0.6, 0.0], [-0.3, 0.2, 0.5]],
+        [[2.0], [1.0], [-0.5]],  # singular: a line
+        [[0.5, 0.0], [0.0, 0.0], [0.7, 1.0]],  # singular: the second is known
+    ],
+)
+def test_a_restricted_gaussian_is_told_as_it_is_drawn(root):
+    cov = np.array(root) @ np.array(root).T
+    law = Gaussian((0.0, 2.0, 2.0), tuple(map(tuple, cov.tolist())))
+    setup = Setup(x0_law=law, duration=1.0, dt=0.1)
+    mean, P = prior_moments(Half(), setup)
+    expected_mean, expected = half_normal(cov)
+    std = np.sqrt(np.diag(cov))
+    assert (abs(mean - law.mean - expected_mean) <= 5e-3 * std).all()
+    assert (abs(P - expected) <= 5e-3 * np.outer(std, std)).all()
+    assert np.linalg.matrix_rank(P, tol=1e-9) == np.linalg.matrix_rank(cov)
+    again = prior_moments(Half(), replace(setup, dt=0.2))
+    np.testing.assert_array_equal(again[0], mean)
+    np.testing.assert_array_equal(again[1], P)
+    free = prior_moments(Free(), setup)
+    np.testing.assert_array_equal(free[0], law.mean)
+    np.testing.assert_array_equal(free[1], law.cov)
+
+
+@dataclass(frozen=True)
+class Free(Satellite):
+    admissible = System.admissible
+
+
+def test_a_restricted_list_is_told_as_it_is_drawn():
+    law = Points(((-1.0, 0.0, 2.0), (1.0, 3.0, 2.0), (2.0, 1.0, 2.0)))
+    mean, P = prior_moments(Half(), Setup(x0_law=law, duration=1.0, dt=0.1))
+    np.testing.assert_allclose(mean, (1.5, 2.0, 2.0))
+    np.testing.assert_allclose(P, [[0.25, -0.5, 0.0], [-0.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+def test_a_gaussian_of_no_admissible_state_is_refused():
+    law = Gaussian((-9.0, 2.0, 2.0), independent(0.1, 0.1, 0.1))
+    with pytest.raises(ValueError, match=r"^Half: none of \d+ states is admissible; x₀ Gaussian"):
+        prior_moments(Half(), Setup(x0_law=law, duration=1.0, dt=0.1))
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ def test_inputs_that_the_model_would_not_use_are_refused():
     record = record_of(EpisodeSource(FeedThrough), 2)
     EKF(FeedThrough()).run(record)
     other = replace(record, u=record.u + 0.5)
-    with pytest.raises(ValueError, match=r"input u1 .* is not that of FeedThrough\.input") as error:
+    with pytest.raises(ValueError, match=r"input u1=.* is not that of FeedThrough\.input") as error:
         EKF(FeedThrough()).run(other)
     assert "\n" not in str(error.value)
     EKF(FeedThrough(measured_input=True)).run(other)

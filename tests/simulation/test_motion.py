@@ -174,7 +174,7 @@ def test_times_of_a_map_are_whole_numbers():
     t = np.array([0.0, 1.0, 2.5])
     prior = Prior.of(Matrix(), BOX, 1)
     record = Record(t, np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), prior)
-    with pytest.raises(ValueError, match=r"sample 2 has t=2\.5; Matrix is a map"):
+    with pytest.raises(ValueError, match=r"a sample has t=2\.5; Matrix is a map"):
         EKF(Matrix()).run(record)
     with pytest.raises(ValueError, match=r"t=2\.5 of Matrix, a map"):
         model_step(Matrix(), 0.0, 2.5, np.zeros((1, 2)))

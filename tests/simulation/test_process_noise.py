@@ -324,11 +324,11 @@ def test_what_is_assumed_beyond_is_a_share_of_scale_per_duration():
     ("levels", "line"),
     [
         (((0.1, 0.2, 0.3), None), "noise_std of Pair has shape (3,); expected 2 number(s)"),
-        ((-0.1, None), "noise_std of Pair=-0.1; expected numbers of at least 0"),
-        ((0.1, (0.1, np.nan)), "process_noise of Pair="),
+        ((-0.1, None), "noise_std=-0.1 of Pair; expected numbers of at least 0"),
+        ((0.1, (0.1, np.nan)), "process_noise=(0.1, nan) of Pair"),
         (((((0.1,), (0.2,))), None), "noise_std of Pair has shape (2, 1); expected (2, 2)"),
         ((0.1, ((1.0, 0.0),)), "process_noise of Pair has shape (1, 2); expected 2 number(s)"),
-        (("a", None), "noise_std of Pair=a; expected numbers of at least 0"),
+        (("a", None), "noise_std='a' of Pair; expected numbers of at least 0"),
     ],
 )
 def test_wrong_levels_are_refused_in_one_line(levels, line):

@@ -153,5 +153,5 @@ def test_the_gradient_with_angles_is_that_of_finite_differences():
 def test_no_kkl_observer_is_trained_on_an_angle():
     _, record, _ = north_record(Compass())
     config = KKLSupervisedTrainer.configured({})
-    with pytest.raises(ValueError, match="Compass has output_period"):
+    with pytest.raises(ValueError, match="takes no outputs with a period"):
         train(KKLSupervisedTrainer(Compass(), config, record=record, noise_std=0.05))

@@ -86,7 +86,7 @@ def test_settings_of_estimators_have_the_types_of_their_fields(estimator, option
 @pytest.mark.parametrize("noise", [-1.0, np.nan, np.inf, "ab", (0.1, 0.2)])
 def test_a_trainer_refuses_a_noise_level_that_is_none(noise):
     trainer, game = TRAINERS.resolve("pinn_obs"), Game.of("Academic")
-    with pytest.raises(ValueError, match=r"^noise_std of Academic(=| has shape).*; expected"):
+    with pytest.raises(ValueError, match=r"^noise_std(=.*)? of Academic.*; expected"):
         trainer(
             game.source.system, trainer.configured({}), record=game.record([0]), noise_std=noise
         )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from pinnobs_gym.estimation.learned.trained_file import plain
-from pinnobs_gym.estimators.kkl import TrainedKKL, check_outputs
+from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.trainer import Trainer
@@ -51,6 +51,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
     (``convergence``).
     """
 
+    takes = KKL.takes
     paced_by_budget = True
     labelled: ClassVar[bool] = True
     """Whether T* is fitted to simulated z, and not to T's own."""
@@ -64,7 +65,6 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         """Return the number of samples between the two of each kept pair; 0 without pairs."""
 
     def start(self) -> None:
-        check_outputs(self.system)
         _check(self.system, self.record)
         self.sweep: list[dict[str, float]] = []
         """The results at each cut-off so far."""
@@ -222,12 +222,6 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
 
 def _check(system: System, record: Record) -> None:
     """Check that a system and a record can be trained on."""
-    if system.discrete or system.stiff:
-        kind = "a map" if system.discrete else "stiff"
-        raise ValueError(
-            f"{type(system).__name__} is {kind}; a KKL observer needs a rate of change that can be "
-            "integrated backwards"
-        )
     if system.measured_input:
         raise ValueError(
             f"{type(system).__name__} has a measured input; a KKL observer is trained on simulated "

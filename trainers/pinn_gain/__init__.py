@@ -21,7 +21,7 @@ from pinnobs_gym.estimation.learned.gain_network import memory_size, shapes
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimation.learned.trained_file import with_tensors
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.pinn_gain import TrainedGain
+from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, output_scale, vector
 from pinnobs_gym.training.trainer import Trainer
@@ -72,6 +72,7 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
     """
 
     name = "pinn_gain"
+    takes = PinnGain.takes
     presets = {"default": PinnGainConfig}
 
     def start(self) -> None:

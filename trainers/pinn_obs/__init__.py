@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from pinnobs_gym.estimation.gaussian import checked
-from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
+from pinnobs_gym.estimators.pinn_obs import PinnObsReplay, TrainedNetwork
 from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -50,6 +50,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
     """
 
     name = "pinn_obs"
+    takes = PinnObsReplay.takes
     presets = {"guided": guided, "plain": plain, "transfer": transfer, "paper": paper}
 
     def start(self) -> None:
@@ -276,9 +277,6 @@ def _check(system: System, record: Record, config: PinnObsConfig) -> None:
         ValueError: in one line, with the value found and the value expected.
     """
     name = type(system).__name__
-    if system.discrete or system.stiff:
-        kind = "a map" if system.discrete else "stiff"
-        raise ValueError(f"{name} is {kind}; PINN-Obs needs a rate of change that is not stiff")
     if (np.diff(record.t.astype(config.dtype)) <= 0).any():
         raise ValueError(
             f"sample times from t={record.t[0]} s on are the same in {config.dtype}; subtract the"

@@ -46,6 +46,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
     """
 
     name = "rl"
+    takes = Sb3.takes
     presets = PRESETS
 
     def start(self) -> None:

@@ -15,6 +15,7 @@ from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
+from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Prior, read_log
 from pinnobs_gym.simulation.system import independent
 from pinnobs_gym.systems import SYSTEMS
@@ -38,6 +39,9 @@ class Estimate:
     """Its standard deviations; the benchmark's if not given."""
     noise_std: tuple[float, ...] | None = None
     """Standard deviations of the output noise; the benchmark's if not given."""
+    process_noise: tuple[float, ...] | None = None
+    """Standard deviations of the process noise after one second (of a map: after one step), in
+    state units per √s: one for all states or one for each; the benchmark's if not given."""
     out: Path = Path("estimates.csv")
     """File of the estimates; a figure is written beside it, with the suffix .png."""
 
@@ -45,7 +49,11 @@ class Estimate:
         """Estimate, and write the results."""
         env_id(self.system)  # checks and registers the user's own system
         cls = SYSTEMS.resolve(self.system)
-        system, setup = cls.configured(noise_std=self.noise_std)
+        noise_std = None if self.noise_std is None else _level(self.noise_std)
+        system, setup = cls.configured(noise_std=noise_std)
+        if self.process_noise is not None:
+            setup = replace(setup, process_noise=_level(self.process_noise))
+            system.noise(setup.noise_std, setup.process_noise)
         if self.xhat0:
             setup = replace(setup, xhat0=self.xhat0)
         if self.P0_std:
@@ -75,9 +83,15 @@ class Estimate:
             f"{name} = {value:.6g}"
             for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
         )
-        console.print(f"{record.num_samples} samples; at t = {record.t[-1]:g} s: {last}")
+        time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
+        console.print(f"{record.num_samples} samples; at t = {time}: {last}")
         console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
         return 0
+
+
+def _level(values: tuple[float, ...]) -> Level:
+    """Return the standard deviations of a noise; a single one is that of all components."""
+    return values[0] if len(values) == 1 else values
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -18,6 +18,8 @@ SHOWN = "indexof(shown, datum.estimator) >= 0"
 """Expression for whether the reader has selected the estimator."""
 PLAIN = ".3~r"
 """Number format of ticks, without exponents."""
+AXIS = 54
+"""Height of the horizontal axis with its title and of the padding, in pixels."""
 HUGE = 1e9
 """Replaces infinity, beyond every axis."""
 
@@ -43,11 +45,15 @@ def named(data: str) -> alt.Chart:
 
 
 def finished(*layers: Any, height: int, **params: Any) -> Spec:
-    """Combine layers into one chart as wide as its container; ``params`` can be set by the page."""
+    """Combine layers into one chart as wide as its container, ``height`` pixels high and `AXIS`
+    more for its axis; ``params`` can be set by the page."""
     spec = alt.layer(*layers).to_dict(validate=False)  # the tests do that; it takes long
     spec.pop("config", None)
     own = [{"name": name, "value": value} for name, value in params.items()]
-    spec |= {"width": "container", "height": height, "params": own}
+    # The chart takes exactly the height that the page keeps for it, so that nothing below moves
+    # when it is drawn.
+    fit = {"type": "fit", "contains": "padding"}
+    spec |= {"width": "container", "height": height + AXIS, "autosize": fit, "params": own}
     return spec
 
 

@@ -96,11 +96,10 @@ def _game(styled: Styled, game: GameResults) -> Charts:
 
 
 def _charts(key: str, specs: Mapping[str, Spec], tables: Mapping[str, Columns]) -> Charts:
-    """Return charts of the same data with their final heights, so that the layout does not move
-    when they are drawn."""
+    """Return charts of the same data with their heights, so that the layout does not move when they
+    are drawn."""
     charts = {
-        name: {"spec": spec, "data": key, "height": spec["height"] + 48}
-        for name, spec in specs.items()
+        name: {"spec": spec, "data": key, "height": spec["height"]} for name, spec in specs.items()
     }
     packed = {name: _packed(table) for name, table in tables.items()}
     return Charts(charts, {key: {**packed, "one": {"at": [1]}}})

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pinnobs_gym.envs.figures import jumps
 from pinnobs_gym.leaderboard.site.columns import Columns, extend, medians, numbers, quantiles
 from pinnobs_gym.scoring.curves import Curves
 from pinnobs_gym.scoring.thinning import kept
@@ -26,10 +27,10 @@ class States:
     """Limits of each state's axis."""
     truth: Columns
     """``t``, true states ``x0``, ...; outputs ``y0``, ..., numbered by the state that they
-    measure."""
+    measure. A gap in a state breaks its line, where an angle jumps by a period."""
     estimates: Columns
     """``estimator``, ``t``, estimates ``m0``, ... and twice their standard deviations ``s0``, ...,
-    with gaps if there are none."""
+    with gaps if there are none, and where an angle jumps."""
 
 
 def errors(found: Mapping[str, Curves]) -> Columns:
@@ -89,10 +90,29 @@ def states(found: Mapping[str, Curves]) -> States | None:
 
 def _truth(own: Curves) -> Columns:
     """Return `States.truth` of an example."""
-    x, y = own.example.x, own.example.y
-    table: Columns = {"t": numbers(own.example.t)}
+    t, x, y = own.example.t, own.example.x, own.example.y
+    breaks = [jumps(each, period) for each, period in zip(x.T, _periods(own), strict=True)]
+    t, x = _broken(breaks, t, x)
+    new = np.unique(np.concatenate(breaks)).astype(int)
+    y = np.insert(y.astype(float), new, np.nan, axis=0)  # no dot is drawn twice
+    table: Columns = {"t": numbers(t)}
     table |= {f"x{i}": numbers(x[:, i]) for i in range(x.shape[1])}
     return table | {f"y{i}": numbers(y[:, output]) for i, output in own.measured.items()}
+
+
+def _periods(own: Curves) -> Sequence[float | None]:
+    """Return the period of each state, None if it does not repeat."""
+    return own.state_period or [None] * own.example.x.shape[1]
+
+
+def _broken(
+    breaks: Sequence[np.ndarray], t: np.ndarray, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and states (points, nx) with a further point before each sample at which the
+    line of some state breaks: a copy of that sample, with NaN in place of such states."""
+    at = np.unique(np.concatenate(breaks)).astype(int)
+    gap = np.stack([np.isin(at, own) for own in breaks], axis=-1)
+    return np.insert(t, at, t[at]), np.insert(x, at, np.where(gap, np.nan, x[at]), axis=0)
 
 
 def _estimates(shown: Mapping[str, Curves]) -> Columns:
@@ -101,8 +121,12 @@ def _estimates(shown: Mapping[str, Curves]) -> Columns:
     table: Columns = {"estimator": [], "t": []}
     table |= {f"{part}{i}": [] for i in range(nx) for part in ("m", "s")}
     for name, own in shown.items():
-        t, mean, std = own.example.t, own.example.xhat, own.example.std
-        parts = {"m": mean, "s": np.full(mean.shape, np.nan) if std is None else 2 * std}
+        example, std = own.example, own.example.std
+        curves = zip(example.xhat.T, _periods(own), example.x.T, strict=True)
+        breaks = [jumps(*each) for each in curves]
+        t, mean = _broken(breaks, example.t, example.xhat)
+        std = np.full(example.xhat.shape, np.nan) if std is None else std
+        parts = {"m": mean, "s": 2 * _broken(breaks, example.t, std)[1]}
         new = {f"{part}{i}": numbers(v[:, i]) for part, v in parts.items() for i in range(nx)}
         extend(table, estimator=[name] * len(t), t=numbers(t), **new)
     return table

@@ -151,7 +151,8 @@ class Gap(Condition):
     @property
     def summary(self) -> str:
         return (
-            f"no output for {self.seconds:g} s, at most {100 * self.largest_part:g} % of the time"
+            f"no output for {self.seconds:g} s (of a map: as many steps), at most "
+            f"{100 * self.largest_part:g} % of the time"
         )
 
     def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:

@@ -1,10 +1,13 @@
 """Errors over time and the example episode, against ones worked out by hand or by other means."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from page_rows import curves, lines_of
 
 from pinnobs_gym.leaderboard.site import over_samples
+from pinnobs_gym.scoring.curves import Example
 
 
 def test_error_over_time_is_median_and_band():
@@ -33,6 +36,28 @@ def test_the_reference_is_of_each_episode_once():
     table = over_samples.reference([first, second, curves(np.ones((1, 3)))])
     assert table == {"t": [0, 1, 2], "median": [3, 4, 5]}
     assert over_samples.reference([curves(np.ones((1, 3)))]) == {"t": [], "median": []}
+
+
+def test_lines_of_an_angle_have_a_gap_where_it_jumps():
+    """A heading wrapped at half a turn, 1 rad a second; the estimate is 0.2 rad ahead."""
+    t = np.arange(8.0)
+    x = np.stack([np.angle(np.exp(1j * t)), np.sin(t)], axis=-1)
+    example = Example(0, t, x, x + np.array([0.2, 0.1]), x[:, :1], np.full(x.shape, 0.25))
+    own = curves(np.ones((1, 8)), t=t)
+    own = replace(own, example=example, state_period=(2 * np.pi, None))
+    found = over_samples.states({"a": own})
+    assert found is not None
+    # π lies between 3 and 4 s; the sample at 4 s is drawn behind a gap.
+    assert found.truth["t"] == [0, 1, 2, 3, 4, 4, 5, 6, 7]
+    assert [k for k, value in enumerate(found.truth["x0"]) if value is None] == [4]
+    assert [k for k, value in enumerate(found.truth["y0"]) if value is None] == [4]
+    assert found.truth["x1"][4] == found.truth["x1"][5] is not None
+    lines = lines_of(found.estimates, "a")
+    assert [line[0] for line in lines] == found.truth["t"]
+    assert [line[1:3] for line in lines if None in line] == [(None, None)]
+    plain = over_samples.states({"a": replace(own, state_period=None)})
+    assert plain is not None
+    assert plain.truth["t"] == t.tolist()
 
 
 def test_the_example_is_of_the_episode_that_most_have():

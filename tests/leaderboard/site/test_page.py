@@ -281,6 +281,25 @@ def test_all_charts_are_drawn_and_filled(opened):
         assert height > 60, name
 
 
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_moves_when_charts_are_drawn(opened, width):
+    """Else a click whose button is pressed before and released after would miss."""
+    page = opened(viewport={"width": width, "height": 900})
+    page.eval_on_selector_all("details", "all => all.forEach(each => { each.open = true })")
+    places = """() => [...document.querySelectorAll("[data-chart], button, select")].map(
+        (each) => each.getBoundingClientRect().top)"""
+    undrawn = page.evaluate("document.querySelectorAll('[data-chart]:not([data-drawn])').length")
+    assert undrawn > 5
+    before = page.evaluate(places)
+    draw_all(page)
+    page.evaluate("window.scrollTo(0, 0)")
+    assert page.evaluate(places) == before
+    spilled = """() => [...document.querySelectorAll("[data-chart]")].filter((chart) =>
+        Math.abs(chart.querySelector("svg").getBoundingClientRect().height
+            - chart.getBoundingClientRect().height) > 1).map((chart) => chart.dataset.chart)"""
+    assert page.evaluate(spilled) == []  # and nothing is cut off
+
+
 def column(page, table, i):
     cells = page.locator(f"{table} tbody tr > :nth-child({i})").all()
     return [cell.inner_text().strip() for cell in cells]
@@ -288,6 +307,7 @@ def column(page, table, i):
 
 def test_columns_sort_both_ways(opened):
     page = opened(viewport={"width": 1280, "height": 900})
+    draw_all(page)
     table = "#ReverseDuffing-v0 table"
     before = column(page, table, 3)
     head = page.locator(f"{table} thead th").nth(2)

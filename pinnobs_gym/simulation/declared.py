@@ -1,0 +1,125 @@
+"""Checks of what the class of a system declares, before anything is computed with it."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.simulation.bounds import box
+from pinnobs_gym.simulation.residual import check_periods
+from pinnobs_gym.simulation.system import Setup, System, is_number
+
+_NAMES = ("state_names", "output_names", "input_names", "uncertain")
+"""Attributes that are several names."""
+_CALLS = {
+    "f": "t, x, u",
+    "h": "t, x, u",
+    "flow": "t0, t1, x, u",
+    "input": "t",
+    "draw_input": "rng, times",
+    "breakpoints": "",
+}
+"""Methods whose arguments are counted."""
+
+
+def check_declared(cls: type[System]) -> None:
+    """Check the attributes of a system's class, each for itself and for the number of states and
+    outputs.
+
+    Raises:
+        TypeError: in one line, naming the class, the attribute, its value and what was expected.
+    """
+    try:
+        _check_names(cls)
+        _check_methods(cls)
+        _check_numbers(cls)
+        _check_others(cls)
+    except ValueError as error:
+        raise TypeError(f"system {cls.__name__}: {error}") from None
+
+
+def _own(cls: type[System], name: str) -> Any:
+    """Return an attribute; None if the class computes it for each of its instances."""
+    value = getattr(cls, name, None)
+    return None if isinstance(value, property | cached_property) else value
+
+
+def _check_names(cls: type[System]) -> None:
+    for name in _NAMES:
+        names = _own(cls, name)
+        if names is None and (name == "uncertain" or getattr(cls, name, None) is not None):
+            continue
+        if not isinstance(names, tuple | list) or not all(
+            isinstance(each, str) and each for each in names
+        ):
+            few = (names,) if isinstance(names, str) else ("a", "b")
+            raise ValueError(f"{name}={names!r}; expected a tuple of names, such as {few!r}")
+        twice = [each for each in names if list(names).count(each) > 1]
+        if twice:
+            raise ValueError(f"{name}={names!r}; expected {twice[0]!r} once")
+        if not names and name in ("state_names", "output_names"):
+            raise ValueError(f"{name}={names!r}; expected at least one name")
+
+
+def _check_methods(cls: type[System]) -> None:
+    for name, value in vars(System).items():
+        own = getattr(cls, name)
+        if inspect.isfunction(value) and not callable(own):
+            raise ValueError(f"{name}={own!r}; expected a method")
+    for name, expected in _CALLS.items():
+        taken = list(inspect.signature(getattr(cls, name)).parameters)
+        wanted = ["self", *filter(None, expected.split(", "))]
+        if len(taken) != len(wanted):
+            raise ValueError(f"{name}({', '.join(taken)}); expected {name}({', '.join(wanted)})")
+
+
+def _check_numbers(cls: type[System]) -> None:
+    nx, ny = (_size(cls, name) for name in ("state_names", "output_names"))
+    for name in ("scale", "state_bound"):
+        values = _own(cls, name)
+        if values is None:
+            continue
+        several = isinstance(values, tuple | list | np.ndarray)
+        if not several or not all(is_number(v) and 0 < v < math.inf for v in values):
+            raise ValueError(f"{name}={values!r}; expected a positive number for each state")
+        if nx is not None and len(values) != nx:
+            raise ValueError(f"{name} has {len(values)} number(s); expected {nx}")
+    for name, size in (("state_period", nx), ("output_period", ny)):
+        if size is not None:
+            check_periods(_own(cls, name), size, name)
+    if nx is not None:
+        box(_own(cls, "state_low"), _own(cls, "state_high"), nx)
+    step = _own(cls, "model_step")
+    if step is not None and not (is_number(step) and 0 < step < math.inf):
+        raise ValueError(f"model_step={step!r}; expected None or a positive number of seconds")
+
+
+def _size(cls: type[System], name: str) -> int | None:
+    """Return the number of names; None if they are not those of the class."""
+    names = _own(cls, name)
+    return None if names is None else len(names)
+
+
+def _check_others(cls: type[System]) -> None:
+    for name in ("discrete", "stiff"):
+        value = _own(cls, name)
+        if value is not None and not isinstance(value, bool):
+            raise ValueError(f"{name}={value!r}; expected True or False")
+    if not isinstance(_own(cls, "version") or 0, int):
+        raise ValueError(f"version={cls.version!r}; expected a whole number")
+    if not isinstance(_own(cls, "units") or {}, Mapping):
+        raise ValueError(f"units={cls.units!r}; expected a mapping from names to units")
+    setups = _own(cls, "setups")
+    if setups is None:
+        return
+    if not isinstance(setups, Mapping) or not all(isinstance(s, Setup) for s in setups.values()):
+        raise ValueError(
+            f"setups is a {type(setups).__name__}; expected a mapping from names to values of Setup"
+        )
+    if "benchmark" not in setups:
+        raise ValueError(f"setups named {', '.join(setups)}; expected one named 'benchmark'")
