@@ -11,6 +11,7 @@ from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
 from pinnobs_gym.estimation.projection import multipliers
 from pinnobs_gym.estimation.takes import EVERYTHING
+from pinnobs_gym.estimation.wrapping import say_of_start
 from pinnobs_gym.simulation.matrices import identity, inner, mapped, sandwich
 from pinnobs_gym.simulation.record import Record
 
@@ -65,6 +66,7 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
     def run(self, record: Record) -> Estimates:
         # The parameters z, with x₀ = x̂₀ + Lz and LLᵀ = P₀, have a standard normal prior.
         record = replace(record, prior=checked(record.prior))
+        say_of_start(self.label, self.system, record, self.noise.R(0.0))
         L = root(record.prior.cov.transpose(1, 2, 0))
         z = np.zeros(record.prior.mean.T.shape)
         z = self._inside(record.prior.mean, L, z, identity(*z.shape))

@@ -18,6 +18,7 @@ from pinnobs_gym.estimation.kalman import innovation_covariance, observe
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
+from pinnobs_gym.estimation.wrapping import say_what_turns, wrapped_state
 from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
@@ -91,13 +92,15 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         beyond = np.zeros(len(P0), dtype=int)
         memory = EKFMemory(wide.transpose(1, 2, 0), bounds, beyond)
         L = prior_root(self.system, prior, self.noise.R(0.0))
-        return State(prior.mean, P=P0, memory=memory, root=L)
+        return wrapped_state(self.system, State(prior.mean, P=P0, memory=memory, root=L))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        return predicted(self.system, state, covariances(state), self.noise, t, u)
+        state = predicted(self.system, state, covariances(state), self.noise, t, u)
+        return wrapped_state(self.system, state)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         P, R = covariances(state), self.noise.R(t, y)
+        say_what_turns(self.label, self.system, (t, y, u), state.xhat, P, R)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         if self.gate is not None:
             state = self._gated(state, innovation, H, R)

@@ -20,6 +20,7 @@ from pinnobs_gym.estimation.linear_window import linear_window, smoothed, whiten
 from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.smoother import backward, forward
 from pinnobs_gym.estimation.square_root import carried, prior_root
+from pinnobs_gym.estimation.wrapping import say_of_start
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 
@@ -54,6 +55,7 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
     def run(self, record: Record) -> Estimates:
         record = replace(record, prior=checked(record.prior))
         R = self.noise.R(0.0)
+        say_of_start(self.label, self.system, record, R)
         roots = prior_root(self.system, record.prior, R)
         rows = np.arange(0) if roots is None else carried(roots)
         # A noise of one's own that differs between rows is that of all rows, not of some.
