@@ -106,9 +106,35 @@ def say_what_turns(
     """
     if system.output_period is None and system.state_period is None:
         return
+    H = _jacobian(system, sample, xhat)
+    _say(label, system, _curved(system, sample, xhat, P, H, R) or _unsure(system, P, H, R))
+
+
+def say_of_outputs(
+    label: str,
+    system: System,
+    sample: tuple[float, np.ndarray, np.ndarray],
+    xhat: np.ndarray,
+    P: np.ndarray,
+    R: np.ndarray,
+) -> None:
+    """As `say_what_turns`, only of outputs, with P of shape (batch, nx, nx): particles take any
+    distribution on a circle, but lose modes that are turns apart."""
+    if system.output_period is not None:
+        H = _jacobian(system, sample, xhat)
+        _say(label, system, _unsure(system, P.transpose(1, 2, 0), H, R))
+
+
+def _jacobian(
+    system: System, sample: tuple[float, np.ndarray, np.ndarray], xhat: np.ndarray
+) -> np.ndarray:
+    """Return the output Jacobians (ny, nx, batch), zero where y is missing."""
     t, y, u = sample
-    H = np.where(np.isnan(y).T[:, None], 0.0, system.h_jacobian(t, xhat, u).transpose(1, 2, 0))
-    found = _curved(system, sample, xhat, P, H, R) or _unsure(system, P, H, R)
+    H = np.asarray(system.h_jacobian(t, xhat, u)).transpose(1, 2, 0)
+    return np.where(np.isnan(y).T[:, None], 0.0, H)
+
+
+def _say(label: str, system: System, found: str | None) -> None:
     if found is not None:
         say_once(
             f"{label} on {type(system).__name__}: {found}; its covariances may be far too small, "
