@@ -136,7 +136,7 @@ def moving_horizon(x: np.ndarray, record: Record) -> Iterator[Figure]:
     yield at_least(f"{name}, share within 10 % at the tenth sample", exact, "", None)
     spread = np.mean(std / x[:, TENTH], axis=0)
     for state, share in zip(Reactor.state_names, spread, strict=True):
-        yield at_most(f"{name}, deviation of {state} there over truth", float(share), "", None)
+        yield at_least(f"{name}, deviation of {state} there over truth", float(share), "", None)
 
 
 def tenth_on_grid(record: Record, number: int = 481) -> tuple[np.ndarray, np.ndarray]:
