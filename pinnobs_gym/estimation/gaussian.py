@@ -11,6 +11,7 @@ from pinnobs_gym.estimation import square_root
 from pinnobs_gym.estimation.estimator import BaseEstimator, Range, State
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.simulation.noise import AssumedNoise, Noise
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
 
@@ -38,7 +39,36 @@ class GaussianEstimator(BaseEstimator):
     def noise(self) -> AssumedNoise:
         """The known noise, with `assumed_noise` and an output noise above zero."""
         told = self.system.noise(self.noise_std, self.process_noise)
-        return AssumedNoise.of(self.system, told, self.assumed_noise)
+        noise = AssumedNoise.of(self.system, told, self.assumed_noise)
+        self._say_if_too_large(noise)
+        return noise
+
+    def _say_if_too_large(self, noise: AssumedNoise) -> None:
+        """Log in one line, once, where the assumed process noise moves an output from one sample to
+        the next by more than the output noise and the known process noise do together: estimates
+        then follow the latest outputs, and the model counts for nothing.
+
+        The default is a share of the state's scale, which is right where the scale is the range of
+        a state. It is not where a state varies little about a large value.
+        """
+        system, setup = self.system, self.system.setups["benchmark"]
+        mean = Prior.of(system, setup, 1).mean
+        with np.errstate(all="ignore"):  # an output that is not defined there says nothing
+            H = np.asarray(system.h_jacobian(0.0, mean, np.zeros((1, system.nu))))[0]
+            assumed = np.sqrt(np.square(H * noise.extra).sum(axis=1) * setup.dt)
+            known = H @ noise.told.L(0.0)[..., 0]
+            variance = np.einsum("iib->ib", noise.R(0.0))[:, 0]
+            rest = np.sqrt(variance + np.square(known).sum(axis=1) * setup.dt)
+            ratio = assumed / rest
+        if (ratio > 1).any():
+            worst = int(np.nanargmax(ratio))
+            name, value = system.output_names[worst], self.assumed_noise
+            say_once(
+                f"{self.label} on {type(system).__name__}: assumed_noise={value:g} moves {name} by "
+                f"{assumed[worst]:.3g} from sample to sample, {ratio[worst]:.3g} times its noise, "
+                "so that estimates follow the latest output; expected at most "
+                f"{0.1 * value / ratio[worst]:.1g}, or 0 for an exact model"
+            )
 
 
 def checked(prior: Prior) -> Prior:

@@ -12,9 +12,12 @@ from pinnobs_gym.estimation.projection import nearest_points
 from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.matrices import product
 from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.residual import Periods, nearest
 
 _HALVINGS = 20
 """Largest number of times that the distance of a row's points from the estimate is halved."""
+_STEPS = 64
+"""Number of steps in which the way from the estimate to a point is followed around a circle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,43 @@ class SigmaPoints:
             values = values.copy(order="K")
             values[:, moved] += product(jacobian()[..., moved], rest).transpose(1, 2, 0)
         return values
+
+    def unwound(
+        self,
+        values: np.ndarray,
+        function: Callable[[np.ndarray], np.ndarray],
+        jacobian: Callable[[], np.ndarray],
+        periods: Periods | None,
+    ) -> np.ndarray:
+        """Return values of a function at the points, in which angles have the turns that they gain
+        on the straight way from the estimate to each point.
+
+        Where the Jacobian tells that they are within a quarter of a turn of their value at the
+        estimate, they are taken within half a turn of it; else the way is followed in steps.
+
+        Args:
+            values: the values, shape (num_points, batch, m).
+            function: as in `images`.
+            jacobian: as in `images`.
+            periods: those of the values; without any, these are unchanged.
+        """
+        if periods is None:
+            return values
+        start = np.asarray(function(self.centre[None]))
+        values = nearest(values, start, periods)
+        way = self.original - self.centre
+        moved = abs(product(jacobian(), np.ascontiguousarray(way.transpose(2, 0, 1))))
+        bound = np.array([np.inf if each is None else each / 4 for each in periods])
+        far = ~(bound >= moved.max(axis=1).T)  # also where it is not finite
+        rows = far.any(axis=1)
+        if not rows.any():
+            return values
+        reference = start
+        for step in range(1, _STEPS):
+            middle = np.asarray(function(self.centre + step / _STEPS * way))
+            middle = nearest(middle, reference, periods)
+            reference = np.where(np.isfinite(middle), middle, reference)
+        return np.where(rows[:, None], nearest(values, reference, periods), values)
 
 
 def _closer(

@@ -21,6 +21,7 @@ from pinnobs_gym.estimation.square_root import (
     prior_root,
     root_of,
 )
+from pinnobs_gym.estimation.wrapping import say_what_turns, wrapped_state
 from pinnobs_gym.simulation.matrices import factor, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.record import Prior
@@ -83,7 +84,8 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         points = unit, mean_weights[:, None, None], np.sqrt(cov_weights)[:, None]
         memory = SigmaPointMemory(points, np.zeros(batch))
         root = prior_root(self.system, prior, self.noise.R(0.0))
-        return State(prior.mean, P=prior.cov, memory=memory, root=root)
+        state = State(prior.mean, P=prior.cov, memory=memory, root=root)
+        return wrapped_state(self.system, state)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
@@ -103,25 +105,26 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         X = (points - mean[:, None]) * roots
         P = (outer(X, X) + Q).transpose(2, 0, 1)
         after = State(mean.T, state.t, state.u, P, state.innovation, None, memory, state.root)
-        return after if state.root is None else _rooted(after, X, root_of(Q.transpose(2, 0, 1)))
+        if state.root is not None:
+            after = _rooted(after, X, root_of(Q.transpose(2, 0, 1)))
+        return wrapped_state(self.system, after)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: SigmaPointMemory = state.memory
         unit, mean_weights, roots = memory.points
         xhat, R = state.xhat, self.noise.R(t, y)
+        say_what_turns(self.label, self.system, (t, y, u), xhat, covariances(state), R)
         L, memory = _factor(state, memory)
         # New points about the prediction, whose spread includes Q, and their outputs.
         X = unit @ L  # (nx, num_points, batch)
         sigma = SigmaPoints.of(xhat, X, self.system.state_box, state.P)
         output = partial(_output, self.system, t, u)
-        outputs = sigma.images(
-            output(sigma.used),
-            output,
-            lambda: self.system.h_jacobian(t, xhat, u).transpose(1, 2, 0),
-            partial(self._notice, "h"),
-        )
-        if (period := self.system.output_period) is not None:  # angles near that of the centre
-            outputs = nearest(outputs, self.system.h(t, xhat, u), period)
+
+        def jacobian() -> np.ndarray:
+            return self.system.h_jacobian(t, xhat, u).transpose(1, 2, 0)
+
+        outputs = sigma.images(output(sigma.used), output, jacobian, partial(self._notice, "h"))
+        outputs = sigma.unwound(outputs, output, jacobian, self.system.output_period)
         outputs = outputs.transpose(2, 0, 1)
         mean = product(outputs, mean_weights)[:, 0]
         X, Y = X * roots, (outputs - mean[:, None]) * roots

@@ -15,6 +15,7 @@ import numpy as np
 from pinnobs_gym.estimation.kalman import cautious, kalman_gain, observe, predict, update_with
 from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.simulation.matrices import (
+    cholesky,
     divide_factored,
     factor,
     identity,
@@ -29,6 +30,10 @@ from pinnobs_gym.simulation.system import System
 
 _ROWS = 2000
 """Approximate number of samples, over all rows, that are processed at a time."""
+
+_LEAST = 1e-10
+"""Least eigenvalue of correlations below which the smoother's inverse loses too many digits. Its
+covariances are then off by about 1e-7 in relative terms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +112,24 @@ def forward(
             x = nearest(x, P.transpose(2, 0, 1), box)
         after.xhat[k], after.P[k] = x, P
     return Filtered(after.xhat, after.P, before, F, Q, K, H)
+
+
+def ill_conditioned(filtered: Filtered) -> np.ndarray:
+    """Return the rows (number,) whose predicted covariances are finite, but too near to singular
+    for the inverse in `backward`: of correlations, the least eigenvalue is less than `_LEAST`."""
+    P = np.ascontiguousarray(filtered.predicted.P[1:].transpose(1, 2, 0, 3))
+    n, batch = P.shape[0], P.shape[3]
+    P = P.reshape(n, n, -1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        L, variances = cholesky(P, semidefinite=True), np.einsum("iib->ib", P)
+        # The determinant of correlations is not greater than the least eigenvalue times e.
+        pivots = np.square(np.einsum("iib->ib", L)) / variances
+        near = np.flatnonzero((pivots.prod(axis=0) < np.e * _LEAST) & np.isfinite(P).all((0, 1)))
+        std = np.sqrt(variances[:, near])
+        correlations = (P[..., near] / (std[:, None] * std)).transpose(2, 0, 1)
+    correlations = np.where(np.isfinite(correlations), correlations, np.eye(n))
+    small = np.linalg.eigvalsh(correlations)[:, 0] < _LEAST
+    return np.unique(near[small] % batch)
 
 
 def backward(filtered: Filtered) -> Path:

@@ -11,6 +11,7 @@ from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import Fit, linearised, root, solved
 from pinnobs_gym.estimation.projection import multipliers
 from pinnobs_gym.estimation.takes import EVERYTHING
+from pinnobs_gym.estimation.wrapping import say_of_start
 from pinnobs_gym.simulation.matrices import identity, inner, mapped, sandwich
 from pinnobs_gym.simulation.record import Record
 
@@ -65,11 +66,12 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
     def run(self, record: Record) -> Estimates:
         # The parameters z, with x₀ = x̂₀ + Lz and LLᵀ = P₀, have a standard normal prior.
         record = replace(record, prior=checked(record.prior))
+        say_of_start(self.label, self.system, record, self.noise.R(0.0))
         L = root(record.prior.cov.transpose(1, 2, 0))
         z = np.zeros(record.prior.mean.T.shape)
         z = self._inside(record.prior.mean, L, z, identity(*z.shape))
         with np.errstate(all="ignore"):
-            for length in self._stretches(record.num_samples):
+            for length in self._stretches(record.y):
                 z = self._fitted(record, L, z, length)
             fit = self._evaluated(record, L, z, np.arange(record.batch), record.num_samples)
             # Map the covariance of z at the optimum to the states along the trajectory.
@@ -77,11 +79,15 @@ P_k &= \Phi_k \Bigl( P_0^{-1} + \sum_j \Phi_j^\top H_j^\top R^{-1} H_j \Phi_j \B
             P = np.stack([sandwich(X, cov) for X in fit.X])
         return Estimates(fit.x.swapaxes(0, 1), P.transpose(3, 0, 1, 2))
 
-    def _stretches(self, num_samples: int) -> list[int]:
-        lengths = [num_samples]
-        while lengths[0] > self.shortest:
-            lengths.insert(0, (lengths[0] + 1) // 2)
-        return lengths
+    def _stretches(self, y: np.ndarray) -> list[int]:
+        """Return the lengths of the parts that are fitted, in rows of the record, whose outputs are
+        y (batch, num_samples, ny). They are doubled in samples with outputs, so that rows without
+        any change no step of the fit."""
+        measured = np.flatnonzero(~np.isnan(y).all(axis=(0, 2)))
+        counts = [len(measured)]
+        while counts[0] > self.shortest:
+            counts.insert(0, (counts[0] + 1) // 2)
+        return [*(int(measured[count - 1]) + 1 for count in counts[:-1]), y.shape[1]]
 
     def _evaluated(
         self, record: Record, L: np.ndarray, z: np.ndarray, rows: np.ndarray, length: int

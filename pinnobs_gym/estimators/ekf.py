@@ -18,7 +18,9 @@ from pinnobs_gym.estimation.kalman import innovation_covariance, observe
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
+from pinnobs_gym.estimation.wrapping import say_what_turns, wrapped_state
 from pinnobs_gym.simulation.matrices import squared_size
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
 
@@ -91,16 +93,18 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         beyond = np.zeros(len(P0), dtype=int)
         memory = EKFMemory(wide.transpose(1, 2, 0), bounds, beyond)
         L = prior_root(self.system, prior, self.noise.R(0.0))
-        return State(prior.mean, P=P0, memory=memory, root=L)
+        return wrapped_state(self.system, State(prior.mean, P=P0, memory=memory, root=L))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        return predicted(self.system, state, covariances(state), self.noise, t, u)
+        state = predicted(self.system, state, covariances(state), self.noise, t, u)
+        return wrapped_state(self.system, state)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         P, R = covariances(state), self.noise.R(t, y)
+        say_what_turns(self.label, self.system, (t, y, u), state.xhat, P, R)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         if self.gate is not None:
-            state = self._gated(state, innovation, H, R)
+            state = self._gated(state, ~np.isnan(y), innovation, H, R)
             P = covariances(state)
         if self.huber is not None:
             R = self._reweighted(P, innovation, H, R)
@@ -115,16 +119,29 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         degrees = np.maximum(np.arange(self.system.ny + 1), 1)
         return 2 * gammaincinv(degrees / 2, self.gate)
 
-    def _gated(self, state: State, innovation: np.ndarray, H: np.ndarray, R: np.ndarray) -> State:
+    def _gated(
+        self,
+        state: State,
+        measured: np.ndarray,
+        innovation: np.ndarray,
+        H: np.ndarray,
+        R: np.ndarray,
+    ) -> State:
         """Return the prediction with P and its root reset where the gate restarts the filter, and
-        with the updated memory."""
+        with the updated memory; ``measured`` (batch, ny) tells which outputs are not missing. No
+        output is left out: a sample without any neither counts as beyond the gate nor as within."""
         memory: EKFMemory = state.memory
         P, L = covariances(state), state.root
-        present = H.any(axis=1).sum(axis=0)  # number of outputs that are not missing
+        present = measured.sum(axis=1)
         nis = squared_size(innovation, innovation_covariance(P, H, R))
         beyond = ~(nis <= memory.bounds[present])
         count = np.where(present > 0, np.where(beyond, memory.beyond + 1, 0), memory.beyond)
         restart = count >= self.patience
+        if restart.any():
+            say_once(
+                f"{self.label} on {type(self.system).__name__}: {self.patience} samples in a row "
+                "are beyond the gate; it restarts with the covariance P0 + diag(scale**2)"
+            )
         P = np.where(restart, memory.P_restart, P)
         if L is not None:  # a row without a root keeps NaN
             wide = np.isfinite(L) & restart[:, None, None]

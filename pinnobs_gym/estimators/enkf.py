@@ -17,6 +17,7 @@ from pinnobs_gym.estimation.localisation import tapers
 from pinnobs_gym.estimation.projection import nearest_points
 from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.wrapping import say_what_turns
 from pinnobs_gym.simulation.matrices import divide, einsum, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
@@ -145,6 +146,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         weight = 1 / np.sqrt(self.members - 1)
         X = weight * (members - mean).transpose(2, 0, 1)
         Y = weight * (outputs - yhat).transpose(2, 0, 1)
+        say_what_turns(self.label, self.system, (t, y, u), mean, outer(X, X), self.noise.R(t))
         missing = np.isnan(y)
         Y = np.where(missing.T[:, None], 0.0, Y)
         K, S, taken = self._analysis(X, Y, self.noise.R(t, y))

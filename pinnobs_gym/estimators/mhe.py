@@ -8,12 +8,13 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimator, Range, State
 from pinnobs_gym.estimation.exact_window import ExactWindow, innovation_covariance
-from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
+from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import observe
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.moving_window import MovingWindow
 from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.estimation.square_root import carried, covariance, prior_root
+from pinnobs_gym.estimation.wrapping import say_what_turns
 from pinnobs_gym.simulation.matrices import mapped, sandwich
 from pinnobs_gym.simulation.record import Prior
 
@@ -104,6 +105,9 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: MHEMemory = state.memory
+        if state.t is None:
+            sample, P = (t, y, u), covariances(state)
+            say_what_turns(self.label, self.system, sample, state.xhat, P, self.noise.R(t))
         if memory.exact is None:
             return self._by_all_states(memory, t, y, u)
         after = self._by_first_state(memory, t, y, u)

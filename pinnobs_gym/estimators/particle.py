@@ -1,4 +1,5 @@
-"""The particle filter: the bootstrap filter, and that of Liu and West without process noise."""
+"""The particle filter: the bootstrap filter, with the kernels of Liu and West where process noise
+is small."""
 
 from __future__ import annotations
 
@@ -10,25 +11,22 @@ import numpy as np
 from pinnobs_gym.estimation.circular import gathered
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
+from pinnobs_gym.estimation.kernels import Sample, shrinkage_of, shrinkages
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.wrapping import say_of_outputs
 from pinnobs_gym.simulation.matrices import cholesky, factor, moments, spread, total, weighted_mean
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 
-_Sample = tuple[float, np.ndarray, np.ndarray, np.ndarray]
-"""Time in s, outputs (batch, ny), inputs (batch, nu), and covariance (ny, ny, batch or 1) of the
-output noise."""
 _FEW = 10
 """The likelihood is tempered if it would reduce the effective number of particles to less than
 their number over this."""
-_DISCOUNT = 0.95
-"""Liu and West's δ where kernels are needed."""
-_TEMPERED = 0.7
-"""Their δ in tempering. Wide kernels keep the covariance of the set right over many resamplings,
-even where the outputs are four standard deviations from the prior."""
+_COLLAPSED = 5
+"""Effective number of particles below which covariances are not to be trusted, if it happens in
+more than a tenth of the samples: of a random walk they are then half of what they ought to be."""
 _ROUNDS = 100
 """Largest number of tempering steps per sample."""
 _LARGEST = 1e150
@@ -49,6 +47,9 @@ class ParticleMemory:
     """States, shape (num_particles, batch, nx)."""
     log_weights: np.ndarray
     """Logarithms of the weights, shape (num_particles, batch); the weights sum to one."""
+    collapses: np.ndarray
+    """Number of samples so far that would have left fewer than `_COLLAPSED` effective particles
+    without tempering, shape (batch,)."""
     sample: int = 0
     """Number of samples processed so far."""
 
@@ -56,21 +57,23 @@ class ParticleMemory:
 @dataclass(frozen=True)
 class ParticleFilter(RecursiveEstimator):
     """The bootstrap particle filter (Gordon, Salmond & Smith 1993), with the kernels of Liu and
-    West (2001) for plants without process noise.
+    West (2001) for plants with little process noise or none.
 
     Particles are propagated by the model, with its process noise, and weighted by the likelihood of
     the outputs. Where their effective number falls below half of the particles, they are resampled
     systematically (Kitagawa 1996). The likelihood of a sample that would reduce the effective
     number below a tenth is tempered (Neal 2001).
 
-    Without process noise, few distinct particles would soon remain. New particles are then drawn
-    from Gaussians about the resampled ones, whose centres are shrunk towards the mean so that the
-    mean and the covariance of the set are preserved in expectation. This is artificial noise, and
-    it also follows each tempering step.
+    Without process noise, or with too little of it, few distinct particles would soon remain. New
+    particles are then drawn from Gaussians about the resampled ones, whose centres are shrunk
+    towards the mean so that the mean and the covariance of the set are preserved in expectation.
+    This is artificial noise. By default, it makes up for what the known noise lacks
+    (`pinnobs_gym.estimation.kernels`); it also follows each tempering step.
 
     A particle that overflows, that is outside of the states' bounds, or at which the output is not
     defined, has the weight zero. Where this holds for all particles of an episode, they stay where
-    they are, or the sample counts as missing, and the log says so once.
+    they are, or the sample counts as missing, and the log says so once. It also says where outputs
+    leave few effective particles too often.
 
     Particles that differ by whole turns of an angle are the same states: they are taken within half
     a turn of their circular mean, and so are their outputs.
@@ -87,7 +90,7 @@ class ParticleFilter(RecursiveEstimator):
     """Number of particles."""
     discount: float | None = None
     """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set. If
-    None, it is 1 with process noise, 0.95 without, and 0.7 in tempering."""
+    None, their variance follows from the process noise."""
     seed: int = 0
     """Seed of the random numbers."""
 
@@ -104,8 +107,9 @@ e_i = y_k - h(t_k, x_i, u_k) \\
 \text{if } \Bigl( \sum_i w_i^2 \Bigr)^{-1} &< \frac N2: \quad
 x_i := a\, x_{j(i)} + (1 - a)\, \hat x_k + \sqrt{1 - a^2} \sqrt{P_k}\, \xi_i, \quad
 w_i := \frac1N \\
-a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
-\qquad j(i) \text{ drawn by the weights}
+1 - a^2 &= \max\bigl(0, \kappa(0.95) - q_k\bigr), \qquad
+\kappa(\delta) = 1 - \Bigl( \frac{3 \delta - 1}{2 \delta} \Bigr)^2 \\
+\xi_i &\sim \mathcal N(0, I), \qquad j(i) \text{ drawn by the weights}
 """
     tunable = {"discount": Range(0.8, 0.999)}
 
@@ -122,7 +126,11 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         draws = generator(self.seed, 0).standard_normal((self.particles, self.system.nx))
         particles = prior.mean + spread(L, draws)
         log_weights = np.full(particles.shape[:2], -np.log(self.particles))
-        return State(prior.mean, P=prior.cov, memory=ParticleMemory(particles, log_weights))
+        return State(
+            prior.mean,
+            P=prior.cov,
+            memory=ParticleMemory(particles, log_weights, np.zeros(len(prior.mean))),
+        )
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
@@ -169,41 +177,55 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         missing = np.isnan(y)
         # The predicted output and its covariance, from the particles before the update.
         outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
-        weights, R = np.exp(log_weights), self.noise.R(t, y)
+        sample, weights = Sample.of(self.noise, state.t, t, y, u), np.exp(log_weights)
+        if self.system.output_period is not None:
+            _, P = moments(weights, x)
+            say_of_outputs(self.label, self.system, (t, y, u), state.xhat, P, sample.R)
         outputs = gathered(outputs, self.system.output_period, weights)
         yhat, S = _predicted_output(weights, outputs)
-        S = S + R.transpose(2, 0, 1)
-        x, log_weights = self._tempered(x, log_weights, (t, y, u, R), memory.sample)
+        S = S + sample.R.transpose(2, 0, 1)
+        x, log_weights, effective = self._tempered(x, log_weights, sample, memory.sample)
+        collapses = self._counted(memory, effective)
         weights = np.exp(log_weights)
         x = gathered(x, self.system.state_period, weights)
         xhat, P = moments(weights, x)
         # Resample the episodes whose effective number of particles, 1/Σw², is below half.
         rows = np.flatnonzero(total(weights**2) > 2 / self.particles)
         if len(rows):
-            usual = 1.0 if self.noise.stochastic else _DISCOUNT
-            discount = usual if self.discount is None else self.discount
             stream = memory.sample, _ROUNDS
-            x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
-        memory = ParticleMemory(x, log_weights, memory.sample + 1)
+            part = sample.rows(rows)
+            x, log_weights = self._resampled(x, log_weights, rows, stream, part, tempering=False)
+        memory = ParticleMemory(x, log_weights, collapses, memory.sample + 1)
         innovation = self.system.output_residual(y, yhat)
         innovation = np.where(missing | np.isnan(yhat), 0.0, innovation)
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 
+    def _counted(self, memory: ParticleMemory, effective: np.ndarray) -> np.ndarray:
+        """Return the number of collapses, given the effective number of particles that a sample
+        would have left, (batch,) each."""
+        collapses = memory.collapses + (effective < _COLLAPSED)
+        if (collapses > np.maximum(10, 0.1 * memory.sample)).any():
+            self._say(
+                f"outputs leave fewer than {_COLLAPSED} effective particles in more than a tenth "
+                "of the samples; its covariances may be far too small, take more particles"
+            )
+        return collapses
+
     def _tempered(
-        self, x: np.ndarray, log_weights: np.ndarray, seen: _Sample, sample: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the particles and the logarithms of their weights after the update with a sample.
+        self, x: np.ndarray, log_weights: np.ndarray, sample: Sample, number: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the particles and the logarithms of their weights after the update with a sample,
+        and the effective number of particles (batch,) that it would have left without tempering.
 
         Where the likelihood would leave too few effective particles, it is applied in several
         factors. Each is a power of the likelihood that leaves effectively half of the
         particles, and is followed by resampling.
         """
-        t, y, u, R = seen
-        remaining = np.ones(len(y))
-        log_likelihood = self._log_likelihood(x, seen)
+        remaining = np.ones(len(sample.y))
+        log_likelihood = self._log_likelihood(x, sample)
+        effective = left = _effective(log_weights + log_likelihood)
         for part_number in range(_ROUNDS):
-            trial = log_weights + remaining * log_likelihood
-            rows = np.flatnonzero(_effective(trial) < self.particles / _FEW)
+            rows = np.flatnonzero(left < self.particles / _FEW)
             if not len(rows):
                 break
             # Apply a power of the likelihood to these episodes, and resample them.
@@ -212,19 +234,18 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
             log_weights = log_weights.copy()
             log_weights[:, rows] = _normalised(old + part * likelihood)
             remaining[rows] -= part
-            discount = _TEMPERED if self.discount is None else self.discount
-            stream = sample, part_number
-            x, log_weights = self._resampled(x, log_weights, rows, stream, discount)
-            part_seen = t, y[rows], u[rows], R[..., rows] if R.shape[2] > 1 else R
-            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), part_seen)
-        return x, _normalised(log_weights + remaining * log_likelihood)
+            stream, seen = (number, part_number), sample.rows(rows)
+            x, log_weights = self._resampled(x, log_weights, rows, stream, seen, tempering=True)
+            log_likelihood[:, rows] = self._log_likelihood(x.take(rows, 1), seen)
+            left = _effective(log_weights + remaining * log_likelihood)
+        return x, _normalised(log_weights + remaining * log_likelihood), effective
 
-    def _log_likelihood(self, x: np.ndarray, seen: _Sample) -> np.ndarray:
+    def _log_likelihood(self, x: np.ndarray, sample: Sample) -> np.ndarray:
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
-        t, y, u, R = seen
+        t, y, u = sample.t, sample.y, sample.u
         errors = self.system.output_residual(y, np.asarray(self.system.h(t, x, u)))
         errors = np.where(np.isnan(y), 0.0, errors)
-        log_likelihood = -0.5 * _squared_sizes(errors, R)
+        log_likelihood = -0.5 * _squared_sizes(errors, sample.R)
         box = self.system.state_box
         if box is not None:
             outside = box.outside(x)
@@ -245,7 +266,9 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         log_weights: np.ndarray,
         rows: np.ndarray,
         stream: tuple[int, int],
-        discount: float,
+        sample: Sample,
+        *,
+        tempering: bool,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Resample the particles of the given episodes to equal weights, with their mean and
         covariance preserved in expectation. The stream identifies the random numbers of this
@@ -254,7 +277,6 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         # `take` keeps the order in memory, on which that of sums depends; indexing changes it.
         old, weights, count = x.take(rows, 1), np.exp(log_weights.take(rows, 1)), self.particles
         old = gathered(old, self.system.state_period, weights)
-        shrinkage = (3 * discount - 1) / (2 * discount)
         mean, P = moments(weights, old)
         # Systematic resampling: the number of copies of each particle.
         ends = np.clip(np.ceil(np.cumsum(weights, axis=0) * count - rng.random()), 0, count)
@@ -264,14 +286,20 @@ a &= \frac{3 \delta - 1}{2 \delta}, \qquad \xi_i \sim \mathcal N(0, I),
         drawn = np.take_along_axis(old, ancestors.reshape(len(rows), count).T[..., None], axis=0)
         x, log_weights = x.copy(), log_weights.copy()
         log_weights[:, rows] = -np.log(count)
-        if shrinkage == 1:
-            x[:, rows] = drawn
+        x[:, rows] = drawn
+        if self.discount is None:
+            a = shrinkages(self.system, sample, mean, P, tempering=tempering)
+        else:
+            a = np.full(len(rows), shrinkage_of(self.discount))
+        wide = np.flatnonzero(a < 1)
+        if not len(wide):
             return x, log_weights
         # Shrink the copies towards the mean, and restore the covariance by Gaussian noise.
-        L, _ = factor(P.transpose(1, 2, 0), np.zeros(len(rows)))
-        L = np.sqrt(1 - shrinkage**2) * L
+        L, _ = factor(P[wide].transpose(1, 2, 0), np.zeros(len(wide)))
+        L = np.sqrt(1 - a[wide] ** 2) * L
         noise = spread(L, rng.standard_normal((count, x.shape[-1])))
-        x[:, rows] = shrinkage * drawn + (1 - shrinkage) * mean + noise
+        a = a[wide, None]
+        x[:, rows[wide]] = a * drawn[:, wide] + (1 - a) * mean[wide] + noise
         return x, log_weights
 
 

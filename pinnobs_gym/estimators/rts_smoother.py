@@ -18,8 +18,9 @@ from pinnobs_gym.estimation.kalman import observe
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.linear_window import linear_window, smoothed, whitened
 from pinnobs_gym.estimation.projection import kept_inside
-from pinnobs_gym.estimation.smoother import backward, forward
+from pinnobs_gym.estimation.smoother import backward, forward, ill_conditioned
 from pinnobs_gym.estimation.square_root import carried, prior_root
+from pinnobs_gym.estimation.wrapping import say_of_start
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 
@@ -32,10 +33,10 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
     The smoother uses the filter's linearisation. Where the filter converges to a wrong trajectory,
     the smoother does, too.
 
-    Without process noise, known or assumed, P⁻ of a contracting plant becomes singular, and the
-    inverse in the recursion loses digits; with a very wide prior, covariances do. In both cases the
-    same estimates are computed by two filters that carry roots, without an inverse
-    (`pinnobs_gym.estimation.linear_window`).
+    With little process noise, known or assumed, or none, P⁻ of a contracting plant becomes nearly
+    singular, and the inverse in the recursion loses digits; with a very wide prior, covariances do.
+    In these cases the same estimates are computed by two filters that carry roots, without an
+    inverse (`pinnobs_gym.estimation.linear_window`).
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
     the known one with `assumed_noise` added.
@@ -54,6 +55,7 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
     def run(self, record: Record) -> Estimates:
         record = replace(record, prior=checked(record.prior))
         R = self.noise.R(0.0)
+        say_of_start(self.label, self.system, record, R)
         roots = prior_root(self.system, record.prior, R)
         rows = np.arange(0) if roots is None else carried(roots)
         # A noise of one's own that differs between rows is that of all rows, not of some.
@@ -63,7 +65,12 @@ P_k^s &= (I - C_k F_k)\, P_k (I - C_k F_k)^\top + C_k (P_{k+1}^s + Q)\, C_k^\top
         with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             if len(rows) == record.batch:
                 return self._by_roots(record, self.noise)
-            path = backward(forward(self.system, record, self.noise))
+            filtered = forward(self.system, record, self.noise)
+            near = ill_conditioned(filtered)
+            rows = np.union1d(rows, near)
+            if len(rows) == record.batch or (len(near) and by_row):
+                return self._by_roots(record, self.noise)
+            path = backward(filtered)
             xhat, P = path.xhat.swapaxes(0, 1), path.P.transpose(3, 0, 1, 2)
             if len(rows):
                 wide = self._by_roots(record.rows(rows), self.noise.rows(rows))

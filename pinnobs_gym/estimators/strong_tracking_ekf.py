@@ -18,6 +18,7 @@ from pinnobs_gym.estimation.gaussian import (
 from pinnobs_gym.estimation.kalman import cautious, observe
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
+from pinnobs_gym.estimation.wrapping import say_what_turns, wrapped_state
 from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.record import Prior
 
@@ -70,10 +71,12 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         L = prior_root(self.system, prior, self.noise.R(0.0))
-        return State(prior.mean, P=prior.cov, memory=np.zeros(len(prior.mean)), root=L)
+        state = State(prior.mean, P=prior.cov, memory=np.zeros(len(prior.mean)), root=L)
+        return wrapped_state(self.system, state)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        return predicted(self.system, state, covariances(state), self.noise, t, u)
+        state = predicted(self.system, state, covariances(state), self.noise, t, u)
+        return wrapped_state(self.system, state)
 
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         # Rows without any output leave the growth to the next sample that has one.
@@ -81,6 +84,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
         growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
         state = enlarged(state, growth * np.where(seen, sizes, 0.0))
         P = covariances(state)
+        say_what_turns(self.label, self.system, (t, y, u), state.xhat, P, R)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         sizes = np.where(seen, squared_size(innovation, R) / self.system.ny, sizes)
         R = cautious(P, H, R, self.output_factor)

@@ -8,7 +8,7 @@ import pytest
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.rts_smoother import RTSSmoother
-from pinnobs_gym.simulation.model import model_step_jacobian
+from pinnobs_gym.simulation.model import model_step_jacobian, model_step_moments
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent, matrix, stack
 
@@ -127,3 +127,77 @@ def test_smoothing_by_roots_is_the_backward_recursion():
         own, roots = each.run(played), each._by_roots(played, each.noise)
         np.testing.assert_allclose(roots.xhat, own.xhat, atol=1e-12)
         np.testing.assert_allclose(roots.P, own.P, atol=1e-14)
+
+
+@pytest.mark.parametrize("process_noise", [1e-4, 1e-6, 1e-8])
+def test_a_contracting_plant_with_little_noise_is_smoothed_as_with_fifty_digits(process_noise):
+    """The recursion of Rauch, Tung and Striebel by mpmath, with the model's own Φ and Q."""
+    A = np.array([[-5.0, 3.0, 0.0], [0.0, -40.0, 2.0], [1.0, 0.0, -1.0]])
+
+    @dataclass(frozen=True)
+    class Contracting(System):
+        state_names = ("a", "b", "c")
+        output_names = ("y",)
+        scale = (1.0, 1.0, 1.0)
+        setups = {"benchmark": Setup((-1.0,) * 3, (1.0,) * 3, duration=3.0, dt=0.1, noise_std=0.1)}
+
+        def f(self, t, x, u):
+            return x @ A.T
+
+        def h(self, t, x, u):
+            return x.sum(-1, keepdims=True)
+
+        def f_jacobian(self, t, x, u):
+            return matrix(x, tuple(map(tuple, A)))
+
+        def h_jacobian(self, t, x, u):
+            return matrix(x, ((1, 1, 1),))
+
+    system, n = Contracting(), 30
+    y = 0.1 * np.random.default_rng(0).standard_normal((1, n, 1))
+    prior = Prior(np.zeros((1, 3)), np.eye(3)[None])
+    record = Record(0.1 * np.arange(n), y, np.zeros((1, n, 0)), prior)
+    smoother = RTSSmoother(system, process_noise=process_noise, assumed_noise=0.0)
+    found = smoother.run(record)
+    assert found.P is not None
+    for k, (x, P) in enumerate(with_fifty_digits(system, smoother.noise, record)):
+        std = np.sqrt(np.diag(P))
+        assert (abs(found.xhat[0, k] - x) < 1e-6 * std).all()
+        np.testing.assert_allclose(np.diag(found.P[0, k]), std**2, rtol=1e-6)
+
+
+def with_fifty_digits(system, noise, record):
+    """Return smoothed means and covariances of a record with one output and one row."""
+    with mpmath.workdps(50):
+        n, R = system.nx, mpmath.mpf(float(noise.R(0.0)[0, 0, 0]))
+        zero, u = np.zeros((1, n)), np.zeros((1, 0))
+        H = digits(system.h_jacobian(0.0, zero, u)[0])
+        x, P, steps = mpmath.matrix(n, 1), mpmath.eye(n), []
+        for k, t in enumerate(record.t):
+            F = before = None
+            if k:
+                times = float(record.t[k - 1]), float(t)
+                _, F, Q = model_step_moments(system, noise, *times, zero, u, u)
+                F, Q = digits(F[..., 0]), digits(np.broadcast_to(Q, (n, n, 1))[..., 0])
+                x, P = F * x, F * P * F.T + Q
+                before = x, P
+            K = P * H.T / ((H * P * H.T)[0] + R)
+            x = x + K * (mpmath.mpf(float(record.y[0, k, 0])) - (H * x)[0])
+            P = P - K * H * P
+            steps.append((x, P, F, before))
+        smoothed = [(x, P)]
+        for k in range(len(steps) - 2, -1, -1):
+            _, _, F, (ahead, P_ahead) = steps[k + 1]
+            x, P = steps[k][:2]
+            C = P * F.T * mpmath.inverse(P_ahead)
+            x_after, P_after = smoothed[-1]
+            smoothed.append((x + C * (x_after - ahead), P + C * (P_after - P_ahead) * C.T))
+        return [
+            (np.array(x.tolist(), dtype=float)[:, 0], np.array(P.tolist(), dtype=float))
+            for x, P in reversed(smoothed)
+        ]
+
+
+def digits(a):
+    """Return an array of numbers as a matrix of mpmath."""
+    return mpmath.matrix(np.asarray(a, float).tolist())

@@ -104,3 +104,5 @@ def figures(repeats: int) -> Iterator[Figure]:
         yield at_most(f"radar, {name}: tracks lost of {RUNS}", lost, "", 0)
         rms = float(np.median(np.sqrt((error**2).mean(axis=1))))
         yield at_most(f"radar, {name}: error of the position", rms, "m", 1.1)
+    lost = int((~(tracks("particle") <= LOST)).any(axis=1).sum())
+    yield at_most(f"radar, particle: tracks lost of {RUNS}", lost, "", 0)
