@@ -42,19 +42,20 @@ def test_its_steps_are_torchs(dtype):
 def test_a_resumed_minimisation_goes_on_as_before():
     whole = parameters(torch.float64)
     first = Adam(whole)
-    for rate in RATES:
-        first.clear()
-        loss(*whole).backward()
-        if rate == RATES[2]:
-            state = first.state()
-            again = [p.detach().clone().requires_grad_() for p in whole]
-        first.step(rate)
+
+    def go_on(adam, moved, rates):
+        for rate in rates:
+            adam.clear()
+            loss(*moved).backward()
+            adam.step(rate)
+
+    go_on(first, whole, RATES[:2])
+    state = first.state()
+    again = [p.detach().clone().requires_grad_() for p in whole]
+    go_on(first, whole, RATES[2:])
     second = Adam(again)
     second.load_state(state)
-    for rate in RATES[2:]:
-        second.clear()
-        loss(*again).backward()
-        second.step(rate)
+    go_on(second, again, RATES[2:])
     for a, b in zip(whole, again, strict=True):
         np.testing.assert_array_equal(a.detach().numpy(), b.detach().numpy())
 
