@@ -81,8 +81,16 @@ class Registry(Generic[T]):
     def plug_ins(self) -> list[type[T]]:
         """Import and return the classes announced by installed packages, with a warning for each
         that cannot be imported."""
+        return self._announced()
+
+    def _announced(self, wanted: str | None = None) -> list[type[T]]:
+        """Import the classes for `plug_ins`; of a wanted name only as many as it takes, and those
+        announced under that name first."""
         classes = []
-        for point in entry_points(group=f"pinnobs_gym.{self._kind}s"):
+        points = entry_points(group=f"pinnobs_gym.{self._kind}s")
+        for point in sorted(points, key=lambda point: point.name != wanted):
+            if wanted in self._known:
+                break
             try:
                 classes.append(self.register(point.load()))
             except Exception as error:  # whatever another package raises
@@ -131,7 +139,7 @@ class Registry(Generic[T]):
         if spec not in self._known and spec in self.sources:
             self._import_class(spec)
         if spec not in self._known:
-            self.plug_ins()
+            self._announced(spec)
         if spec not in self._known:
             known = ", ".join(sorted({*self._known, *self.sources}))
             if not known:  # e.g. if a folder in the working folder shadows the package

@@ -74,6 +74,29 @@ def test_entry_points_are_found_and_broken_ones_left_out(plug_in, tmp_path, monk
     assert "ReverseDuffing" in classes
 
 
+def test_a_plug_in_that_is_named_is_loaded_alone(tmp_path, monkeypatch):
+    """One whose class has another name than its entry point is found, too, after a warning of what
+    cannot be imported before it."""
+    info = tmp_path / "plug_in-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plug-in\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(
+        "[pinnobs_gym.systems]\n"
+        "broken = broken_plug_in:Nothing\nDecay = one_plug_in:Decay\nz = other_plug_in:Growth\n"
+    )
+    (tmp_path / "broken_plug_in.py").write_text("raise RuntimeError('imported')")
+    (tmp_path / "one_plug_in.py").write_text(PLUG_IN)
+    (tmp_path / "other_plug_in.py").write_text(PLUG_IN.replace("Decay", "Growth"))
+    monkeypatch.syspath_prepend(tmp_path)
+    fresh = made("pinnobs_gym.systems")
+    assert fresh.resolve("Decay").__module__ == "one_plug_in"
+    assert not {"broken_plug_in", "other_plug_in"} & set(sys.modules)
+    with pytest.warns(UserWarning, match="system plug-in 'broken' is left out: imported"):
+        assert fresh.resolve("Growth").__module__ == "other_plug_in"
+    for name in ("one_plug_in", "other_plug_in"):
+        del sys.modules[name]
+
+
 def made(package: str) -> Registry[System]:
     """A registry of systems whose files lie in a package."""
     return Registry("system", "pinnobs_gym.simulation.system:System", package, "state_names")

@@ -18,7 +18,8 @@ from pinnobs_gym.envs.arguments import (
     reward_weights,
     seeds_of,
 )
-from pinnobs_gym.envs.episodes import Changes, EpisodeBuffer, EpisodeSource, Stream
+from pinnobs_gym.envs.episode_buffer import EpisodeBuffer
+from pinnobs_gym.envs.episodes import Changes, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
@@ -80,7 +81,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         self._k = 0
         self._over = True
         self._stream: Stream | None = None
-        self._buffer = EpisodeBuffer(self.source, 1)
+        self._buffer = EpisodeBuffer(self.source, 1, measured=False)
         self._picture: EpisodePicture | None = None
 
     def reset(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from itertools import chain, cycle, islice
+from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -25,9 +23,6 @@ _DRAWS = 64
 """Number of initial states drawn at a time."""
 _ATTEMPTS = 1000
 """Number of such draws without an admissible state after which the initial set counts as empty."""
-
-_SAMPLES_AHEAD = 65536
-"""Number of samples simulated at a time when rows restart one by one."""
 
 
 class Changes(TypedDict, total=False):
@@ -57,10 +52,6 @@ class Draws:
     """A seed per episode for the draws of its condition and of the process noise; empty if neither
     draws anything."""
 
-    def row(self, i: int) -> Draws:
-        """Return the draws of one episode."""
-        return Draws(*(getattr(self, f.name)[i : i + 1] for f in fields(self)))
-
 
 @dataclass(frozen=True)
 class Episodes:
@@ -74,10 +65,6 @@ class Episodes:
     """Inputs, shape (num_steps + 1, batch, nu)."""
     observations: np.ndarray
     """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
-
-    def row(self, i: int) -> Episodes:
-        """Return one of the episodes."""
-        return Episodes(*(getattr(self, f.name)[:, i : i + 1] for f in fields(self)))
 
 
 class EpisodeSource:
@@ -226,68 +213,6 @@ class EpisodeSource:
         u = episodes.u[:last].swapaxes(0, 1).copy()
         prior = Prior.of(self.system, self.setup, batch, xhat0)
         return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
-
-
-class EpisodeBuffer:
-    """Buffer of the next episodes of an env's rows, simulated before they are played.
-
-    Simulating many episodes takes little longer than one. When rows restart one by one, a block of
-    episodes is simulated at a time: one for each requested row and each other row without a waiting
-    episode, and then further ones of the requested rows.
-
-    Args:
-        source: source of the episodes.
-        rows: number of rows.
-    """
-
-    def __init__(self, source: EpisodeSource, rows: int) -> None:
-        self._source = source
-        self._waiting: list[deque[tuple[Draws, Episodes]]] = [deque() for _ in range(rows)]
-
-    def forget(self, rows: Iterable[int]) -> None:
-        """Drop the waiting episodes of these rows, whose streams have changed."""
-        for row in rows:
-            self._waiting[row].clear()
-
-    def any(self, rows: Iterable[int]) -> bool:
-        """Return whether any of these rows has an episode that is not yet started."""
-        return any(self._waiting[row] for row in rows)
-
-    def _draw(self, rows: Sequence[int], streams: Sequence[Stream]) -> Draws:
-        """Return the draws of the next episodes of these rows, waiting or not."""
-        waiting = [self._waiting[row].popleft()[0] if self._waiting[row] else None for row in rows]
-        drawn = [
-            self._source.draw([streams[row]]) if draws is None else draws
-            for row, draws in zip(rows, waiting, strict=True)
-        ]
-        seeds = tuple(seed for draws in drawn for seed in draws.seeds)
-        x0, noise, u = (
-            np.concatenate([getattr(draws, name) for draws in drawn])
-            for name in ("x0", "noise", "u")
-        )
-        return Draws(x0, noise, u, seeds)
-
-    def take(
-        self, rows: Sequence[int], streams: Sequence[Stream], x0: np.ndarray | None = None
-    ) -> Episodes:
-        """Return the next episodes of these rows, from initial states (len(rows), nx) if given."""
-        if x0 is not None:
-            return self._source.play(self._draw(rows, streams), x0)
-        missing = [row for row in rows if not self._waiting[row]]
-        if missing:
-            requested = set(missing)
-            others = (
-                r for r, queue in enumerate(self._waiting) if not queue and r not in requested
-            )
-            size = max(len(missing), _SAMPLES_AHEAD // len(self._source.times))
-            block = list(islice(chain(missing, others, cycle(missing)), size))
-            draws = self._source.draw([streams[row] for row in block])
-            played = self._source.play(draws)
-            for i, row in enumerate(block):
-                self._waiting[row].append((draws.row(i), played.row(i)))
-        taken = [self._waiting[row].popleft()[1] for row in rows]
-        parts = (np.concatenate([getattr(t, f.name) for t in taken], 1) for f in fields(Episodes))
-        return Episodes(*parts)
 
 
 class Stream:

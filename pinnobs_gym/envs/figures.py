@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pinnobs_gym.envs.panels import panels
 from pinnobs_gym.simulation.residual import nearest, residual
 from pinnobs_gym.simulation.system import System, initial_states
 
@@ -44,17 +45,14 @@ def state_figure(
         P: covariances (num_samples, nx, nx), drawn as a band of two standard deviations.
         title: title of the figure.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 1.0 + 1.6 * system.nx), layout="constrained")
-    panels = figure.subplots(system.nx, 1, sharex=True, squeeze=False)[:, 0]
+    figure, column = panels(system.nx, width=8, height=1.0 + 1.6 * system.nx)
     measured = measured_states(system)
     if y is not None:
         y = drawn_outputs(system, xhat if x is None else x, y)
     if x is not None:
         xhat = nearest(xhat, x, system.state_period)
     periods = system.state_period or [None] * system.nx
-    for i, (panel, name) in enumerate(zip(panels, system.state_names, strict=True)):
+    for i, (panel, name) in enumerate(zip(column[:, 0], system.state_names, strict=True)):
         unit = system.units.get(name)
         panel.set_ylabel(f"{name} ({unit})" if unit else name)
         if y is not None and i in measured:
@@ -78,9 +76,9 @@ def state_figure(
         if len(seen):
             panel.set_ylim(*_limits(seen, float(system.scale[i])))
         panel.grid(alpha=0.3)
-    panels[0].set_title(title, fontsize=10)
-    panels[0].legend(loc="upper right", fontsize=8, ncols=3)
-    panels[-1].set_xlabel(f"t ({system.time_unit})")
+    column[0, 0].set_title(title, fontsize=10)
+    column[0, 0].legend(loc="upper right", fontsize=8, ncols=3)
+    column[-1, 0].set_xlabel(f"t ({system.time_unit})")
     return figure
 
 

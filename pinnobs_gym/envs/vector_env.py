@@ -20,7 +20,8 @@ from pinnobs_gym.envs.arguments import (
     given_x0,
     reward_weights,
 )
-from pinnobs_gym.envs.episodes import Changes, EpisodeBuffer, Episodes, EpisodeSource, Stream
+from pinnobs_gym.envs.episode_buffer import EpisodeBuffer
+from pinnobs_gym.envs.episodes import Changes, Episodes, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
@@ -73,7 +74,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._any_over = False
         self._together = True
         self._streams: list[Stream] = []
-        self._buffer = EpisodeBuffer(self.source, num_envs)
+        self._buffer = EpisodeBuffer(self.source, num_envs, measured=True)
         self._episodes: Episodes | None = None
         self._noise: np.ndarray | None = None
         self._prior = Prior.of(self.source.system, self.source.setup, num_envs)
@@ -210,7 +211,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             self._episodes = self.source.play(draws, x0, self._episodes)
         else:
             new = self._buffer.take(chosen, self._streams, x0)
-            for name in ("x", "y", "observations"):
+            for name in ("x", "y", "u", "observations"):
                 getattr(self._playing, name)[:, rows] = getattr(new, name)
         self._k[rows] = 0
         self._over[rows] = False

@@ -8,13 +8,11 @@ count by their version alone, which rows carry; files that code reads at run tim
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import importlib.util
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from importlib.machinery import ModuleSpec
@@ -26,6 +24,7 @@ import numpy as np
 
 import pinnobs_gym
 from pinnobs_gym.registry import discard_stale_bytecode
+from pinnobs_gym.scoring.code_source import Import, digest, told
 from pinnobs_gym.simulation.system import System
 
 _OWN = frozenset({"pinnobs_gym", "trainers"})
@@ -95,11 +94,6 @@ def content(value: Any) -> Any:
     raise Unreadable(f"{name} is neither data nor code with a source of its own")
 
 
-def digest(value: Any) -> str:
-    """Return a short hash of what `repr` shows of a value."""
-    return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
-
-
 def _modules(subject: type | str) -> Iterator[str]:
     """Yield the modules that define a class and its bases, without those of foreign packages."""
     if isinstance(subject, str):
@@ -153,14 +147,12 @@ def _is_installed(top: str) -> bool:
     return any(Path(path).resolve() in parents for path in paths if path)
 
 
-_Import = tuple[str, str]
-"""A module, and the name that is imported from it, if any."""
-_LOADED: dict[str, tuple[ModuleType, ModuleSpec | None, str, tuple[_Import, ...]]] = {}
+_LOADED: dict[str, tuple[ModuleType, ModuleSpec | None, str, tuple[Import, ...]]] = {}
 """By name: the module and its spec, of which a reload makes new ones, the digest of its code, and
 its imports."""
 
 
-def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
+def _loaded(name: str) -> tuple[str, tuple[Import, ...]]:
     """Return the digest of a module's code, and its imports."""
     module = sys.modules.get(name)
     if module is not None and name in _LOADED:
@@ -175,112 +167,14 @@ def _loaded(name: str) -> tuple[str, tuple[_Import, ...]]:
             f"{file} was edited within a second of being compiled, and Python has loaded what it "
             "held before; run again"
         )
+    package = (spec.parent if spec else name.rpartition(".")[0]) or ""
     try:
-        source = Path(file).read_bytes()
-        tree = ast.parse(source)
+        code, imports = told(Path(file), package)
     except (OSError, SyntaxError) as error:
         raise Unreadable(f"module {name}: {error}") from None
-    package = (spec.parent if spec else name.rpartition(".")[0]) or ""
-    imports = (*_imports(package, tree), *_imports_by_call(package, tree, source))
-    code = digest(_shape(tree))
     if module is not None:
         _LOADED[name] = module, module.__spec__, code, imports
     return code, imports
-
-
-def _shape(node: Any) -> list[str]:
-    """Return the shape of a syntax tree: no positions, no docstrings, no empty fields, which
-    differ between versions of Python."""
-    shape: list[str] = []
-    _append_shape(node, shape)
-    return shape
-
-
-def _append_shape(node: Any, shape: list[str]) -> None:
-    if isinstance(node, ast.AST):
-        shape.append(type(node).__name__)
-        for name in node._fields:
-            value = getattr(node, name, None)
-            if not (value is None or (type(value) is list and not value) or name == "kind"):
-                shape.append(name)
-                _append_shape(value, shape)
-        shape.append(")")
-    elif isinstance(node, list):
-        for part in node:
-            if not _is_text(part):
-                _append_shape(part, shape)
-        shape.append("]")
-    else:
-        shape.append(repr(node))
-
-
-def _is_text(node: Any) -> bool:
-    """Return whether a statement is a string alone, such as a docstring."""
-    if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
-        return False
-    return isinstance(node.value.value, str)
-
-
-def _imports(package: str, tree: ast.Module) -> Iterator[_Import]:
-    """Yield what a module of a package imports, at its head or inside functions."""
-    for node in _executed(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, ""
-        elif isinstance(node, ast.ImportFrom):
-            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            for alias in node.names:
-                yield base, alias.name
-
-
-_CALLS = ("import_module", "__import__")
-"""The functions that import a module by its name."""
-
-
-def _imports_by_call(package: str, tree: ast.Module, source: bytes) -> Iterator[_Import]:
-    """Yield the modules that calls of `_CALLS` in a module of a package import, where the name is a
-    constant."""
-    if not any(function.encode() in source for function in _CALLS):
-        return  # a walk through all expressions takes as long as all the rest
-    for statement in _executed(tree):
-        for node in _expressions(statement):
-            if not isinstance(node, ast.Call):
-                continue
-            function = getattr(node.func, "attr", getattr(node.func, "id", None))
-            given = [*node.args[:1], *(part.value for part in node.keywords if part.arg == "name")]
-            if function not in _CALLS or not given or not isinstance(given[0], ast.Constant):
-                continue
-            name = given[0].value
-            with suppress(ImportError):  # a relative name outside a package, which Python refuses
-                if type(name) is str and name:
-                    yield importlib.util.resolve_name(name, package), ""
-
-
-def _expressions(statement: ast.AST) -> Iterator[ast.AST]:
-    """Yield the expressions of a statement, without those of the statements in its blocks."""
-    waiting = [statement]
-    while waiting:
-        for node in ast.iter_child_nodes(waiting.pop()):
-            if not isinstance(node, ast.stmt | ast.ExceptHandler | ast.match_case):
-                waiting.append(node)
-                yield node
-
-
-_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
-"""The fields of statements that hold statements."""
-
-
-def _executed(tree: ast.Module) -> Iterator[ast.AST]:
-    """Yield the statements of a module, without blocks for type checkers."""
-    waiting: list[ast.AST] = [tree]
-    while waiting:
-        node = waiting.pop()
-        yield node
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            waiting += node.orelse
-            continue
-        for name in _BLOCKS:
-            waiting += getattr(node, name, ())
 
 
 def _home_of(base: str, name: str) -> str:

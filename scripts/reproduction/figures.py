@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pinnobs_gym.envs.panels import panels
 from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.scoring.playing import Played
 from trainers.pinn_obs.pictures import gain_figure
@@ -23,7 +24,9 @@ def estimates_figure(played: Played, title: str) -> Figure:
     assert legend is not None
     legend.remove()
     handles, labels = top.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8)
+    top.set_title("")
+    top.set_title(title, fontsize=10, loc="left")
+    figure.legend(handles, labels, loc="upper right", ncols=3, fontsize=8, borderaxespad=0.2)
     return figure
 
 
@@ -47,10 +50,7 @@ def readable_gain_figure(trained: TrainedNetwork) -> Figure:
 
 def loss_figure(curve: np.ndarray, title: str) -> Figure:
     """Plot the least loss over iterations, from points (num_points, 2)."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 3), layout="constrained")
-    panel = figure.subplots()
+    figure, ((panel,),) = panels(1, width=8, height=3)
     panel.semilogy(curve[:, 0], curve[:, 1], lw=1.3)
     panel.set_title(title, fontsize=10)
     panel.set_xlabel("iteration")

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from drawn import cut_off
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.panels import panels
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
 
@@ -22,3 +24,17 @@ def test_estimates_that_diverged_are_drawn_as_far_as_they_go(value, known):
     for panel in figure.axes:
         (line,) = (line for line in panel.lines if line.get_label() == "estimate")
         np.testing.assert_array_equal(line.get_xdata(), t[:20])
+
+
+@pytest.mark.parametrize("size", [2.5e-4, 1.0, 7e4, -3e9])
+@pytest.mark.parametrize("rows", [1, 2, 9])
+def test_nothing_is_cut_off(size, rows):
+    figure, column = panels(rows, width=8, height=1 + 1.6 * rows)
+    for panel in column[:, 0]:
+        panel.plot([0, 1000], [-size, size])
+        panel.set_ylabel("armature current (kA)")
+    column[-1, 0].set_xlabel("t (s)")
+    column[0, 0].set_title("pinnobs/InductionMotor-v0, noise5+dropout10: strong_tracking_ekf")
+    assert not cut_off(figure)
+    column[0, 0].set_ylabel("a name that is longer than the panel is high, " * 4)
+    assert cut_off(figure)

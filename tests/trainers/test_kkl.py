@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from drawn import cut_off
 from linear import A as PLANT
 from linear import FeedThrough, H, Linear, linear_record
 from scipy.integrate import solve_ivp
@@ -598,6 +599,7 @@ def test_the_sweep_chooses_a_cutoff_and_draws_its_curve():
     assert points[-1]["noise_gain"] > 2 * points[3]["noise_gain"]  # faster filters pass more
     drawn = figures(plant, trained, record)
     assert set(drawn) == {"radius", "error", "maps", "sweep"}
+    assert not any(cut_off(figure) for figure in drawn.values())
     driven, plant, _, record = trained_on("kkl_supervised", "InductionMotor", **short)
     assert set(figures(plant, driven, record)) == {"radius"}
 

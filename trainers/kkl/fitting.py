@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pinnobs_gym.estimation.learned.kkl_maps import Mlp
-from pinnobs_gym.estimation.learned.trained_file import with_tensors
+from trainers.adam import Adam
 
 FitMethod: TypeAlias = Literal["gauss_newton", "adam"]
 
@@ -75,6 +74,14 @@ def _times(matrix: Tensor, values: Tensor) -> Tensor:
     return (matrix @ values[..., None])[..., 0]
 
 
+def _squared(J: Tensor) -> Tensor:
+    """Return JᵀJ. NumPy computes one half of it, torch both."""
+    if J.device.type != "cpu":
+        return J.T @ J
+    rows = J.numpy()
+    return torch.from_numpy(rows.T @ rows)
+
+
 Objective: TypeAlias = Callable[[torch.Generator], Sequence[Equations]]
 """Draws the equations of one step, a mini-batch."""
 
@@ -108,7 +115,7 @@ class Fit:
         self.iteration, self.loss = 0, math.nan
         self._H: Tensor | None = None
         self._damping = _FIRST_DAMPING
-        self._adam = torch.optim.Adam(net.parameters, learning_rate)
+        self._adam = Adam(net.parameters)
 
     def step(self, progress: float) -> None:
         """Make one step at a training progress between 0 and 1."""
@@ -125,12 +132,10 @@ class Fit:
         residuals = [e.residual(self.net) for e in equations]
         loss = torch.stack([r.square().mean() for r in residuals]).sum()
         self.loss = loss.item()
-        for group in self._adam.param_groups:
-            group["lr"] = length
-        self._adam.zero_grad()
+        self._adam.clear()
         if math.isfinite(self.loss):
             loss.backward()
-            self._adam.step()
+            self._adam.step(length)
 
     def _newton_step(self, equations: Sequence[Equations], length: float) -> None:
         with torch.no_grad():
@@ -139,7 +144,7 @@ class Fit:
             for each in equations:
                 residual, J = each.linearised(self.net)
                 flat, rows = residual.reshape(-1), J.reshape(-1, J.shape[-1])
-                H, g = H + rows.T @ rows / len(flat), g + rows.T @ flat / len(flat)
+                H, g = H + _squared(rows) / len(flat), g + rows.T @ flat / len(flat)
                 self.loss += float(flat @ flat) / len(flat)
             assert isinstance(H, Tensor)
             assert isinstance(g, Tensor)
@@ -179,7 +184,7 @@ class Fit:
             "damping": self._damping,
             "H": None if self._H is None else self._H.cpu().numpy(),
             "parameters": [p.detach().cpu().numpy() for p in self.net.parameters],
-            "adam": copy.deepcopy(self._adam.state_dict()),
+            "adam": self._adam.state(),
             "generator": self.generator.get_state().numpy(),
         }
 
@@ -191,5 +196,5 @@ class Fit:
         with torch.no_grad():
             for p, kept in zip(self.net.parameters, state["parameters"], strict=True):
                 p.copy_(torch.from_numpy(kept))
-        self._adam.load_state_dict(with_tensors(state["adam"]))
+        self._adam.load_state(state["adam"])
         self.generator.set_state(torch.from_numpy(state["generator"]))

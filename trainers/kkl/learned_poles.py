@@ -11,6 +11,7 @@ from torch import Tensor
 from pinnobs_gym.estimation.learned.kkl_maps import Mlp, Scaling
 from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import truth
+from trainers.adam import Adam
 
 EPISODES = 200
 """Largest number of episodes from which windows are drawn."""
@@ -68,7 +69,7 @@ class PoleSearch:
             Scaling(np.zeros(n), np.eye(n)) for n in (system.ny * len(sizes), system.nx)
         )
         self._net = Mlp(inputs, outputs, 2, _WIDTH, "tanh", self._generator)
-        self._adam = torch.optim.Adam([*self._net.parameters, self._logs], _RATE)
+        self._adam = Adam([*self._net.parameters, self._logs])
         self.iteration = 0
         """Number of steps so far."""
         self.loss = float("nan")
@@ -85,8 +86,6 @@ class PoleSearch:
 
     def step(self) -> None:
         """Make a step of Adam, of a length that falls as a half cosine."""
-        for group in self._adam.param_groups:
-            group["lr"] = _RATE * 0.5 * (1 + np.cos(np.pi * self.iteration / STEPS))
         # A batch of windows, each ending at a sample k of an episode i, with fresh noise.
         y, window, generator = self._y, self._window, self._generator
         k = torch.randint(window, len(y), (_BATCH,), generator=generator)
@@ -99,9 +98,9 @@ class PoleSearch:
         z = torch.einsum("pw,bwo->bop", weights, windows).reshape(_BATCH, -1)
         z = (z - z.mean(0)) / z.std(0)
         loss = (self._net(z) - self._states[k, i]).square().mean()
-        self._adam.zero_grad()
+        self._adam.clear()
         loss.backward()
-        self._adam.step()
+        self._adam.step(_RATE * 0.5 * (1 + np.cos(np.pi * self.iteration / STEPS)))
         self.iteration += 1
         self.loss = loss.item()
 

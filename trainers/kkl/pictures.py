@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pinnobs_gym.envs.panels import ABOVE, BELOW, LEFT, panels
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.record import Prior, Record
@@ -23,6 +24,8 @@ RADII = np.linspace(0.1, 2.0, 14)
 _RAYS = 12
 _FLOOR = 1e-6
 """Smallest error that is shown."""
+_BAR = 0.8
+"""Width in inches of the numbers and the name beside a bar of colours."""
 
 
 def figures(system: System, trained: TrainedKKL, record: Record) -> dict[str, Figure]:
@@ -68,7 +71,6 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
     T(x) is integrated, without noise. The box of the training states and an episode are drawn, too.
     """
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     first, second, x = _plane(system, trained)
     states = x.reshape(-1, system.nx)
@@ -79,8 +81,7 @@ def error_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
     scale = vector(system.scale, system.nx, "scale")
     off = system.state_residual(xhat, states[stays]) / scale
     error[stays] = np.sqrt((off**2).mean(axis=-1))
-    figure = Figure(figsize=(6.5, 5), layout="constrained")
-    panel = figure.subplots()
+    figure, ((panel,),) = panels(1, width=6.5, height=5, after=_BAR)
     shown = np.maximum(error, _FLOOR).reshape(GRID, GRID)
     image = panel.pcolormesh(first, second, shown, norm=LogNorm(_FLOOR, 1.0), cmap="viridis")
     figure.colorbar(image, label="scaled error of x̂")
@@ -112,8 +113,6 @@ def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure
 
     The radius is the distance from the middle of the training set over that of its edge.
     """
-    from matplotlib.figure import Figure
-
     x0 = _starts(system, trained, 400)
     middle = (x0.min(axis=0) + x0.max(axis=0)) / 2
     reach = (x0.max(axis=0) - x0.min(axis=0)) / 2
@@ -121,8 +120,7 @@ def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure
     outer = x0[np.argsort(-size)[:_RAYS]]
     x0 = middle + RADII[:, None, None] * (outer - middle)
     errors = _tails(system, trained, record, x0)
-    figure = Figure(figsize=(6.5, 4), layout="constrained")
-    panel = figure.subplots()
+    figure, ((panel,),) = panels(1, width=6.5, height=4)
     low, mid, high = np.nanquantile(errors, [0.1, 0.5, 0.9], axis=1)
     panel.fill_between(RADII, low, high, alpha=0.25, lw=0, label="80 % of episodes")
     panel.semilogy(RADII, mid, lw=1.5, label="median")
@@ -159,20 +157,25 @@ def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) 
 def maps_figure(system: System, trained: TrainedKKL) -> Figure:
     """Plot components of T over the first two states, and of T* over the plane of the first two
     principal components of z."""
-    from matplotlib.figure import Figure
-
     first, second, x = _plane(system, trained)
     z = trained.T(x)
     shown = min(trained.dynamics.size, 3)
     columns = max(shown, min(system.nx, 3))
-    figure = Figure(figsize=(3.2 * columns, 6), layout="constrained")
-    panels: Any = figure.subplots(2, columns, squeeze=False)
+    figure, grid = panels(
+        2,
+        columns,
+        width=LEFT + 3.4 * columns,
+        height=6,
+        beside=_BAR,
+        after=_BAR,
+        between=BELOW + ABOVE,
+    )
     for i in range(shown):
-        image = panels[0, i].pcolormesh(first, second, z[..., i], cmap="viridis")
-        figure.colorbar(image, ax=panels[0, i])
-        panels[0, i].set_title(f"T: z{i + 1}", fontsize=10)
-        panels[0, i].set_xlabel(system.state_names[0])
-    panels[0, 0].set_ylabel(system.state_names[1])
+        image = grid[0, i].pcolormesh(first, second, z[..., i], cmap="viridis")
+        figure.colorbar(image, ax=grid[0, i])
+        grid[0, i].set_title(f"T: z{i + 1}", fontsize=10)
+        grid[0, i].set_xlabel(system.state_names[0])
+    grid[0, 0].set_ylabel(system.state_names[1])
     flat = trained.T(_starts(system, trained, 500))
     mean = flat.mean(axis=0)
     _, sizes, axes = np.linalg.svd(flat - mean, full_matrices=False)
@@ -182,12 +185,12 @@ def maps_figure(system: System, trained: TrainedKKL) -> Figure:
     plane = mean + a[..., None] * axes[0] + b[..., None] * axes[1]
     xhat = trained.inverse(plane, _late(trained), np.zeros(system.nu))
     for i in range(min(system.nx, 3)):
-        image = panels[1, i].pcolormesh(*sides, xhat[..., i], cmap="viridis")
-        figure.colorbar(image, ax=panels[1, i])
-        panels[1, i].set_title(f"T*: {system.state_names[i]}", fontsize=10)
-        panels[1, i].set_xlabel("first axis of z")
-    panels[1, 0].set_ylabel("second axis of z")
-    for panel in panels.ravel():
+        image = grid[1, i].pcolormesh(*sides, xhat[..., i], cmap="viridis")
+        figure.colorbar(image, ax=grid[1, i])
+        grid[1, i].set_title(f"T*: {system.state_names[i]}", fontsize=10)
+        grid[1, i].set_xlabel("first axis of z")
+    grid[1, 0].set_ylabel("second axis of z")
+    for panel in grid.ravel():
         if not panel.has_data():
             panel.set_axis_off()
     return figure
@@ -195,26 +198,24 @@ def maps_figure(system: System, trained: TrainedKKL) -> Figure:
 
 def sweep_figure(trained: TrainedKKL) -> Figure:
     """Plot error, noise gain and convergence time over the cut-off, with the chosen one marked."""
-    from matplotlib.figure import Figure
-
     points = trained.facts["sweep"]
     cutoff = [point["cutoff"] for point in points]
-    figure = Figure(figsize=(6.5, 6), layout="constrained")
-    panels: Any = figure.subplots(3, 1, sharex=True)
+    figure, column = panels(3, width=6.5, height=6)
     for name in ("noisy", "clean"):
         values = [point[name] for point in points]
-        panels[0].loglog(cutoff, values, "o-", label=f"{name} outputs")
-    panels[0].set_ylabel("NRMSE at the end")
-    panels[0].legend(fontsize=8)
+        column[0, 0].loglog(cutoff, values, "o-", label=f"{name} outputs")
+    column[0, 0].set_ylabel("NRMSE at the end")
+    column[0, 0].legend(fontsize=8)
     for panel, name, label in (
-        (panels[1], "noise_gain", "noise gain"),
-        (panels[2], "convergence", "convergence (s)"),
+        (column[1, 0], "noise_gain", "noise gain"),
+        (column[2, 0], "convergence", "convergence (s)"),
     ):
         panel.semilogx(cutoff, [point[name] for point in points], "o-")
         panel.set_ylabel(label)
-    for panel in panels:
+    for panel in column[:, 0]:
         panel.axvline(trained.config["cutoff"], color="#d1495b", ls="--", lw=1)
         panel.grid(alpha=0.3)
-    panels[2].set_xlabel("cut-off (Hz)")
-    panels[0].set_title(f"{trained.system}: {trained.trainer}, cut-off chosen in red", fontsize=10)
+    column[2, 0].set_xlabel("cut-off (Hz)")
+    title = f"{trained.system}: {trained.trainer}, cut-off chosen in red"
+    column[0, 0].set_title(title, fontsize=10)
     return figure

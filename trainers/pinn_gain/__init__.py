@@ -19,12 +19,12 @@ from torch import Tensor
 
 from pinnobs_gym.estimation.learned.gain_network import memory_size, shapes
 from pinnobs_gym.estimation.learned.perceptron import Layers
-from pinnobs_gym.estimation.learned.trained_file import with_tensors
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, output_scale, vector
 from pinnobs_gym.training.trainer import Trainer
+from trainers.adam import Adam
 from trainers.pinn_gain.config import PinnGainConfig
 from trainers.pinn_gain.held_out import HeldOut
 from trainers.pinn_gain.rollout import Model
@@ -123,7 +123,7 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
         self.average = [p.clone() for p in self.parameters]
         for parameter in self.parameters:
             parameter.requires_grad_()
-        self._optimiser = torch.optim.Adam(self.parameters, lr=config.learning_rate)
+        self._optimiser = Adam(self.parameters)
         first = 1.0 if config.variant == "kalman" else 0.0
         memory = memory_size(config.variant, system.ny, config.width), first
         chunk = min(config.chunk, self.record.num_samples)
@@ -141,16 +141,14 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
         self.iteration += 1
         self.since += 1
         self.loss = loss.item()
-        self._optimiser.zero_grad()
+        self._optimiser.clear()
         if math.isfinite(self.loss):
             loss.backward()
             self.gradient = float(torch.nn.utils.clip_grad_norm_(self.parameters, 1.0))
         if math.isfinite(self.loss) and math.isfinite(self.gradient):
             # A step of Adam with warm-up, then the moving average of the weights.
             self.failures = 0
-            for group in self._optimiser.param_groups:
-                group["lr"] = self.config.learning_rate * min(1.0, self.since / _WARM_UP)
-            self._optimiser.step()
+            self._optimiser.step(self.config.learning_rate * min(1.0, self.since / _WARM_UP))
             kept = min(_AVERAGE, 1 - 1 / (1 + self.since / 2))
             for average, parameter in zip(self.average, self.parameters, strict=True):
                 average.lerp_(parameter.detach(), 1 - kept)
@@ -246,7 +244,7 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
             "streams": self.streams.state(),
             "parameters": [p.detach().numpy() for p in self.parameters],
             "average": [p.numpy() for p in self.average],
-            "optimiser": self._optimiser.state_dict(),
+            "optimiser": self._optimiser.state(),
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -258,7 +256,7 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
             for mine, kept in zip(self.parameters, state["parameters"], strict=True):
                 mine.copy_(torch.from_numpy(kept))
         self.average = [torch.from_numpy(kept) for kept in state["average"]]
-        self._optimiser.load_state_dict(with_tensors(state["optimiser"]))
+        self._optimiser.load_state(state["optimiser"])
         self.streams.load_state(state["streams"])
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.panels import panels
 from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
 from pinnobs_gym.simulation.system import System
 
@@ -24,15 +25,12 @@ def figures(system: System, trained: TrainedNetwork) -> dict[str, Figure]:
 def gain_figure(t: np.ndarray, L: np.ndarray) -> Figure:
     """Plot gains L (num_samples, nx, ny) over times t (num_samples,) in s, with a panel per state
     and a line per output."""
-    from matplotlib.figure import Figure
-
     nx, ny = L.shape[1:]
-    figure = Figure(figsize=(8, 1.0 + 1.6 * nx), layout="constrained")
-    panels = figure.subplots(nx, 1, sharex=True, squeeze=False)[:, 0]
-    for i, panel in enumerate(panels):
+    figure, column = panels(nx, width=8, height=1.0 + 1.6 * nx)
+    for i, panel in enumerate(column[:, 0]):
         for j in range(ny):
             panel.plot(t, L[:, i, j], lw=1.2, label=f"L{i + 1}{j + 1}")
         panel.legend(loc="upper right", fontsize=8)
         panel.grid(alpha=0.3)
-    panels[-1].set_xlabel("t (s)")
+    column[-1, 0].set_xlabel("t (s)")
     return figure

@@ -18,8 +18,13 @@ from pinnobs_gym.leaderboard.contenders import contenders
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.states_table import by_state
 from pinnobs_gym.leaderboard.tables import tables
-from pinnobs_gym.scoring.evaluation import Results, make_estimator, run_episodes, seeds_of
-from pinnobs_gym.scoring.rows import Row
+from pinnobs_gym.scoring.evaluation import (
+    Evaluated,
+    Results,
+    make_estimator,
+    run_episodes,
+    seeds_of,
+)
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
 from pinnobs_gym.training.by_name import load
 from pinnobs_gym.training.log import Log
@@ -65,11 +70,14 @@ class Evaluate:
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         check_writable(self.out)
-        scored = self._score(game, estimator, episodes)
-        for table in tables(contenders(runs_of(scored))):
+        evaluated = self._score(game, estimator, episodes)
+        for table in tables(contenders(runs_of(evaluated.rows))):
             hint = f"pinnobs tables {self._rows} -o FILE writes all"
             print_table(standings_table.layouts(table), hint)
-        print_table([[by_state(game.source.system, scored)]])
+        print_table([[by_state(game.source.system, evaluated.rows)]])
+        with Log(log_folder(self.out, evaluated.rows[0])) as log:  # drawing takes longer
+            log_episodes(log, evaluated.rows, evaluated.first_played)
+            log_summary(log, evaluated.rows)
         console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)
@@ -80,8 +88,8 @@ class Evaluate:
     def _rows(self) -> Path:
         return self.out / "rows.jsonl"
 
-    def _score(self, game: Game, estimator: BaseEstimator, episodes: int) -> list[Row]:
-        """Score and log this number of episodes, and return their rows."""
+    def _score(self, game: Game, estimator: BaseEstimator, episodes: int) -> Evaluated:
+        """Score this number of episodes."""
         seeds = seeds_of(self.seed, episodes)
         with progress() as bar:
             task = bar.add_task("episodes", total=episodes)
@@ -94,10 +102,7 @@ class Evaluate:
             bar.update(task, completed=episodes)
         if evaluated.reused:
             console.print(evaluated.reuse(self._rows), soft_wrap=True, highlight=False)
-        with Log(log_folder(self.out, evaluated.rows[0])) as log:
-            log_episodes(log, evaluated.rows, evaluated.first_played)
-            log_summary(log, evaluated.rows)
-        return evaluated.rows
+        return evaluated
 
 
 def run(arguments: Sequence[str]) -> int:
