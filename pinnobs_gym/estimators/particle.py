@@ -11,10 +11,10 @@ import numpy as np
 from pinnobs_gym.estimation.circular import gathered
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
-from pinnobs_gym.estimation.kernels import Sample, shrinkage_of, shrinkages
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.regularisation import Sample, shrinkage_of, shrinkages
 from pinnobs_gym.estimation.wrapping import say_of_outputs
 from pinnobs_gym.simulation.matrices import cholesky, factor, moments, spread, total, weighted_mean
 from pinnobs_gym.simulation.model import noisy_model_step
@@ -68,7 +68,7 @@ class ParticleFilter(RecursiveEstimator):
     particles are then drawn from Gaussians about the resampled ones, whose centres are shrunk
     towards the mean so that the mean and the covariance of the set are preserved in expectation.
     This is artificial noise. By default, it makes up for what the known noise lacks
-    (`pinnobs_gym.estimation.kernels`); it also follows each tempering step.
+    (`pinnobs_gym.estimation.regularisation`); it also follows each tempering step.
 
     A particle that overflows, that is outside of the states' bounds, or at which the output is not
     defined, has the weight zero. Where this holds for all particles of an episode, they stay where

@@ -10,7 +10,7 @@ from benchmarks.plants.motion import Growth, grid_means, growth_runs
 from benchmarks.plants.radar import LOST, tracks
 from circle import Pair, Turns, circle_record
 
-from pinnobs_gym.estimation.kernels import Sample, shrinkage_of, shrinkages
+from pinnobs_gym.estimation.regularisation import Sample, shrinkage_of, shrinkages
 from pinnobs_gym.estimators.particle import ParticleFilter
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior, Record

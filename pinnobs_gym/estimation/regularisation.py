@@ -42,7 +42,7 @@ class Sample:
         L = noise.L(t)
         Q = np.zeros((len(L), len(L), 1))
         if before is not None and L.shape[1]:
-            Q = (t - before) * noise.density(t)
+            Q = (t - before) * noise.root(t).density
         return Sample(t, y, u, noise.R(t, y), Q)
 
     def rows(self, rows: np.ndarray) -> Sample:
