@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,12 +46,7 @@ def plant_library(system: System, template: str) -> PlantLibrary | str:
 
 def _usual(system: System) -> System:
     """Return the plant with the numbers of its class, which stand for all."""
-    usual = type(system)()
-    numbers = {
-        f.name: getattr(usual, f.name)
-        for f in fields(system)
-        if is_number(getattr(usual, f.name)) and f.name != "measured_input"
-    }
+    numbers = {n: v for n, v in type(system)().parameters.items() if is_number(v)}
     return replace(system, measured_input=False, **numbers)
 
 
