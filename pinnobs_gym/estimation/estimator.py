@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from pinnobs_gym.estimation.compiled import Packed
 from pinnobs_gym.estimation.given import checked_reset, checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
@@ -42,6 +43,8 @@ class State:
     root: np.ndarray | None = None
     """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
     `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
+    packed: Packed | None = None
+    """The same arrays in the layout of compiled code, if it computed them."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,9 @@ class BaseEstimator(ABC):
         for name, check in checks.items():
             if name in vars(cls) and not getattr(vars(cls)[name], "__isabstractmethod__", False):
                 setattr(cls, name, check(vars(cls)[name]))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "compiled"}
 
     def __post_init__(self) -> None:
         probe(type(self.system))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, final
+from functools import cached_property
+from typing import Any, ClassVar, final
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimator, State
+from pinnobs_gym.estimation.compiled import CompiledFilter, compiled_filter
+from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
+from pinnobs_gym.simulation.record import Record
 
 
 @dataclass(frozen=True)
@@ -19,6 +22,10 @@ class RecursiveEstimator(Estimator):
     Subclasses define `reset`, `predict` and `correct`. One that defines `update` is refused with a
     TypeError; it derives from `Estimator` instead.
     """
+
+    template: ClassVar[str] = ""
+    """The template of `pinnobs_gym.simulation.kernels` that computes the same; empty if there is
+    none. It is not used for a subclass that overrides `reset`, `predict` or `correct`."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -55,6 +62,44 @@ class RecursiveEstimator(Estimator):
 
     @final
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        compiled = self.compiled
+        if compiled is not None:
+            after = compiled.update(state, t, y, u)
+            if after is not None:
+                return after
+        return self.update_by_numpy(state, t, y, u)
+
+    def run(self, record: Record) -> Estimates:
+        compiled = self.compiled
+        if compiled is not None:
+            columns = compiled.run(record)
+            if columns is not None:
+                return Estimates(**columns)
+        return super().run(record)
+
+    @final
+    def update_by_numpy(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after the sample at time t by `predict` and `correct`, which compiled
+        code has to agree with; see `update`."""
         if state.t is not None:
             state = self._state_from("predict", self.predict(state, t, u))
         return self._state_from("correct", self.correct(state, t, y, u))
+
+    @cached_property
+    def compiled(self) -> CompiledFilter | None:
+        """The compiled code of the estimator; None if it is computed in NumPy."""
+        found = compiled_filter(self)
+        return None if isinstance(found, str) else found
+
+    def plan_settings(self) -> dict[str, Any]:
+        """Return the settings that the compiled code takes, by the fields of ``struct plan``."""
+        return {}
+
+    def carried_memory(self, state: State) -> tuple[Any, dict[str, np.ndarray]]:
+        """Return the memory of the next state, and those of its arrays, by the fields of ``struct
+        call``, that the compiled code reads and changes."""
+        return state.memory, {}
+
+    def memory_rows(self, memory: Any, rows: np.ndarray) -> Any:
+        """Return the memory of some rows of the batch."""
+        return memory

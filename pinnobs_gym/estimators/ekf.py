@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -62,6 +63,7 @@ class EKF(RecursiveEstimator, GaussianEstimator):
     Schaub 2007); never if None. The value 1.345 is 95 % efficient on Gaussian noise."""
 
     name = "ekf"
+    template = "ekf"
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u), \qquad
 \dot\Phi = \tfrac{\partial f}{\partial x}(t, \hat x, u)\, \Phi \\
@@ -109,6 +111,21 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         if self.huber is not None:
             R = self._reweighted(P, innovation, H, R)
         return corrected(state, (t, u), P, innovation, H, R)
+
+    def plan_settings(self) -> dict[str, Any]:
+        settings: dict[str, Any] = {"patience": self.patience, "huber": self.huber or 0.0}
+        return settings if self.gate is None else settings | {"gate": self._gate_bounds()}
+
+    def carried_memory(self, state: State) -> tuple[EKFMemory, dict[str, np.ndarray]]:
+        memory: EKFMemory = state.memory
+        if self.gate is None:
+            return memory, {}
+        memory = replace(memory, beyond=memory.beyond.astype(np.int64))
+        P_restart = np.ascontiguousarray(memory.P_restart)
+        return memory, {"beyond": memory.beyond, "P_restart": P_restart}
+
+    def memory_rows(self, memory: EKFMemory, rows: np.ndarray) -> EKFMemory:
+        return replace(memory, P_restart=memory.P_restart[..., rows], beyond=memory.beyond[rows])
 
     def _gate_bounds(self) -> np.ndarray:
         """Return the gate's bounds on the NIS of 0, 1, ... ny outputs, which are χ² quantiles."""

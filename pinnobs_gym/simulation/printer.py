@@ -1,4 +1,4 @@
-"""SymPy expressions of real numbers as lines of NumPy code."""
+"""SymPy expressions of real numbers as lines of code, in NumPy or in C."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Printer:
 
     def define(self, symbol: sympy.Symbol, expression: Any) -> None:
         """Write the line that gives a symbol its value."""
-        self.lines.append(f"{symbol} = {self.code(expression)}")
+        self.lines.append(self.line(str(symbol), self.code(expression)))
         if self._is_scalar(expression):
             self._scalars.add(symbol)
         if self._is_gate(expression):
@@ -58,10 +58,10 @@ class Printer:
         if e.is_Symbol:
             return str(e)
         if e in (sympy.true, sympy.false):
-            return str(e)
+            return self.truth(e == sympy.true)
         if e.is_Number or e.is_NumberSymbol:
             value = float(e)
-            text = repr(value) if math.isfinite(value) else f"float('{value!r}')"
+            text = repr(value) if math.isfinite(value) else self.infinite(value)
             return f"({text})" if value < 0 else text
         for kind, method in _METHODS.items():
             if isinstance(e, kind):
@@ -74,10 +74,25 @@ class Printer:
         name = _FUNCTIONS.get(type(e).__name__)
         if name is None:
             raise ValueError(f"{type(e).__name__} has no counterpart in NumPy")
-        args = [self.code(part) for part in e.args]
+        return self.call(name, [self.code(part) for part in e.args])
+
+    def truth(self, value: bool) -> str:
+        """Return the code of a truth value."""
+        return str(value)
+
+    def infinite(self, value: float) -> str:
+        """Return the code of a number that is not finite."""
+        return f"float('{value!r}')"
+
+    def call(self, name: str, args: list[str]) -> str:
+        """Return the call of a function by NumPy's name."""
         while name.startswith("logical") and len(args) > 2:  # NumPy's have two arguments
             args = [f"np.{name}({args[0]}, {args[1]})", *args[2:]]
         return f"np.{name}({', '.join(args)})"
+
+    def line(self, name: str, code: str) -> str:
+        """Return the line that gives a name its value."""
+        return f"{name} = {code}"
 
     def _sum(self, e: Any) -> str:
         text = ""
@@ -97,7 +112,9 @@ class Printer:
         if gates and len(gates) < len(e.args):
             gate = self._named(self._factors(gates))
             rest = self._factors([part for part in e.args if part not in gates])
-            return f"({sign}np.where({gate} == 0.0, 0.0, {gate} * {rest}))"
+            return (
+                f"({sign}{self.call('where', [f'({gate} == 0.0)', '0.0', f'({gate} * {rest})'])})"
+            )
         return f"({sign}{self._factors(e.args)})"
 
     def _factors(self, parts: Sequence[Any]) -> str:
@@ -117,9 +134,9 @@ class Printer:
         name, value = self._named(self.code(base)), float(exponent)
         whole, half = int(value), value % 1 == 0.5
         if value > _LARGEST_POWER or not (half or value == whole):
-            return f"np.power({name}, {value!r})"
+            return self.call("power", [name, repr(value)])
         factors = [self._whole_power(name, whole)] if whole else []
-        return f"({' * '.join([*factors, f'np.sqrt({name})'] if half else factors)})"
+        return f"({' * '.join([*factors, self.call('sqrt', [name])] if half else factors)})"
 
     def _whole_power(self, name: str, n: int) -> str:
         """Return the code of a power by products of lower ones."""
@@ -131,14 +148,12 @@ class Printer:
         return f"{half} * {half}"
 
     def _piecewise(self, e: Any) -> str:
-        text = "np.nan"
+        text = self.infinite(math.nan)
         for value, condition in reversed(e.args):
             part = self.code(value)
-            text = (
-                part
-                if condition == sympy.true
-                else f"np.where({self.code(condition)}, {part}, {text})"
-            )
+            if condition != sympy.true:
+                part = self.call("where", [self.code(condition), part, text])
+            text = part
         return text
 
     def _pieces(self, e: Any) -> str:
@@ -146,7 +161,7 @@ class Printer:
         return f"table{number}_{order}({self.code(x)})"
 
     def _step(self, e: Any) -> str:
-        return f"np.heaviside({self.code(e.args[0])}, 0.5)"
+        return self.call("heaviside", [self.code(e.args[0]), "0.5"])
 
     def _named(self, code: str) -> str:
         """Return a name of the value of some code, for which a line is written if need be."""
@@ -154,7 +169,7 @@ class Printer:
             return code
         if code not in self._names:
             self._names[code] = f"w{len(self._names)}"
-            self.lines.append(f"{self._names[code]} = {code}")
+            self.lines.append(self.line(self._names[code], code))
         return self._names[code]
 
     def _scalars_first(self, parts: Sequence[Any]) -> list[Any]:

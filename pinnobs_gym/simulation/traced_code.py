@@ -83,8 +83,12 @@ class Trace:
         kind = self.tape.kind()
         plant = with_symbols(system, parameters, properties, kind)
         # One row rather than none, so that sums over the states are arrays, too.
-        given = (as_array(part, kind) for part in (self.t, [self.x], [self.u]))
-        (value,), size = getattr(plant, name)(*given), {"f": system.nx, "h": system.ny}[name]
+        if name == "input":
+            given = (as_array([self.t], kind),)
+        else:
+            given = tuple(as_array(part, kind) for part in (self.t, [self.x], [self.u]))
+        size = {"f": system.nx, "h": system.ny, "input": system.nu}[name]
+        (value,) = getattr(plant, name)(*given)
         self.values: list[Any] = column(value, size).flat()
         """The components."""
 
@@ -105,24 +109,38 @@ class Trace:
     def source(self, rows: list[list[Any]], kind: str) -> str:
         """Return the code of a function of the system, t, x and u, whose value is a matrix of these
         rows or, if ``kind`` is ``vector``, of the components of the only one."""
-        steps, flat = self._shared([entry for row in rows for entry in row])
         printer = Printer(set(self.numbers.values()))
-        for symbol, expression in steps.items():
-            printer.define(symbol, expression)
-        entries = [printer.code(entry) for entry in flat]
-        used = {s for e in (*steps.values(), *flat) for s in e.free_symbols}
         given = [
             *((s, f"x[..., {i}]") for i, s in enumerate(self.x)),
             *((s, f"u[..., {i}]") for i, s in enumerate(self.u)),
             *((s, f"system.{name}") for name, s in self.numbers.items()),
         ]
-        lines = [f"{s} = {value}" for s, value in given if s in used] + printer.lines
+        lines, entries = self.printed([entry for row in rows for entry in row], printer, given)
         width = len(rows[0])
         made = [", ".join(entries[i : i + width]) for i in range(0, len(entries), width)]
         result = (
             f"stack(x, {made[0]})" if kind == "vector" else f"matrix(x, [[{'], ['.join(made)}]])"
         )
         return "\n    ".join(["def function(system, t, x, u):", *lines, f"return {result}"])
+
+    def printed(
+        self, wanted: list[Any], printer: Printer, given: list[tuple[sympy.Symbol, str]]
+    ) -> tuple[list[str], list[str]]:
+        """Return lines of code, and the code of some expressions of the names that they define.
+
+        Args:
+            wanted: the expressions.
+            printer: a new printer.
+            given: symbols, and the code of their values.
+        """
+        steps, flat = self._shared(wanted)
+        for symbol, expression in steps.items():
+            printer.define(symbol, expression)
+        entries = [printer.code(entry) for entry in flat]
+        used = {s for e in (*steps.values(), *flat) for s in e.free_symbols}
+        return [
+            printer.line(str(s), value) for s, value in given if s in used
+        ] + printer.lines, entries
 
     def _shared(self, wanted: list[Any]) -> tuple[dict[sympy.Symbol, Any], list[Any]]:
         """Return the steps that some expressions need, in the order in which they can be computed,

@@ -1,0 +1,96 @@
+"""The arguments of compiled code, as arrays in the layout that it expects.
+
+The batch is the last axis of all arrays, and their entries are contiguous doubles.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.simulation.runge_kutta import longest_step
+from pinnobs_gym.simulation.system import System
+
+_POINTER, _INT, _DOUBLE = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+
+
+class PlanStructure(ctypes.Structure):
+    """``struct plan`` of ``common.h``."""
+
+    _fields_ = [
+        *(("p", _POINTER), ("p_rows", _INT), ("L", _POINTER), ("m", _INT)),
+        *(("R", _POINTER), ("R_samples", _INT), ("R_rows", _INT)),
+        *(("longest", _DOUBLE), ("breaks", _POINTER), ("num_breaks", _INT)),
+        *(("input", _INT), ("discrete", _INT)),
+        *(("state_period", _POINTER), ("output_period", _POINTER)),
+        *(("low", _POINTER), ("high", _POINTER)),
+        *(("gate", _POINTER), ("patience", _INT), ("huber", _DOUBLE)),
+    ]
+
+
+class CallStructure(ctypes.Structure):
+    """``struct call`` of ``filter.h``."""
+
+    _fields_ = [
+        *(("plan", _POINTER), ("batch", _INT), ("samples", _INT)),
+        *((name, _POINTER) for name in ("t", "y", "u", "x", "P", "innovation", "S")),
+        *((name, _POINTER) for name in ("t_before", "u_before", "x_before", "P_before")),
+        *((name, _POINTER) for name in ("beyond", "P_restart", "x_predicted", "P_predicted", "F")),
+    ]
+
+
+def address(array: np.ndarray) -> int:
+    """Return the address of an array's first entry."""
+    return array.ctypes.data
+
+
+@dataclass(eq=False)
+class Plan:
+    """What stays the same over the samples of a call, with the arrays that it points to."""
+
+    structure: PlanStructure
+    kept: list[np.ndarray]
+
+    @staticmethod
+    def of(system: System, numbers: Sequence[str], L: np.ndarray, R: np.ndarray) -> Plan:
+        """Return the plan of a model.
+
+        Args:
+            system: the model.
+            numbers: the attributes of the system that its code takes.
+            L: process noise, shape (nx, m).
+            R: output noise, shape (samples or 1, ny, ny, batch or 1).
+        """
+        plan = Plan(PlanStructure(), [])
+        values = [np.asarray(getattr(system, name), dtype=float) for name in numbers]
+        by_row = any(value.ndim for value in values)
+        p = np.array(np.broadcast_arrays(*values) if by_row else values, dtype=float)
+        breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
+        measured = {"previous": 1, "linear": 2}[system.input_hold]
+        plan.set(p=p, L=L, R=R, breaks=breaks, output_period=_periods(system.output_period))
+        plan.set(state_period=_periods(system.state_period))
+        box = system.state_box
+        plan.set(low=None if box is None else box.low, high=None if box is None else box.high)
+        structure = plan.structure
+        structure.p_rows, structure.m = int(by_row), L.shape[1]
+        structure.R_samples, structure.R_rows = int(len(R) > 1), int(R.shape[-1] > 1)
+        structure.longest, structure.num_breaks = longest_step(system), len(breaks)
+        structure.input = measured if system.measured_input else 0
+        structure.discrete = int(system.discrete)
+        return plan
+
+    def set(self, **values: np.ndarray | float | None) -> None:
+        """Set fields: arrays by their address, None as a null pointer, and numbers."""
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                self.kept.append(np.ascontiguousarray(value, dtype=float))
+                value = address(self.kept[-1])
+            setattr(self.structure, name, value)
+
+
+def _periods(periods: Any) -> np.ndarray | None:
+    return None if periods is None else np.array([period or 0.0 for period in periods])

@@ -1,0 +1,48 @@
+/* What does not depend on the number of lanes. */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define MIN(a, b) ((a) < (b) ? (a) : (b))
+
+/* NumPy's functions, NaN included, that C does not have. */
+static inline double maximum(double a, double b) { return a > b || a != a ? a : b; }
+static inline double minimum(double a, double b) { return a < b || a != a ? a : b; }
+static inline double sign(double a) { return a > 0 ? 1.0 : a < 0 ? -1.0 : a; }
+static inline double heaviside(double a, double half)
+{
+    return a > 0 ? 1.0 : a < 0 ? 0.0 : a == 0 ? half : a;
+}
+
+/* Return a difference in [-period/2, period/2); one that is there already is unchanged. */
+static inline double wrapped(double difference, double period)
+{
+    const double half = period / 2;
+    if (-half <= difference && difference < half) return difference;
+    double rest = fmod(difference, period);
+    if (rest < 0) rest += period;
+    return rest >= half ? rest - period : rest;
+}
+
+/* What stays the same over the samples of a call. The batch is the last axis of all arrays. */
+struct plan {
+    const double *p;          /* the plant's numbers, (NP, 1 or batch) */
+    int64_t p_rows;           /* 1, or 0 if p is the same in all rows */
+    const double *L;          /* process noise, (NX, m) */
+    int64_t m;
+    const double *R;          /* output noise, (1 or samples, NY, NY, 1 or batch) */
+    int64_t R_samples;        /* 1, or 0 if R is the same at all samples */
+    int64_t R_rows;           /* 1, or 0 if R is the same in all rows */
+    double longest;           /* longest Runge-Kutta step in s */
+    const double *breaks;     /* ascending times at which f jumps */
+    int64_t num_breaks;
+    int64_t input;            /* 0: defined by the plant, 1: measured and held, 2: joined */
+    int64_t discrete;         /* 1 if the plant is a map */
+    const double *state_period;   /* (NX,), 0 for a state that does not repeat; or NULL */
+    const double *output_period;  /* (NY,), or NULL */
+    const double *low, *high; /* bounds of the states, (NX,), or NULL */
+    /* EKF */
+    const double *gate;       /* bounds of the NIS, (NY + 1,), or NULL */
+    int64_t patience;
+    double huber;             /* 0 for none */
+};

@@ -1,0 +1,137 @@
+/* The extended Kalman filter, as pinnobs_gym/estimators/ekf.py says. */
+
+/* Correct x and P by the outputs of sample k. 0 if NumPy has to do it. */
+static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
+                                    int64_t row, int count, lanes *restrict x, lanes *restrict P,
+                                    int64_t *restrict beyond)
+{
+    const struct plan *plan = c->plan;
+    lanes t, y[NY], u[LU], e[NY], H[NY * NX], R[NY * NY], S[NY * NY], HP[NY * NX];
+    EACH_LANE t[l] = c->t[k];
+    AT_WIDTH(load)(NY, c->y + k * NY * c->batch, c->batch, row, count, y);
+    AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, u);
+    AT_WIDTH(load_R)(plan, k, c->batch, row, count, y, R);
+    /* Innovation e = y - h and H; both are zero for missing outputs. */
+    AT_WIDTH(plant_h_linearised)(t, x, u, p, e, H);
+    for (int i = 0; i < NY; i++) {
+        EACH_LANE e[i][l] = y[i][l] - e[i][l];
+        if (plan->output_period && plan->output_period[i])
+            EACH_LANE e[i][l] = wrapped(e[i][l], plan->output_period[i]);
+        EACH_LANE e[i][l] = y[i][l] != y[i][l] ? 0 : e[i][l];
+        for (int j = 0; j < NX; j++)
+            EACH_LANE H[i * NX + j][l] = y[i][l] != y[i][l] ? 0 : H[i * NX + j][l];
+    }
+    /* S = H P H^T + R */
+    AT_WIDTH(product)(NY, NX, NX, H, P, HP);
+    AT_WIDTH(outer)(NY, NX, NY, HP, H, S);
+    for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
+    if (plan->gate) { /* restart rows that were beyond the gate for long */
+        lanes Se[NY];
+        int restarted = 0;
+        for (int i = 0; i < NY; i++) EACH_LANE Se[i][l] = e[i][l];
+        if (!AT_WIDTH(divide)(1, S, Se)) return 0;
+        EACH_LANE {
+            int present = 0;
+            double nis = 0;
+            for (int i = 0; i < NY; i++) {
+                int seen = 0;
+                for (int j = 0; j < NX; j++) seen |= H[i * NX + j][l] != 0;
+                present += seen;
+                nis += Se[i][l] * e[i][l];
+            }
+            if (present) beyond[l] = nis <= plan->gate[present] ? 0 : beyond[l] + 1;
+            if (beyond[l] >= plan->patience) {
+                const int64_t at = row + MIN(l, count - 1);
+                for (int i = 0; i < NX * NX; i++) P[i][l] = c->P_restart[i * c->batch + at];
+                beyond[l] = 0;
+                restarted = 1;
+            }
+        }
+        if (restarted) {
+            AT_WIDTH(product)(NY, NX, NX, H, P, HP);
+            AT_WIDTH(outer)(NY, NX, NY, HP, H, S);
+            for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
+        }
+    }
+    if (plan->huber) { /* enlarge variances of outputs with large innovations */
+        for (int i = 0; i < NY; i++) {
+            double excess[W];
+            EACH_LANE excess[l] =
+                maximum(fabs(e[i][l]) / (plan->huber * sqrt(S[i * NY + i][l])), 1.0);
+            for (int j = 0; j < NY; j++)
+                EACH_LANE {
+                    const double more = R[i * NY + j][l] * excess[l];
+                    S[i * NY + j][l] += more - R[i * NY + j][l];
+                    R[i * NY + j][l] = more;
+                }
+        }
+    }
+    /* K = P H^T S^-1 */
+    lanes K[NX * NY];
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NY; j++) EACH_LANE K[i * NY + j][l] = HP[j * NX + i][l];
+    if (!AT_WIDTH(divide)(NX, S, K)) return 0;
+    /* x = x + K e, and P = (I - K H) P (I - K H)^T + K R K^T */
+    lanes M[NX * NX], KR[NX * NY], own[NX * NX];
+    AT_WIDTH(product)(NX, NY, NX, K, H, M);
+    for (int i = 0; i < NX * NX; i++) EACH_LANE M[i][l] = -M[i][l];
+    for (int i = 0; i < NX; i++) EACH_LANE M[i * NX + i][l] += 1;
+    AT_WIDTH(sandwich)(NX, M, P);
+    AT_WIDTH(product)(NX, NY, NY, K, R, KR);
+    AT_WIDTH(symmetric)(NX, NY, KR, K, own);
+    for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += own[i][l];
+    for (int i = 0; i < NX; i++) {
+        double step[W];
+        EACH_LANE step[l] = K[i * NY][l] * e[0][l];
+        for (int j = 1; j < NY; j++) EACH_LANE step[l] += K[i * NY + j][l] * e[j][l];
+        EACH_LANE x[i][l] += step[l];
+    }
+    AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
+    AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
+    return !AT_WIDTH(outside)(plan, x);
+}
+
+/* Filter W rows, of which ``count`` exist. Return the number of the sample that NumPy has to do, or
+   the number of samples. */
+static int64_t AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count)
+{
+    const struct plan *plan = c->plan;
+    lanes p[LP], x[NX], P[NX * NX], F[NX * NX];
+    struct interval over = {.plan = plan, .p = p};
+    int64_t beyond[W];
+    EACH_LANE beyond[l] = plan->gate ? c->beyond[row + MIN(l, count - 1)] : 0;
+    AT_WIDTH(load)(NP, plan->p, plan->p_rows ? c->batch : 0, row, count, p);
+    AT_WIDTH(load)(NX, c->x_before, c->batch, row, count, x);
+    AT_WIDTH(load)(NX * NX, c->P_before, c->batch, row, count, P);
+    if (c->t_before) AT_WIDTH(load)(NU, c->u_before, c->batch, row, count, over.u1);
+    for (int64_t k = 0; k < c->samples; k++) {
+        const double *before = k ? c->t + k - 1 : c->t_before;
+        if (before) {
+            if (!AT_WIDTH(movable)(plan, *before, c->t[k])) return k;
+            over.t0 = *before;
+            over.t1 = c->t[k];
+            memcpy(over.u0, over.u1, sizeof over.u0);
+        }
+        AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, over.u1);
+        if (before) {
+            if (c->F) {
+                for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] = i % (NX + 1) == 0;
+                AT_WIDTH(move_moments)(&over, x, P, F);
+                AT_WIDTH(store)(NX * NX, F, c->F + k * NX * NX * c->batch, c->batch, row, count);
+            } else {
+                AT_WIDTH(move_moments)(&over, x, P, NULL);
+            }
+        }
+        if (c->x_predicted) {
+            AT_WIDTH(store)(NX, x, c->x_predicted + k * NX * c->batch, c->batch, row, count);
+            AT_WIDTH(store)(NX * NX, P, c->P_predicted + k * NX * NX * c->batch, c->batch, row,
+                            count);
+        }
+        if (!AT_WIDTH(correct)(c, p, k, row, count, x, P, beyond)) return k;
+        AT_WIDTH(store)(NX, x, c->x + k * NX * c->batch, c->batch, row, count);
+        AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * c->batch, c->batch, row, count);
+        if (plan->gate)
+            for (int l = 0; l < count; l++) c->beyond[row + l] = beyond[l];
+    }
+    return c->samples;
+}

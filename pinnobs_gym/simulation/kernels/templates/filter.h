@@ -1,0 +1,78 @@
+/* What filters share: a sample, the rows of a call, and when a sample is left to NumPy. */
+
+/* The arrays of a call, with the batch as the last axis. The row of a sample is (n, batch). */
+#ifndef CALL
+#define CALL
+struct call {
+    const struct plan *plan;
+    int64_t batch, samples;
+    const double *t;          /* (samples,) */
+    const double *y;          /* (samples, NY, batch); NaN is missing */
+    const double *u;          /* (samples, NU, batch) */
+    double *x;                /* (samples, NX, batch) */
+    double *P;                /* (samples, NX, NX, batch) */
+    double *innovation;       /* (samples, NY, batch) */
+    double *S;                /* (samples, NY, NY, batch) */
+    const double *t_before;   /* time of the sample before, or NULL: x and P are then predictions */
+    const double *u_before;   /* (NU, batch) */
+    const double *x_before;   /* (NX, batch) */
+    const double *P_before;   /* (NX, NX, batch) */
+    /* EKF with a gate */
+    int64_t *beyond;          /* (batch,) samples in a row beyond the gate */
+    const double *P_restart;  /* (NX, NX, batch) */
+    /* results of a forward pass, or NULL */
+    double *x_predicted;      /* (samples, NX, batch) */
+    double *P_predicted;      /* (samples, NX, NX, batch) */
+    double *F;                /* (samples, NX, NX, batch) */
+};
+#endif
+
+/* Load a sample; innovations and rows of H of missing outputs are zero later. */
+static inline void AT_WIDTH(load_R)(const struct plan *plan, int64_t k, int64_t batch, int64_t row,
+                                    int count, const lanes *restrict y, lanes *restrict R)
+{
+    const int64_t rows = plan->R_rows ? batch : 0;
+    const double *from = plan->R + k * plan->R_samples * NY * NY * (rows ? rows : 1);
+    AT_WIDTH(load)(NY * NY, from, rows, row, count, R);
+    for (int i = 0; i < NY; i++) /* covariances with missing outputs do not count */
+        for (int j = 0; j < NY; j++)
+            if (i != j)
+                EACH_LANE if (y[i][l] != y[i][l] || y[j][l] != y[j][l]) R[i * NY + j][l] = 0;
+}
+
+/* X = X S^-1 for X (n, NY) and S (NY, NY) symmetric; 0 where rounding leaves S no root. */
+static inline int AT_WIDTH(divide)(int n, const lanes *restrict S, lanes *restrict X)
+{
+    if (NY == 1) {
+        for (int i = 0; i < n; i++) EACH_LANE X[i][l] /= S[0][l];
+        return 1;
+    }
+    lanes root[NY * NY];
+    AT_WIDTH(cholesky)(NY, S, root);
+    AT_WIDTH(divide_factored)(n, NY, X, root);
+    int good = 1;
+    EACH_LANE {
+        int finite = 1;
+        for (int i = 0; i < NY * NY; i++) finite &= isfinite(S[i][l]) != 0;
+        good &= !finite || isfinite(root[NY * NY - 1][l]);
+    }
+    return good;
+}
+
+/* 1 if a state is outside of its bounds */
+static inline int AT_WIDTH(outside)(const struct plan *plan, const lanes *restrict x)
+{
+    int found = 0;
+    if (plan->low)
+        for (int i = 0; i < NX; i++)
+            EACH_LANE found |= x[i][l] < plan->low[i] || x[i][l] > plan->high[i];
+    return found;
+}
+
+/* 1 if the model can be moved between these times here */
+static inline int AT_WIDTH(movable)(const struct plan *plan, double t0, double t1)
+{
+    if (!(t1 > t0)) return 0;
+    if (plan->discrete) return t0 == floor(t0) && t1 == floor(t1);
+    return (t1 - t0) / plan->longest < 1e6;
+}

@@ -1,0 +1,233 @@
+/* The motion of the model from one sample to the next, as pinnobs_gym/simulation/model.py says. */
+
+/* An interval between two samples, for W lanes. */
+#define interval AT_WIDTH(interval)
+struct interval {
+    const struct plan *plan;
+    const lanes *p;
+    double t0, t1;
+    lanes u0[LU], u1[LU];     /* measured inputs at both */
+};
+
+/* Inputs at a time of the interval, for all lanes. */
+static inline void AT_WIDTH(input_at)(const struct interval *over, double t, double part,
+                                      lanes *restrict u)
+{
+    if (over->plan->input == 1) {
+        for (int i = 0; i < NU; i++) EACH_LANE u[i][l] = over->u0[i][l];
+    } else if (over->plan->input == 2) {
+        for (int i = 0; i < NU; i++)
+            EACH_LANE u[i][l] = (1 - part) * over->u0[i][l] + part * over->u1[i][l];
+    } else if (over->plan->p_rows) {
+        EACH_LANE plant_input(t, &over->p[0][l], W, &u[0][l], W);
+    } else { /* the same in all lanes */
+        plant_input(t, &over->p[0][0], W, &u[0][0], W);
+        for (int i = 0; i < NU; i++)
+            for (int l = 1; l < W; l++) u[i][l] = u[i][0];
+    }
+}
+
+/* A step of the classical Runge-Kutta method: its times, inputs and length. */
+#define rk_step AT_WIDTH(rk_step)
+struct rk_step {
+    double h;
+    lanes t[3];
+    lanes u[3][LU];           /* at the start, the middle and the end */
+};
+
+static const int AT_WIDTH(stage)[4] = {0, 1, 1, 2};
+#define STAGE AT_WIDTH(stage)
+
+static inline void AT_WIDTH(set_step)(const struct interval *over, double start, double step,
+                                      int64_t k, double last, struct rk_step *s)
+{
+    s->h = step;
+    for (int i = 0; i < 3; i++) {
+        const double t = MIN(start + (k + 0.5 * i) * step, last);
+        const double whole = over->t1 - over->t0;
+        EACH_LANE s->t[i][l] = t;
+        if (i == 0 && k > 0 && last == INFINITY) { /* the end of the previous step */
+            memcpy(s->u[0], s->u[2], sizeof s->u[0]);
+            continue;
+        }
+        AT_WIDTH(input_at)(over, t, (t - over->t0) / whole, s->u[i]);
+    }
+}
+
+/* x at the end of a step, from x at its start. */
+static inline void AT_WIDTH(runge_kutta)(const struct rk_step *s, const lanes *p, lanes *restrict x)
+{
+    lanes k[4][NX], point[NX];
+    const double h = s->h, part[4] = {0, h / 2, h / 2, h};
+    for (int q = 0; q < 4; q++) {
+        if (q == 0) memcpy(point, x, sizeof point);
+        else
+            for (int i = 0; i < NX; i++) EACH_LANE point[i][l] = part[q] * k[q - 1][i][l] + x[i][l];
+        AT_WIDTH(plant_f)(s->t[STAGE[q]], point, s->u[STAGE[q]], p, k[q]);
+    }
+    for (int i = 0; i < NX; i++)
+        EACH_LANE x[i][l] += h / 6 * ((k[1][i][l] + k[2][i][l]) * 2 + k[0][i][l] + k[3][i][l]);
+}
+
+/* The same, with the Jacobian F (NX, NX) of the step, and those of f at its first and last stage.
+   F integrates the variational equation F' = A F by the same method at the same stages. */
+static inline void AT_WIDTH(runge_kutta_linearised)(const struct rk_step *s, const lanes *p,
+                                                    lanes *restrict x, lanes *restrict F,
+                                                    lanes *restrict A_first,
+                                                    lanes *restrict A_last)
+{
+    lanes k[4][NX], point[NX], A[NX * NX], Phi[NX * NX], K[NX * NX];
+    const double h = s->h, part[4] = {0, h / 2, h / 2, h}, weight[4] = {1, 2, 2, 1};
+    for (int q = 0; q < 4; q++) {
+        if (q == 0) memcpy(point, x, sizeof point);
+        else
+            for (int i = 0; i < NX; i++) EACH_LANE point[i][l] = part[q] * k[q - 1][i][l] + x[i][l];
+        AT_WIDTH(plant_f_linearised)(s->t[STAGE[q]], point, s->u[STAGE[q]], p, k[q],
+                                     q == 0 ? A_first : q == 3 ? A_last : A);
+        if (q == 0) { /* Phi = I at the start */
+            memcpy(K, A_first, sizeof K);
+            for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] = K[i][l];
+        } else {
+            for (int i = 0; i < NX * NX; i++) EACH_LANE Phi[i][l] = part[q] * K[i][l];
+            for (int i = 0; i < NX; i++) EACH_LANE Phi[i * NX + i][l] += 1;
+            AT_WIDTH(product)(NX, NX, NX, q == 3 ? A_last : A, Phi, K);
+            for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] += weight[q] * K[i][l];
+        }
+    }
+    for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] *= h / 6;
+    for (int i = 0; i < NX; i++) EACH_LANE F[i * NX + i][l] += 1;
+    for (int i = 0; i < NX; i++)
+        EACH_LANE x[i][l] += h / 6 * ((k[1][i][l] + k[2][i][l]) * 2 + k[0][i][l] + k[3][i][l]);
+}
+
+/* P = P + B L L^T B^T w for B (NX, NX) */
+static inline void AT_WIDTH(add_noise)(const struct plan *plan, const lanes *restrict B, double w,
+                                       lanes *restrict P)
+{
+    const int m = (int)plan->m;
+    for (int c = 0; c < m; c++) {
+        lanes BL[NX];
+        for (int i = 0; i < NX; i++) {
+            EACH_LANE BL[i][l] = 0;
+            for (int j = 0; j < NX; j++) {
+                const double entry = plan->L[j * m + c];
+                if (entry != 0) EACH_LANE BL[i][l] += B[i * NX + j][l] * entry;
+            }
+        }
+        for (int i = 0; i < NX; i++)
+            for (int j = 0; j < NX; j++) EACH_LANE P[i * NX + j][l] += w * (BL[i][l] * BL[j][l]);
+    }
+}
+
+/* P = P + w L L^T */
+static inline void AT_WIDTH(add_density)(const struct plan *plan, double w, lanes *restrict P)
+{
+    const int m = (int)plan->m;
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) {
+            double sum = 0;
+            for (int c = 0; c < m; c++) sum += plan->L[i * m + c] * plan->L[j * m + c];
+            EACH_LANE P[i * NX + j][l] += w * sum;
+        }
+}
+
+/* The steps of an interval. Runge-Kutta steps are equal, at most the longest, and none crosses a
+   breakpoint; at its end, a part has the left limit of what jumps there. */
+#define steps AT_WIDTH(steps)
+struct steps {
+    double start, end, step, last;
+    int64_t count, k, next_break;
+    int begun;
+};
+
+static inline int AT_WIDTH(next_step)(const struct interval *over, struct steps *at,
+                                      struct rk_step *s)
+{
+    const struct plan *plan = over->plan;
+    while (!at->begun || at->k == at->count) {
+        if (at->begun && at->end >= over->t1) return 0;
+        at->start = at->begun ? at->end : over->t0;
+        if (!at->begun) at->next_break = 0;
+        while (at->next_break < plan->num_breaks && plan->breaks[at->next_break] <= at->start)
+            at->next_break++;
+        at->end = over->t1;
+        at->last = INFINITY;
+        if (at->next_break < plan->num_breaks && plan->breaks[at->next_break] <= over->t1) {
+            at->end = plan->breaks[at->next_break];
+            at->last = nextafter(at->end, at->start);
+        }
+        const double count = ceil((at->end - at->start) / plan->longest - 1e-6);
+        at->count = count < 1 ? 1 : (int64_t)count;
+        at->step = (at->end - at->start) / at->count;
+        at->k = 0;
+        at->begun = 1;
+    }
+    AT_WIDTH(set_step)(over, at->start, at->step, at->k, at->last, s);
+    at->k++;
+    return 1;
+}
+
+/* Move x (NX) over an interval. */
+static inline void AT_WIDTH(move)(const struct interval *over, lanes *restrict x)
+{
+    if (over->plan->discrete) {
+        for (double k = over->t0; k < over->t1; k++) {
+            lanes t, u[LU], next[NX];
+            EACH_LANE t[l] = k;
+            AT_WIDTH(input_at)(over, k, (k - over->t0) / (over->t1 - over->t0), u);
+            AT_WIDTH(plant_f)(t, x, u, over->p, next);
+            memcpy(x, next, sizeof next);
+        }
+        return;
+    }
+    struct steps at = {.begun = 0};
+    struct rk_step s;
+    while (AT_WIDTH(next_step)(over, &at, &s)) AT_WIDTH(runge_kutta)(&s, over->p, x);
+}
+
+/* Move x and its covariance P over an interval: P = F P F^T + Q, where
+   Q = integral of Psi L L^T Psi^T by Simpson's rule. Psi at the middle of a step is the cubic
+   Hermite polynomial through its values and slopes -Psi A at the ends. If ``F`` is given, it is
+   multiplied by the Jacobian. */
+static inline void AT_WIDTH(move_moments)(const struct interval *over, lanes *restrict x,
+                                          lanes *restrict P, lanes *restrict F)
+{
+    lanes step_F[NX * NX], A_first[NX * NX], A_last[NX * NX];
+    if (over->plan->discrete) {
+        for (double k = over->t0; k < over->t1; k++) {
+            lanes t, u[LU], next[NX];
+            EACH_LANE t[l] = k;
+            AT_WIDTH(input_at)(over, k, (k - over->t0) / (over->t1 - over->t0), u);
+            AT_WIDTH(plant_f_linearised)(t, x, u, over->p, next, step_F);
+            memcpy(x, next, sizeof next);
+            AT_WIDTH(sandwich)(NX, step_F, P);
+            AT_WIDTH(add_density)(over->plan, 1, P);
+            if (F) {
+                AT_WIDTH(product)(NX, NX, NX, step_F, F, A_first);
+                memcpy(F, A_first, sizeof A_first);
+            }
+        }
+        return;
+    }
+    struct steps at = {.begun = 0};
+    struct rk_step s;
+    while (AT_WIDTH(next_step)(over, &at, &s)) {
+        AT_WIDTH(runge_kutta_linearised)(&s, over->p, x, step_F, A_first, A_last);
+        AT_WIDTH(sandwich)(NX, step_F, P);
+        if (over->plan->m) {
+            /* Weights 1/6, 4/6 and 1/6 at the start, the middle and the end */
+            lanes twice[NX * NX];
+            AT_WIDTH(product)(NX, NX, NX, step_F, A_first, twice);
+            for (int i = 0; i < NX * NX; i++)
+                EACH_LANE twice[i][l] = (A_last[i][l] - twice[i][l]) * (s.h / 4) + step_F[i][l];
+            for (int i = 0; i < NX; i++) EACH_LANE twice[i * NX + i][l] += 1;
+            AT_WIDTH(add_noise)(over->plan, step_F, s.h / 6, P);
+            AT_WIDTH(add_noise)(over->plan, twice, s.h / 6, P);
+            AT_WIDTH(add_density)(over->plan, s.h / 6, P);
+        }
+        if (F) {
+            AT_WIDTH(product)(NX, NX, NX, step_F, F, A_first);
+            memcpy(F, A_first, sizeof A_first);
+        }
+    }
+}
