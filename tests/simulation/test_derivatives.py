@@ -393,9 +393,10 @@ SOURCE = """
 import sys
 sys.path.insert(0, {folder!r})
 from test_derivatives import FORMULAS, plant
+from pinnobs_gym.simulation.plant_form import plant_form
 from pinnobs_gym.simulation.traced_code import Trace
 for formula in FORMULAS.values():
-    trace = Trace(plant(formula)(), "f")
+    trace = Trace(plant_form(plant(formula)()), "f")
     print(trace.source(trace.jacobian(), "matrix"))
 """
 
