@@ -75,10 +75,7 @@ def library(source: str, about: Mapping[str, str] | None = None) -> tuple[ctypes
         about: what is told of the library where it is listed, such as its ``plant``.
     """
     candidates = usable_compilers()
-    if not candidates:
-        reason = "no C compiler works" if _broken else NO_COMPILER
-        say_once(f"{reason}; estimators run in NumPy, which takes longer")
-        return reason
+    made: tuple[ctypes.CDLL, str] | str = without_compiler()
     for i, compiler in enumerate(candidates):
         made = _with(source, compiler, dict(about or {}))
         if not isinstance(made, str):
@@ -90,6 +87,11 @@ def library(source: str, about: Mapping[str, str] | None = None) -> tuple[ctypes
         instead = f"{others[0].name} is tried" if others else "NumPy is used"
         say_once(f"{made}; {instead}")
     return made
+
+
+def without_compiler() -> str:
+    """Return the reason why nothing is compiled if no compiler is usable."""
+    return "no C compiler works" if _broken else NO_COMPILER
 
 
 def kept(name: str) -> ctypes.CDLL | None:

@@ -109,8 +109,8 @@ def processor() -> str:
         first = _CPUINFO.read_text(errors="replace").partition("\n\n")[0]
     except OSError:
         return _named_processor()
-    lines = dict(line.partition(":")[::2] for line in first.splitlines())
-    told = {key.strip(): value.strip() for key, value in lines.items()}
+    lines = (line.partition(":") for line in first.splitlines())
+    told = {key.strip(): value.strip() for key, _, value in lines}
     able = told.get("flags") or told.get("Features")
     if not able:
         return ""

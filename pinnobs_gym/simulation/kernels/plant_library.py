@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.kernels.agreement import agrees
-from pinnobs_gym.simulation.kernels.build import NO_COMPILER, kept, library, usable_compilers
+from pinnobs_gym.simulation.kernels.build import kept, library, usable_compilers, without_compiler
 from pinnobs_gym.simulation.kernels.cache_folder import PLANT, kernel_folder, read_json, write_json
 from pinnobs_gym.simulation.kernels.compilers import tools
 from pinnobs_gym.simulation.kernels.plant_key import plant_key
@@ -69,7 +69,7 @@ def why_not(system: System, template: str) -> str:
     reason = _excluded(system)
     if reason or usable_compilers():
         return reason or _why_untraced(system, template)
-    return NO_COMPILER
+    return without_compiler()
 
 
 def _excluded(system: System) -> str:
@@ -127,8 +127,8 @@ def _of_form(form: PlantForm, template: str) -> PlantLibrary | str:
         if code is not None:
             return PlantLibrary(code, tuple(told["numbers"]))
     if not candidates:
-        made = library("")  # says why there is none
-        return made if isinstance(made, str) else NO_COMPILER
+        say_once(f"{without_compiler()}; estimators run in NumPy, which takes longer")
+        return without_compiler()
     _forms[cls] += 1
     if _forms[cls] > MOST_FORMS:
         return f"more than {MOST_FORMS} {cls.__name__} differ in other things than numbers"
