@@ -124,7 +124,7 @@ def _is_followed(name: str, home: set[str] | frozenset[str]) -> bool:
         return True
     if top in sys.stdlib_module_names:
         return False
-    return not _is_installed(top)
+    return not is_installed(top)
 
 
 def _packages_of(name: str) -> Iterator[str]:
@@ -140,8 +140,9 @@ def _packages_of(name: str) -> Iterator[str]:
 
 
 @lru_cache(maxsize=512)
-def _is_installed(top: str) -> bool:
-    """Return whether a package comes from the folders of installed packages, or from nowhere."""
+def is_installed(top: str) -> bool:
+    """Return whether a top-level package comes from the folders of installed packages, or from
+    nowhere."""
     try:
         spec = importlib.util.find_spec(top)
     except (ImportError, ValueError):

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Set
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from platform import python_implementation, python_version
-from types import CodeType, FunctionType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.code_hash import Unreadable, digest, module_hashes
+from pinnobs_gym.simulation.code_hash import Unreadable, digest, is_installed, module_hashes
 from pinnobs_gym.simulation.plant_form import PlantForm
 from pinnobs_gym.simulation.system import System
 
@@ -37,7 +38,7 @@ def plant_key(form: PlantForm, *values: str) -> str | None:
     versions of what makes it; None if the code that defines the plant cannot be told."""
     try:
         plant = _plant(form.system, form.rest)
-    except (Unreadable, ValueError, RecursionError):
+    except (Unreadable, ValueError, OSError, RecursionError):
         return None
     parts = (plant, form.numbers, form.properties, values, _machinery(), _versions())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
@@ -75,11 +76,12 @@ class _Code:
         """Hashes of the sources by name."""
         self.parts: list[Any] = []
         self._seen: set[int] = set()
+        self._packages: set[str] = set()
 
     def add_class(self, cls: type) -> None:
         """Add the attributes of a class and of those that it derives from."""
         for each in cls.__mro__:
-            if id(each) in self._seen or self._is_foreign(each.__module__):
+            if id(each) in self._seen or self._counts_by_name(each.__module__):
                 continue
             self._seen.add(id(each))
             if "<locals>" in each.__qualname__:
@@ -109,7 +111,7 @@ class _Code:
 
     def add_function(self, function: FunctionType) -> None:
         """Add the code of a function, and what it names."""
-        if id(function) in self._seen:
+        if id(function) in self._seen or self._counts_by_name(function.__module__):
             return
         self._seen.add(id(function))
         if function.__code__.co_filename.startswith("<") or "<locals>" in function.__qualname__:
@@ -122,36 +124,52 @@ class _Code:
         names = _names(function.__code__)
         for name in sorted(names & function.__globals__.keys()):
             value = function.__globals__[name]
-            if isinstance(value, ModuleType):
-                for part in sorted(names & vars(value).keys()):
-                    self._add(f"{name}.{part}", vars(value)[part])
-            else:
-                self._add(name, value)
+            self._add(name, value, names)
 
-    def _add(self, name: str, value: Any) -> None:
-        """Add what a name stands for: code of this project or data. Code of others counts by its
-        name."""
+    def _add(self, name: str, value: Any, names: Set[str] = frozenset()) -> None:
+        """Add what a name stands for, code or data; of a module, what these names stand for in
+        it."""
         self.parts.append(name)
         while hasattr(value, "__wrapped__") and not isinstance(value, FunctionType):
             value = value.__wrapped__  # as of a cache
         if isinstance(value, ModuleType):
-            self.parts.append(value.__name__)
+            if not self._counts_by_name(value.__name__):
+                for part in sorted(names & vars(value).keys()):
+                    self._add(part, vars(value)[part], names - {part})
         elif isinstance(value, type):
             self.parts.append(f"{value.__module__}.{value.__qualname__}")
             if value is not System:
                 self.add_class(value)
-        elif isinstance(value, FunctionType) and not self._is_foreign(value.__module__):
+        elif isinstance(value, FunctionType):
+            self.parts.append([value.__module__, value.__qualname__])
             self.add_function(value)
-        elif callable(value) and hasattr(value, "__name__"):
-            self.parts.append([getattr(value, "__module__", ""), value.__name__])
+        elif isinstance(value, np.ufunc) or _is_builtin(value):
+            self.parts.append(value.__name__)
         elif type(value).__module__ == "typing":  # as Any under another name
             self.parts.append(repr(value))
         else:
             self.parts.append(self.data(value))
 
-    def _is_foreign(self, module: str) -> bool:
-        """Return whether a module is of another project, or counts as a whole."""
-        return module not in self.modules
+    def _counts_by_name(self, module: str) -> bool:
+        """Return whether code of a module counts by its name: that of installed packages and of the
+        machinery. Their versions and files are parts of the key.
+
+        Raises:
+            Unreadable: if it is neither that nor of the plant's modules.
+        """
+        if module in self.modules:
+            return False
+        top = module.partition(".")[0]
+        own = f"{module}.".startswith(f"{_ROOM}.")
+        if not own and (top in ("__main__", "pinnobs_gym", "trainers") or not is_installed(top)):
+            raise Unreadable(f"{module} is not among the modules that the plant's import")
+        if not own and top not in self._packages and top not in sys.stdlib_module_names:
+            self._packages.add(top)
+            package = sys.modules.get(top)
+            file = getattr(package, "__file__", None)
+            date = None if file is None else Path(file).stat().st_mtime_ns
+            self.parts.append([top, str(getattr(package, "__version__", "")), date])
+        return True
 
     def data(self, value: Any) -> Any:
         """Return data as nested lists of text.
@@ -181,11 +199,19 @@ class _Code:
         raise Unreadable(f"{type(value).__qualname__} is no data")
 
 
+def _is_builtin(value: Any) -> bool:
+    """Return whether a value is a function written in C, such as `math.sin`, of a module."""
+    if not isinstance(value, BuiltinFunctionType):
+        return False
+    return value.__self__ is None or isinstance(value.__self__, ModuleType)
+
+
 def _code(code: CodeType) -> list[Any]:
     """Return what a compiled function does, without lines and files."""
-    constants = [
-        _code(c) if isinstance(c, CodeType) else [type(c).__name__, repr(c)] for c in code.co_consts
-    ]
+    constants = []
+    for c in code.co_consts:
+        text = sorted(map(repr, c)) if isinstance(c, frozenset) else repr(c)
+        constants.append(_code(c) if isinstance(c, CodeType) else [type(c).__name__, text])
     return [code.co_code.hex(), code.co_names, code.co_varnames, constants]
 
 
