@@ -381,8 +381,4 @@ def test_a_plant_is_found_again_without_sympy_unless_it_was_edited(own_folder, t
     assert printed() == "-6.0 False"
     assert printed(gain="5.0") == "-15.0 True"
     assert printed(sign="+") == "6.0 True"
-    assert printed() == "-6.0 False"
-    (own_folder / next(own_folder.glob("*.so")).name).unlink()
-    for entry in own_folder.glob("*.so"):
-        entry.unlink()
-    assert printed() == "-6.0 True"
+    assert len(list(own_folder.glob("*.plant"))) == 3
