@@ -53,5 +53,6 @@ def test_the_page_of_a_system_says_what_is_compiled():
 
 
 def test_without_a_compiler_the_page_says_so(monkeypatch):
+    monkeypatch.delenv("PINNOBS_KERNELS", raising=False)
     monkeypatch.setattr("pinnobs_gym.simulation.kernels.plant_library.usable_compilers", lambda: [])
     assert "`ekf`: computed in NumPy: there is no C compiler" in compiled(ReverseDuffing())

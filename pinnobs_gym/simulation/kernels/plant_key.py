@@ -37,10 +37,10 @@ def plant_key(form: PlantForm, *values: str) -> str | None:
     """Return a key of the code made from a form, of the values, of this package's code and of the
     versions of what makes it; None if the code that defines the plant cannot be told."""
     try:
-        plant = _plant(form.system, form.rest)
+        plant, machinery = _plant(form.system, form.rest), _machinery()
     except (Unreadable, ValueError, OSError, RecursionError):
         return None
-    parts = (plant, form.numbers, form.properties, values, _machinery(), _versions())
+    parts = (plant, form.numbers, form.properties, values, machinery, _versions())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 
 

@@ -109,8 +109,8 @@ def _of_system(system: System, template: str, literal: bool) -> PlantLibrary | s
     return _OTHER
 
 
-_forms: Counter[type[System]] = Counter()
-"""Number of forms of each class that were compiled."""
+_forms: Counter[tuple[type[System], str]] = Counter()
+"""Number of forms of each class that were traced for each algorithm."""
 
 
 @cached_by_form
@@ -129,8 +129,8 @@ def _of_form(form: PlantForm, template: str) -> PlantLibrary | str:
     if not candidates:
         say_once(f"{without_compiler()}; estimators run in NumPy, which takes longer")
         return without_compiler()
-    _forms[cls] += 1
-    if _forms[cls] > MOST_FORMS:
+    _forms[cls, template] += 1
+    if _forms[cls, template] > MOST_FORMS:
         return f"more than {MOST_FORMS} {cls.__name__} differ in other things than numbers"
     traced = _traced(form, template)
     if isinstance(traced, str):
