@@ -1,11 +1,19 @@
 import itertools
 import os
+import shutil
 import time
+from pathlib import Path
 
 # What a terminal or a user's environment would change, before anything reads it.
 os.environ["TTY_COMPATIBLE"] = "0"
 os.environ.pop("FORCE_COLOR", None)
 os.environ.pop("PINNOBS_TRACEBACK", None)
+os.environ.pop("PINNOBS_KERNELS", None)
+os.environ.pop("CC", None)
+# Compiled code is kept for all test processes and for the next run, apart from the user's own.
+os.environ["PINNOBS_CACHE"] = str(Path(__file__).parents[1] / ".pytest_cache" / "pinnobs")
+if not any(map(shutil.which, ("cc", "clang", "gcc"))):
+    os.environ["PINNOBS_KERNELS"] = "0"  # says no line in the log of a test about something else
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as our command does, whichever test calls it first
 
 import gymnasium as gym

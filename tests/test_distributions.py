@@ -89,6 +89,7 @@ def test_the_wheel_holds_the_packages_and_their_data(source, wheel):
         held = set(file.namelist())
     for name in (
         *("py.typed", "leaderboard/suites/quick.toml", "leaderboard/site/page.css"),
+        "simulation/kernels/templates/ekf.c",
         *("leaderboard/site/page.html", "leaderboard/site/page.js"),
     ):
         assert f"pinnobs_gym/{name}" in held

@@ -8,7 +8,7 @@ from types import ModuleType
 
 from docstring_parser import parse_from_object
 
-from pinnobs_gym.cli.told_section import jacobians, told
+from pinnobs_gym.cli.told_section import compiled, jacobians, told
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.conditions import CONDITIONS, fitting
@@ -55,6 +55,7 @@ def page(cls: type[System], env_id: str) -> str:
         "\n## Motion of the Model\n",
         _motion(system, setup),
         jacobians(system, setup),
+        f"\n{compiled(system)}",
         "\n## What the Outputs Tell\n",
         told(system, setup),
         "\n## Reward\n",

@@ -1,11 +1,14 @@
-"""What the page of a system says of its Jacobians, and of what its outputs tell."""
+"""What the page of a system says of its Jacobians, of compiled code, and of what its outputs
+tell."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.simulation.derivatives import origin
+from pinnobs_gym.simulation.kernels.plant_library import why_not
 from pinnobs_gym.simulation.observability import TRAJECTORIES, Observability, observability
 from pinnobs_gym.simulation.system import Setup, System, initial_states
 
@@ -26,6 +29,22 @@ def jacobians(system: System, setup: Setup) -> str:
             return "The Jacobians of f and h are written by hand."
         return "f and h can be traced: their Jacobians are derived from the equations."
     return f"The Jacobian of f is {f}; that of h is {h}."
+
+
+def compiled(system: System) -> str:
+    """Return which estimators are compiled for a plant, and otherwise why not; see
+    `pinnobs_gym.simulation.kernels`."""
+    kinds: dict[str, list[str]] = {}
+    for name, cls in ESTIMATORS.classes().items():
+        template = getattr(cls, "template", "")
+        if template:
+            kinds.setdefault(template, []).append(name)
+    lines = []
+    for template, names in kinds.items():
+        reason = why_not(system, template)
+        how = f"computed in NumPy: {reason}" if reason else "compiled"
+        lines.append(f"- {', '.join(f'`{name}`' for name in names)}: {how}")
+    return "\n".join(["Compiled code:\n", *lines, "- all others: computed in NumPy"])
 
 
 def told(system: System, setup: Setup) -> str:

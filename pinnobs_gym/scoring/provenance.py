@@ -17,7 +17,7 @@ import numpy as np
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.registry import trainer_class
-from pinnobs_gym.scoring.code_hash import Unreadable, code_hash, content, digest
+from pinnobs_gym.simulation.code_hash import Unreadable, code_hash, content, digest
 from pinnobs_gym.simulation.system import System
 
 _GAME = (

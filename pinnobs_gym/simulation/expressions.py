@@ -84,6 +84,19 @@ class Expressions(np.ndarray):
             return _clipped(*args, **kwargs)
         return super().__array_function__(func, types, args, kwargs)
 
+    def __bool__(self) -> bool:
+        """Return the truth of a number or a condition that is known.
+
+        Raises:
+            TypeError: for a symbol, which Python would otherwise take as true.
+        """
+        if self.size != 1:
+            return bool(super().__bool__())
+        value = self.item()
+        if isinstance(value, sympy.Expr) and not value.is_number:
+            raise TypeError(f"a branch depends on whether {value} is zero")
+        return bool(value)
+
     def _made(self, values: Any) -> Expressions:
         return as_array(_elementwise(self.kept, np.asarray(values, dtype=object)), type(self))
 

@@ -13,6 +13,7 @@ import sympy
 from sympy.printing.conventions import split_super_sub
 
 from pinnobs_gym.simulation.expressions import Expressions, as_array, column, tidy
+from pinnobs_gym.simulation.plant_form import numeric_properties
 from pinnobs_gym.simulation.system import System, is_number
 
 
@@ -85,12 +86,6 @@ def _traced(system: System, parameters: Mapping[str, sympy.Symbol]) -> Equations
         column(traced.h(now, state, inputs), system.ny),
         column(traced.input(now), system.nu),
     )
-
-
-def numeric_properties(system: System) -> list[str]:
-    """Return the names of the properties that a system's class defines and that are numbers."""
-    own = [name for name, value in vars(type(system)).items() if isinstance(value, property)]
-    return [name for name in own if is_number(getattr(system, name))]
 
 
 def with_symbols(

@@ -8,18 +8,18 @@ and in any batch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import sympy
 
-from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.expressions import as_array, column
+from pinnobs_gym.simulation.plant_form import PlantForm, cached_by_form, plant_form
 from pinnobs_gym.simulation.printer import Printer
-from pinnobs_gym.simulation.symbolic import numeric_properties, with_symbols
-from pinnobs_gym.simulation.system import System, is_number, matrix, stack
+from pinnobs_gym.simulation.symbolic import with_symbols
+from pinnobs_gym.simulation.system import System, matrix, stack
 from pinnobs_gym.simulation.table import pieces
 from pinnobs_gym.simulation.tape import Tape
 
@@ -43,19 +43,17 @@ def traced_code(system: System, name: str) -> TracedCode:
     Raises:
         ValueError: in one line, if the function cannot be traced or differentiated.
     """
-    # The code does not depend on numbers: those of the class stand for all.
-    usual = {n: v for n, v in type(system)().parameters.items() if is_number(v)}
-    found = _code(replace(system, **usual), name)
+    found = _code(plant_form(system), name)
     if isinstance(found, str):
         raise ValueError(found)
     return found
 
 
-@cached_by_plant
-def _code(system: System, name: str) -> TracedCode | str:
+@cached_by_form
+def _code(form: PlantForm, name: str) -> TracedCode | str:
     """Return the code, or the reason why there is none."""
     try:
-        traced = Trace(system, name)
+        traced = Trace(form, name)
         value, rows = traced.values, traced.jacobian()
         return TracedCode(traced.compiled([value], "vector"), traced.compiled(rows, "matrix"))
     except Exception as error:  # whatever the user's functions raise when they are given symbols
@@ -68,14 +66,13 @@ class Trace:
     The names of symbols differ even where those of states, inputs and parameters are the same.
     """
 
-    def __init__(self, system: System, name: str) -> None:
+    def __init__(self, form: PlantForm, name: str) -> None:
+        system = form.system
         self.t = _symbol("t")
         self.x = [_symbol(f"x{i}") for i in range(system.nx)]
         self.u = [_symbol(f"u{i}") for i in range(system.nu)]
-        numbers = [n for n, value in system.parameters.items() if is_number(value)]
         parameters, properties = (
-            {n: _symbol(f"of_{n}") for n in names}
-            for names in (numbers, numeric_properties(system))
+            {n: _symbol(f"of_{n}") for n in names} for names in (form.numbers, form.properties)
         )
         self.numbers = parameters | properties
         """Symbols of numbers of the system, by the attribute's name."""

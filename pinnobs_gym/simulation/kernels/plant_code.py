@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import sympy
 
+from pinnobs_gym.simulation.plant_form import PlantForm
 from pinnobs_gym.simulation.printer import Printer
-from pinnobs_gym.simulation.system import System, is_number
+from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.traced_code import Trace
 
 _NAMES = {
@@ -72,18 +73,18 @@ class PlantCode:
     """The attributes of the system that the functions take as numbers, in their order."""
 
 
-def plant_code(system: System) -> PlantCode:
+def plant_code(form: PlantForm) -> PlantCode:
     """Return the code of a system's f, h, their Jacobians, and the input that it defines.
 
-    Parameters are arguments of the code. Others than numbers, such as tables, are part of it.
+    The numbers of its form are arguments of the code. Other parameters, such as tables, are part of
+    it.
 
     Raises:
         Exception: whatever the system's functions raise when they are given symbols.
         ValueError: in one line, if a function has no counterpart in C.
     """
-    usual = {n: v for n, v in type(system)().parameters.items() if is_number(v)}
-    plant = replace(system, **usual)
-    traces = {name: Trace(plant, name) for name in ("f", "h", "input")}
+    system = form.system
+    traces = {name: Trace(form, name) for name in ("f", "h", "input")}
     numbers = tuple(traces["f"].numbers)
     parts = [_sizes(system, len(numbers))]
     for name, trace in traces.items():
@@ -136,8 +137,8 @@ def _function(name: str, trace: Trace, tables: str, results: dict[str, list[Any]
         first += len(values)
     arguments = ", ".join(f"lanes *restrict {array}" for array in results)
     head = (
-        f"static inline void AT_WIDTH({name})(const double *restrict times, const lanes *restrict x, "
-        f"const lanes *restrict u, const lanes *restrict p, {arguments})"
+        f"static inline void AT_WIDTH({name})(const double *restrict times, "
+        f"const lanes *restrict x, const lanes *restrict u, const lanes *restrict p, {arguments})"
     )
     unused = "(void)times; (void)x; (void)u; (void)p;"
     body = "\n        ".join([*lines, *stored])

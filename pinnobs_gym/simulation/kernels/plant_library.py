@@ -1,24 +1,37 @@
-"""The libraries of compiled algorithms of a plant."""
+"""The libraries of compiled algorithms of a plant.
+
+An index in the cache folder tells the library of a plant whose code is known (`plant_key`), so that
+most processes need not trace it, which would import SymPy. Whatever the index says, a library is
+used only after its functions gave the values of the plant's own (`agreement`).
+"""
 
 from __future__ import annotations
 
 import ctypes
 import os
-from dataclasses import dataclass, replace
-
-import numpy as np
+import warnings
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
 
 from pinnobs_gym.simulation.cached import cached_by_plant
-from pinnobs_gym.simulation.kernels.build import library
-from pinnobs_gym.simulation.kernels.calls import Plan, address
-from pinnobs_gym.simulation.kernels.plant_code import plant_code
-from pinnobs_gym.simulation.kernels.source import library_source
-from pinnobs_gym.simulation.system import System, initial_states, is_number, vector
+from pinnobs_gym.simulation.kernels.agreement import agrees
+from pinnobs_gym.simulation.kernels.build import kept, library, usable_compilers, without_compiler
+from pinnobs_gym.simulation.kernels.cache_folder import PLANT, kernel_folder, read_json, write_json
+from pinnobs_gym.simulation.kernels.compilers import tools
+from pinnobs_gym.simulation.kernels.plant_key import plant_key
+from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.plant_form import PlantForm, cached_by_form, plant_form
+from pinnobs_gym.simulation.system import System
 
 LARGEST = 12
 """Largest number of states of a plant that is compiled; beyond it BLAS takes less time."""
-_POINTS = 32
-"""Number of states at which the functions of a library are compared with the plant's own."""
+MOST_FORMS = 8
+"""Number of forms of a class that a process compiles. Systems that differ in more than numbers, or
+whose equations branch on numbers, each need code of their own."""
+OFF = "kernels are turned off by PINNOBS_KERNELS=0"
+_UNTRACED = "its equations cannot be traced"
+_OTHER = "its compiled equations give other values"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,40 +46,36 @@ class PlantLibrary:
 def plant_library(system: System, template: str) -> PlantLibrary | str:
     """Return the library of an algorithm for a plant, or the reason in one line why there is none.
 
-    Systems of one class that differ in numbers only share it.
+    Systems of one class that differ in numbers only share it. If the equations could have been
+    compiled but for what they call or branch on, the log says so once; what a plant is, such as
+    stiff, is no fault.
 
     Args:
-        system: the plant.
+        system: the plant; its parameters may be arrays (batch,) of one number per row.
         template: the algorithm, such as ``ekf``.
     """
-    if os.environ.get("PINNOBS_KERNELS") == "0":
-        return "kernels are turned off by PINNOBS_KERNELS=0"
-    return _library(_usual(system), template)
-
-
-def _usual(system: System) -> System:
-    """Return the plant with the numbers of its class, which stand for all."""
-    numbers = {n: v for n, v in type(system)().parameters.items() if is_number(v)}
-    return replace(system, measured_input=False, **numbers)
-
-
-@cached_by_plant
-def _library(system: System, template: str) -> PlantLibrary | str:
-    reason = _not_compiled(system)
+    reason = _excluded(system)
     if reason:
         return reason
-    try:
-        plant = plant_code(system)
-    except Exception as error:  # whatever the user's functions raise when they are given symbols
-        return f"cannot be traced: {type(error).__name__}: {' '.join(str(error).split())}"
-    code = library(library_source(plant, template))
-    made = PlantLibrary(code, plant.numbers)
-    return made if _agrees(system, made) else "its compiled equations give other values"
+    found = _library(system, template)
+    if isinstance(found, str) and found.startswith((_UNTRACED, _OTHER)):
+        say_once(f"{type(system).__name__} is computed in NumPy, which takes longer: {found}")
+    return found
 
 
-def _not_compiled(system: System) -> str:
-    """Return why a plant is not compiled, an empty text if nothing prevents it."""
-    cls = type(system)
+def why_not(system: System, template: str) -> str:
+    """Return why an algorithm is not compiled for a plant, an empty text if it is or would be. The
+    plant is traced if need be, but nothing is compiled."""
+    reason = _excluded(system)
+    if reason or usable_compilers():
+        return reason or _why_untraced(system, template)
+    return without_compiler()
+
+
+def _excluded(system: System) -> str:
+    """Return what about a plant keeps it from being compiled, an empty text if nothing does."""
+    if os.environ.get("PINNOBS_KERNELS") == "0":
+        return OFF
     if system.own_flow:
         return "it moves by a flow of its own"
     if system.stiff:
@@ -74,59 +83,107 @@ def _not_compiled(system: System) -> str:
     if system.nx > LARGEST:
         return f"it has {system.nx} states, more than {LARGEST}"
     for name in ("output_residual", "state_residual"):
-        if getattr(cls, name) is not getattr(System, name):
+        if getattr(type(system), name) is not getattr(System, name):
             return f"it defines {name}"
     return ""
 
 
-def _agrees(system: System, made: PlantLibrary) -> bool:
-    """Return whether the compiled functions give the plant's own values, at states of the initial
-    set and within twice the scale of these."""
-    setup, scale = system.setups["benchmark"], vector(system.scale, system.nx, "scale")
-    rng = np.random.default_rng(0)
-    x = initial_states(system, setup, _POINTS)
-    x[::2] += scale * rng.uniform(-2, 2, (len(x[::2]), system.nx))
-    t = rng.uniform(0, setup.duration, _POINTS)
-    t = np.floor(t) if system.discrete else t
-    with np.errstate(all="ignore"):
-        u = np.asarray(system.input(t))
-        own = [
-            *(system.f(t, x, u), system.f_jacobian(t, x, u)),
-            *(system.h(t, x, u), system.h_jacobian(t, x, u), u),
-        ]
-        found = evaluated(system, made, t, x, u)
-        for value, slopes, mine in (
-            (own[0], own[1], found[0]),
-            (own[2], own[3], found[2]),
-        ):
-            # Rounding errors are relative to the terms of a value.
-            terms = (abs(slopes) * np.maximum(abs(x), scale)[:, None]).sum(axis=-1)
-            if not _same(value, mine, 1e-9 * (abs(value) + terms)):
-                return False
-        # Jacobians that a system writes itself may be approximate in their last digits.
-        return all(
-            _same(a, b, 1e-6 * (1e-3 * abs(a).max(initial=0.0) + abs(a)))
-            for a, b in ((own[1], found[1]), (own[3], found[3]), (own[4], found[4]))
-        )
+@cached_by_plant
+def _library(system: System, template: str) -> PlantLibrary | str:
+    """Return the library for this system's own numbers, or the reason why there is none."""
+    first = _of_system(system, template, False)
+    if not isinstance(first, str) or not first.startswith((_UNTRACED, _OTHER)):
+        return first
+    # The equations may branch on numbers: then these are written into the code.
+    second = _of_system(system, template, True)
+    return first if isinstance(second, str) else second
 
 
-def _same(a: np.ndarray, b: np.ndarray, allowed: np.ndarray) -> bool:
-    """Return whether the differences are at most those allowed, where the first are finite."""
-    return bool(((abs(a - b) <= allowed) | ~np.isfinite(a) | ~np.isfinite(allowed)).all())
+def _of_system(system: System, template: str, literal: bool) -> PlantLibrary | str:
+    try:
+        found = _of_form(plant_form(system, literal), template)
+        if isinstance(found, str) or agrees(system, found.code, found.numbers):
+            return found
+    except Exception as error:  # whatever the user's functions raise
+        return f"{_UNTRACED}: {_line(error)}"
+    return _OTHER
 
 
-def evaluated(
-    system: System, made: PlantLibrary, t: np.ndarray, x: np.ndarray, u: np.ndarray
-) -> list[np.ndarray]:
-    """Return the compiled f (n, nx), its Jacobian, h (n, ny), its Jacobian, and the input (n, nu)
-    at n times (s), states (n, nx) and inputs (n, nu)."""
-    nx, ny, nu, n = system.nx, system.ny, system.nu, len(t)
-    plan = Plan.of(system, made.numbers, np.zeros((nx, 0)), np.zeros((1, ny, ny, 1)))
-    shapes = [(nx,), (nx, nx), (ny,), (ny, nx), (nu,)]
-    results = [np.empty((*shape, n)) for shape in shapes]
-    given = [np.ascontiguousarray(part.T, dtype=float) for part in (t, x, u)]
-    evaluate = made.code.evaluate
-    evaluate.restype = None
-    evaluate.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 8]
-    evaluate(ctypes.addressof(plan.structure), n, *map(address, [*given, *results]))
-    return [np.moveaxis(result, -1, 0) for result in results]
+_forms: Counter[tuple[type[System], str]] = Counter()
+"""Number of forms of each class that were traced for each algorithm."""
+
+
+@cached_by_form
+def _of_form(form: PlantForm, template: str) -> PlantLibrary | str:
+    """Return the library of a form, whose functions are not compared yet, or a reason."""
+    cls = type(form.system)
+    candidates = usable_compilers()
+    entry = _entry(form, template) if candidates else None
+    told = None if entry is None else read_json(entry)
+    if isinstance(told, dict):
+        if "reason" in told:
+            return told["reason"]
+        code = kept(told["library"])
+        if code is not None:
+            return PlantLibrary(code, tuple(told["numbers"]))
+    if not candidates:
+        say_once(f"{without_compiler()}; estimators run in NumPy, which takes longer")
+        return without_compiler()
+    _forms[cls, template] += 1
+    if _forms[cls, template] > MOST_FORMS:
+        return f"more than {MOST_FORMS} {cls.__name__} differ in other things than numbers"
+    traced = _traced(form, template)
+    if isinstance(traced, str):
+        _write(entry, {"reason": traced})
+        return traced
+    source, numbers = traced
+    made = library(source, {"plant": cls.__name__, "template": template})
+    if isinstance(made, str):
+        return made
+    code, name = made
+    _write(entry, {"library": name, "numbers": numbers})
+    return PlantLibrary(code, numbers)
+
+
+def _traced(form: PlantForm, template: str) -> tuple[str, tuple[str, ...]] | str:
+    """Return the source of a library and the numbers that it takes, or why there is none."""
+    from pinnobs_gym.simulation.kernels.plant_code import plant_code
+    from pinnobs_gym.simulation.kernels.source import library_source
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            plant = plant_code(form)
+    except Exception as error:  # whatever the user's functions raise when they are given symbols
+        return f"{_UNTRACED}: {_line(error)}"
+    return library_source(plant, template), plant.numbers
+
+
+def _why_untraced(system: System, template: str) -> str:
+    """Return why a plant cannot be traced, an empty text if it can."""
+    try:
+        form = plant_form(system)
+        traced = _traced(form, template)
+        literal = _traced(plant_form(system, True), template) if isinstance(traced, str) else traced
+    except Exception as error:  # whatever the user's functions raise
+        return f"{_UNTRACED}: {_line(error)}"
+    return traced if isinstance(traced, str) and isinstance(literal, str) else ""
+
+
+def _entry(form: PlantForm, template: str) -> Path | None:
+    """Return the file of the index that tells the library of a form; None if it has none."""
+    compiler = usable_compilers()[0]
+    key = plant_key(form, template, *tools(compiler))
+    try:
+        return None if key is None else kernel_folder() / f"{key}{PLANT}"
+    except OSError:
+        return None
+
+
+def _write(entry: Path | None, content: dict[str, object]) -> None:
+    if entry is not None:
+        write_json(entry, content)
+
+
+def _line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

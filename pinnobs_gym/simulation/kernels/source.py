@@ -35,4 +35,6 @@ def library_source(plant: PlantCode, *templates: str) -> str:
 
 @cache
 def _template(name: str) -> str:
-    return (files(__package__) / "templates" / name).read_text(encoding="utf-8")
+    return (files("pinnobs_gym.simulation.kernels") / "templates" / name).read_text(
+        encoding="utf-8"
+    )

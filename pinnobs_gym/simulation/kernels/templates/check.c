@@ -6,7 +6,7 @@ void evaluate(const struct plan *plan, int64_t n, const double *t, const double 
     for (int64_t row = 0; row < n; row++) {
         double p1[LP][1], t1[1] = {t[row]}, x1[NX][1], u1[LU][1];
         double f1[NX][1], A1[NX * NX][1], h1[NY][1], H1[NY * NX][1], input1[LU];
-        load_1(NP, plan->p, 0, row, 1, p1);
+        load_1(NP, plan->p, plan->p_rows ? n : 0, row, 1, p1);
         load_1(NX, x, n, row, 1, x1);
         load_1(NU, u, n, row, 1, u1);
         plant_f_linearised_1(t1, x1, u1, p1, f1, A1);

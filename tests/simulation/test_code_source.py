@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pinnobs_gym.scoring import code_source
-from pinnobs_gym.scoring.code_source import told
+from pinnobs_gym.simulation import code_source
+from pinnobs_gym.simulation.code_source import told
 
 SOURCE = "import math\nfrom . import near\n\nGAIN = 1\n"
 

@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-import pinnobs_gym
 from pinnobs_gym.registry import discard_stale_bytecode
-from pinnobs_gym.scoring.code_source import Import, digest, told
+from pinnobs_gym.simulation.code_source import Import, digest, told
 from pinnobs_gym.simulation.system import System
 
 _OWN = frozenset({"pinnobs_gym", "trainers"})
@@ -48,18 +47,24 @@ def code_hash(*subjects: type | str) -> str:
         Unreadable: in one line, if the source of a class or module cannot be read.
         ValueError: in one line, if Python has loaded the compiled file of an earlier source.
     """
+    return digest(sorted(module_hashes(*subjects).items()))
+
+
+def module_hashes(*subjects: type | str, without: str = "") -> dict[str, str]:
+    """Return the hash of each module that `code_hash` follows, by name, without those of a package
+    and what only these import. The errors are those of `code_hash`."""
     names = {name for subject in subjects for name in _modules(subject)}
     home = {name.partition(".")[0] for name in names} | _OWN
     digests: dict[str, str] = {}
     waiting = sorted(names)
     while waiting:
         name = waiting.pop()
-        if name not in digests:
+        if name not in digests and not (without and f"{name}.".startswith(f"{without}.")):
             digests[name], imports = _loaded(name)
             waiting += _packages_of(name)
             followed = [pair for pair in imports if _is_followed(pair[0], home)]
             waiting += [_home_of(base, part) for base, part in followed]
-    return digest(sorted(digests.items()))
+    return digests
 
 
 def content(value: Any) -> Any:
@@ -113,7 +118,7 @@ def _is_followed(name: str, home: set[str] | frozenset[str]) -> bool:
         return True
     if top in sys.stdlib_module_names:
         return False
-    return not _is_installed(top)
+    return not is_installed(top)
 
 
 def _packages_of(name: str) -> Iterator[str]:
@@ -129,8 +134,9 @@ def _packages_of(name: str) -> Iterator[str]:
 
 
 @lru_cache(maxsize=512)
-def _is_installed(top: str) -> bool:
-    """Return whether a package comes from the folders of installed packages, or from nowhere."""
+def is_installed(top: str) -> bool:
+    """Return whether a top-level package comes from the folders of installed packages, or from
+    nowhere."""
     try:
         spec = importlib.util.find_spec(top)
     except (ImportError, ValueError):
@@ -179,8 +185,10 @@ def _loaded(name: str) -> tuple[str, tuple[Import, ...]]:
 
 def _home_of(base: str, name: str) -> str:
     """Return the module that ``from base import name`` takes the name from."""
-    if base == _FACE and name in pinnobs_gym.__all__:
-        return getattr(getattr(pinnobs_gym, name), "__module__", base)
+    if base == _FACE:
+        face = sys.modules[_FACE]  # loaded, as this module is a part of it
+        if name in face.__all__:
+            return getattr(getattr(face, name), "__module__", base)
     spec = _spec(base)
     if spec is None or spec.submodule_search_locations is None:
         return base  # no package; asking for a module in it would import it

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.scoring.code_hash import Unreadable, code_hash, content
+from pinnobs_gym.simulation.code_hash import Unreadable, code_hash, content
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
 MODULE = '''"""A module."""
@@ -215,7 +215,7 @@ def test_code_that_python_did_not_compile_anew_is_not_taken_for_the_source(tmp_p
     os.utime(source, ns=(second * 10**9 + 5 * 10**8,) * 2)
     run = """
 import quick_module
-from pinnobs_gym.scoring.code_hash import code_hash
+from pinnobs_gym.simulation.code_hash import code_hash
 print(quick_module.Thing.gain)
 try:
     code_hash(quick_module.Thing)
@@ -260,7 +260,7 @@ def test_an_estimator_counts_with_the_mathematics_that_it_imports_and_not_with_o
         read.append(path.name)
         return original(path)
 
-    from pinnobs_gym.scoring import code_hash as module
+    from pinnobs_gym.simulation import code_hash as module
 
     original = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", spy)
