@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimates, State
+from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.square_root import carried
 from pinnobs_gym.simulation.kernels.calls import CallStructure, Plan, address
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary, plant_library
@@ -305,6 +306,8 @@ class CompiledFilter:
         t, y, u = float(record.t[k]), record.y[rows, k], record.u[rows, k]
         with np.errstate(all="ignore"):
             part = estimator.update_by_numpy(before, t, y, u)
+        if (box := estimator.system.state_box) is not None:
+            part = kept_inside(part, box)
         for name in _FIELDS:
             results[name][k][..., rows] = np.moveaxis(getattr(part, name), 0, -1)
         return self._with_rows(state, rows, part)

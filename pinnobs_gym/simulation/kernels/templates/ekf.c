@@ -55,17 +55,18 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
         }
     }
     if (plan->huber) { /* enlarge variances of outputs with large innovations */
-        for (int i = 0; i < NY; i++) {
-            double excess[W];
-            EACH_LANE excess[l] =
+        lanes excess[NY];
+        for (int i = 0; i < NY; i++)
+            EACH_LANE excess[i][l] =
                 maximum(fabs(e[i][l]) / (plan->huber * sqrt(S[i * NY + i][l])), 1.0);
+        for (int i = 0; i < NY; i++)
             for (int j = 0; j < NY; j++)
                 EACH_LANE {
-                    const double more = R[i * NY + j][l] * excess[l];
+                    const double more =
+                        R[i * NY + j][l] * sqrt(excess[i][l] * excess[j][l]); /* as correlated */
                     S[i * NY + j][l] += more - R[i * NY + j][l];
                     R[i * NY + j][l] = more;
                 }
-        }
     }
     /* K = P H^T S^-1 */
     lanes K[NX * NY];
