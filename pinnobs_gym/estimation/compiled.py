@@ -40,7 +40,7 @@ class _Layout:
     estimates, covariances, innovations and their covariances of a batch, and the numbers by which
     compiled code marks rows; see ``update`` in ``templates/filter.c``."""
 
-    buffer: type[ctypes.Array[ctypes.c_double]]
+    buffer: Any
     """The type of the buffer."""
     u: int
     """Position of the inputs in bytes."""
@@ -93,10 +93,12 @@ class CompiledFilter:
         system = estimator.system
         self._estimator, self._made = estimator, made
         self._sizes = system.nx, system.ny, system.nu
-        self._by_sample = estimator.noise.samples is not None
-        # The number of rows that the model has, 1 if it is the same for any number
-        values = [getattr(system, name) for name in made.numbers]
-        self._rows = np.broadcast_shapes((1,), *(np.shape(value) for value in values))[0]
+        samples = estimator.noise.samples
+        self._by_sample = samples is not None
+        # The number of rows that model and noise have, 1 if they are the same for any number
+        shapes = [np.shape(getattr(system, name)) for name in made.numbers]
+        told = () if samples is None else samples.std.shape[:1]
+        self._rows = np.broadcast_shapes((1,), told, *shapes)[0]
         self._plan = self._planned(estimator, estimator.noise.R(0.0)[None])
         self._layouts: dict[int, _Layout] = {}
         self._run, self._update = made.code.run, made.code.update
@@ -331,7 +333,7 @@ class CompiledFilter:
             self._layouts[batch] = layout
         return layout
 
-    def _packed(self, state: State, layout: _Layout) -> ctypes.Array[ctypes.c_double]:
+    def _packed(self, state: State, layout: _Layout) -> Any:
         """Return the arrays of a state in a buffer."""
         buffer, nu = layout.buffer(), self._sizes[2]
         if state.t is not None:
