@@ -4,6 +4,18 @@
 #undef POINTS
 #define POINTS (2 * NX + 1)
 
+/* The symmetric c = a a^T for a (n, k) */
+static inline void AT_WIDTH(squared)(int n, int k, const lanes *restrict a, lanes *restrict c)
+{
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j <= i; j++) {
+            double sum[W];
+            EACH_LANE sum[l] = a[i * k][l] * a[j * k][l];
+            for (int q = 1; q < k; q++) EACH_LANE sum[l] += a[i * k + q][l] * a[j * k + q][l];
+            EACH_LANE c[i * n + j][l] = c[j * n + i][l] = sum[l];
+        }
+}
+
 /* Points (num_points, NX) of the distribution with mean x and covariance P. Lanes where P has no
    root, or a point is outside of the bounds, are marked. */
 static inline void AT_WIDTH(draw)(const struct plan *plan, const lanes *restrict x,
@@ -92,7 +104,7 @@ static inline void AT_WIDTH(predict)(const struct interval *over, lanes *restric
     AT_WIDTH(move_moments)(over, centre, Q, NULL);
     AT_WIDTH(mark_undefined)(plan, NX, centre, points, bad);
     AT_WIDTH(deviations)(plan, NX, plan->state_period, centre, points, x, X);
-    AT_WIDTH(symmetric)(NX, (int)plan->num_points, X, X, P);
+    AT_WIDTH(squared)(NX, (int)plan->num_points, X, P);
     for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += Q[i][l];
 }
 
@@ -129,7 +141,7 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
             EACH_LANE Y[i * num_points + q][l] = y[i][l] != y[i][l] ? 0 : Y[i * num_points + q][l];
     }
     /* S = Y Y^T + R, and K = X Y^T S^-1 */
-    AT_WIDTH(symmetric)(NY, num_points, Y, Y, S);
+    AT_WIDTH(squared)(NY, num_points, Y, S);
     for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
     AT_WIDTH(outer)(NX, num_points, NY, X, Y, K);
     AT_WIDTH(divide)(NX, S, K, bad);
@@ -148,7 +160,7 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
             EACH_LANE X[i * num_points + q][l] -= sum[l];
         }
     }
-    AT_WIDTH(symmetric)(NX, num_points, X, X, P);
+    AT_WIDTH(squared)(NX, num_points, X, P);
     AT_WIDTH(product)(NX, NY, NY, K, R, KR);
     AT_WIDTH(symmetric)(NX, NY, KR, K, own);
     for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += own[i][l];
