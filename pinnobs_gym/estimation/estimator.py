@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, dataclass, field, fields
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from pinnobs_gym.estimation.compiled import Packed
 from pinnobs_gym.estimation.given import checked_reset, checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
@@ -43,8 +42,9 @@ class State:
     root: np.ndarray | None = None
     """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
     `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
-    packed: Packed | None = None
-    """The same arrays in the layout of compiled code, if it computed them."""
+    packed: Any = field(default=None, init=False, repr=False, compare=False)
+    """The buffer of which the arrays are views, if compiled code computed them. A state with a
+    value replaced has none, nor has one that is copied or comes from another process."""
 
 
 @dataclass(frozen=True)

@@ -68,8 +68,7 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(update)
     def unchecked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
-        result, box = update(self, state, t, y, u), self.system.state_box
-        return result if box is None else kept_inside(result, box)
+        return _inside(self.system, update(self, state, t, y, u))
 
     @wraps(update)
     def checked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
@@ -92,11 +91,19 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
             _check_sample(system, before, t, y, u, shapes)
         if (nu and not system.measured_input) or system.discrete:
             check_use(system, np.array([t], dtype=float), np.asarray(u, dtype=float)[:, None])
-        result, box = update(self, state, t, y, u), system.state_box
-        return result if box is None else kept_inside(result, box)
+        return _inside(system, update(self, state, t, y, u))
 
     checked.unchecked = unchecked  # pyright: ignore[reportAttributeAccessIssue]
     return checked
+
+
+def _inside(system: System, state: Any) -> Any:
+    """Return a state with its estimates within the system's bounds."""
+    box = system.state_box
+    # Compiled code has found the estimates of its states inside.
+    if box is None or getattr(state, "packed", None) is not None:
+        return state
+    return kept_inside(state, box)
 
 
 def _check_sample(
