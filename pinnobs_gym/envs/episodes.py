@@ -13,6 +13,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.conditions import parse_condition
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
@@ -123,6 +124,7 @@ class EpisodeSource:
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.start = self.setup.start(self.system.nx)
+        ask(self.system, "truth")
         step = longest_step(self.system)
         self._drawn = noise_shape(self.system, self.noise, self.setup.dt, step)
 
