@@ -6,6 +6,7 @@ import hashlib
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import chain, cycle, islice
 from typing import TypedDict, Unpack
 
@@ -186,7 +187,7 @@ class EpisodeSource:
         episodes = self._empty(len(start)) if into is None else into
         x, y, observations = episodes.x, episodes.y, episodes.observations
         u = episodes.u
-        u[:] = draws.u.swapaxes(0, 1)
+        _copy(draws.u.swapaxes(0, 1), u)
         inputs = u if self.system.draws_input else None
         rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
@@ -207,8 +208,8 @@ class EpisodeSource:
             sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
             y[:] = self.condition.outputs(sent, rngs)
         ny = self.system.ny
-        observations[..., :ny] = y
-        observations[..., ny:-1] = u
+        _copy(y, observations[..., :ny])
+        _copy(u, observations[..., ny:-1])
         observations[..., -1] = (self.times / self.times[-1])[:, None]
         return episodes
 
@@ -228,6 +229,12 @@ class EpisodeSource:
         u = episodes.u[:last].swapaxes(0, 1).copy()
         prior = Prior.of(self.system, self.setup, batch, xhat0)
         return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
+
+
+def _copy(values: np.ndarray, to: np.ndarray) -> None:
+    """Copy an array (..., n) component by component, whose loops are longer than those over n."""
+    for j in range(values.shape[-1]):
+        to[..., j] = values[..., j]
 
 
 class EpisodeBuffer:
@@ -306,12 +313,20 @@ class Stream:
     def __init__(self, seeds: np.random.SeedSequence, system: str) -> None:
         salt = np.frombuffer(hashlib.sha256(system.encode()).digest()[:16], "<u4").tolist()
         salted = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, *salt))
-        states, noise, conditions, inputs = map(np.random.default_rng, salted.spawn(4))
-        self._states = states
+        self._seeds = salted.spawn(4)
+        self._states, self.noise = map(np.random.default_rng, self._seeds[:2])
         self._queue: list[np.ndarray] = []
-        self.noise = noise
-        self.conditions = conditions
-        self.inputs = inputs
+
+    # Most setups draw neither of these, and to make a generator takes time.
+    @cached_property
+    def conditions(self) -> np.random.Generator:
+        """The generator of the seeds of conditions and process noise."""
+        return np.random.default_rng(self._seeds[2])
+
+    @cached_property
+    def inputs(self) -> np.random.Generator:
+        """The generator of inputs."""
+        return np.random.default_rng(self._seeds[3])
 
     def next_x0(self, source: EpisodeSource) -> np.ndarray:
         """Return the next initial state (nx,) from the setup's set, as changed by the condition.

@@ -54,19 +54,25 @@ def mesh_of(start: float, end: float, steps: int, times: bytes) -> Mesh:
     interval = np.clip(np.searchsorted(nodes, samples, side="right") - 1, 0, len(nodes) - 2)
     bounds = np.searchsorted(interval, np.arange(len(nodes)))
     checked = np.unique(np.append(np.arange(0, len(nodes) - 1, 3), len(nodes) - 2))
-    intervals, checks = [], []
-    for k in range(len(nodes) - 1):
-        # The nearest nodes, shifted inwards at the ends; time is in steps from the first of them.
-        first = min(max(k - NODES // 2 + 1, 0), len(nodes) - NODES)
-        rows = slice(2 * first, 2 * (first + NODES))
-        window = (nodes[first : first + NODES] - nodes[first]) / step
-        inside = (samples[bounds[k] : bounds[k + 1]] - nodes[first]) / step
-        value, slope = _hermite(tuple(np.round(window, 6)))
-        units = np.tile([1.0, step], NODES)  # slopes per s to slopes per step
-        intervals.append((rows, value(inside) * units))
-        if k in checked:
-            middle = window[k - first : k - first + 2].mean(keepdims=True)
-            checks.append((rows, np.concatenate([value(middle), slope(middle) / step]) * units))
+    # The nearest nodes, shifted inwards at the ends; time is in steps from the first of them.
+    k = np.arange(len(nodes) - 1)
+    first = np.clip(k - NODES // 2 + 1, 0, len(nodes) - NODES)
+    windows = (nodes[first[:, None] + np.arange(NODES)] - nodes[first][:, None]) / step
+    inside = (samples - nodes[first[interval]]) / step
+    middle = (windows[k, k - first] + windows[k, k - first + 1]) / 2
+    units = np.tile([1.0, step], NODES)  # slopes per s to slopes per step
+    weights, midway = np.empty((len(samples), 2 * NODES)), np.empty((len(k), 2, 2 * NODES))
+    # Polynomials whose nodes are spaced alike have the same weights.
+    shapes, shape = np.unique(np.round(windows, 6), axis=0, return_inverse=True)
+    for i, window in enumerate(shapes.tolist()):
+        value, slope = _hermite(tuple(window))
+        own, alike = shape[interval] == i, shape == i
+        weights[own] = value(inside[own]) * units
+        midway[alike, 0] = value(middle[alike]) * units
+        midway[alike, 1] = slope(middle[alike]) / step * units
+    rows = [slice(2 * f, 2 * (f + NODES)) for f in first.tolist()]
+    intervals = [(rows[i], weights[bounds[i] : bounds[i + 1]]) for i in k.tolist()]
+    checks = [(rows[i], midway[i]) for i in checked.tolist()]
     return Mesh(nodes, np.round(np.diff(nodes), 15), bounds, intervals, checked, checks)
 
 

@@ -179,7 +179,13 @@ class Noise:
         """Return the noise Gv (num_samples, batch, ny) of outputs at times t (num_samples,) in s,
         given standard normal numbers v (num_samples, batch, m)."""
         if type(self).G is Noise.G and self.samples is None:
-            return weighted(self._G[..., 0], v)
+            scales = _scales(self._G)[:, 0]
+            if len(scales) < 2:
+                return weighted(self._G[..., 0], v)
+            noise = np.empty(v.shape)
+            for j, scale in enumerate(scales):  # long loops, whatever the order of v in memory
+                np.multiply(v[..., j], scale, out=noise[..., j])
+            return noise
         G = [self.G(float(now))[..., 0] for now in t]
         return np.stack([weighted(M, each) for M, each in zip(G, v, strict=True)])
 
