@@ -312,21 +312,25 @@ class Stream:
 
     def __init__(self, seeds: np.random.SeedSequence, system: str) -> None:
         salt = np.frombuffer(hashlib.sha256(system.encode()).digest()[:16], "<u4").tolist()
-        salted = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, *salt))
-        self._seeds = salted.spawn(4)
-        self._states, self.noise = map(np.random.default_rng, self._seeds[:2])
+        self._entropy, self._key = seeds.entropy, (*seeds.spawn_key, *salt)
+        self._states, self.noise = self._generator(0), self._generator(1)
         self._queue: list[np.ndarray] = []
 
     # Most setups draw neither of these, and to make a generator takes time.
     @cached_property
     def conditions(self) -> np.random.Generator:
         """The generator of the seeds of conditions and process noise."""
-        return np.random.default_rng(self._seeds[2])
+        return self._generator(2)
 
     @cached_property
     def inputs(self) -> np.random.Generator:
         """The generator of inputs."""
-        return np.random.default_rng(self._seeds[3])
+        return self._generator(3)
+
+    def _generator(self, number: int) -> np.random.Generator:
+        """Return the generator of the child with this number."""
+        key = (*self._key, number)
+        return np.random.default_rng(np.random.SeedSequence(self._entropy, spawn_key=key))
 
     def next_x0(self, source: EpisodeSource) -> np.ndarray:
         """Return the next initial state (nx,) from the setup's set, as changed by the condition.
