@@ -11,10 +11,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from pinnobs_gym.estimation.compiled import Packed
-from pinnobs_gym.estimation.given import checked_run, checked_update
+from pinnobs_gym.estimation.given import asking_reset, checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
 from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
@@ -125,7 +126,8 @@ class BaseEstimator(ABC):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        for name, check in (("run", checked_run), ("update", checked_update)):
+        checks = (("run", checked_run), ("update", checked_update), ("reset", asking_reset))
+        for name, check in checks:
             if name in vars(cls) and not getattr(vars(cls)[name], "__isabstractmethod__", False):
                 setattr(cls, name, check(vars(cls)[name]))
 
@@ -137,6 +139,10 @@ class BaseEstimator(ABC):
         noise = self.system.noise(self.noise_std, self.process_noise)  # raises for a wrong level
         check_taken(type(self), self.system, noise)
         check_settings(self, self.setting_fields())
+
+    def ask_model(self) -> None:
+        """Ask for the compiled steps of the model, which are used from then on."""
+        ask(self.system, "model")
 
     @classmethod
     def for_setup(cls, system: System, setup: Setup, **options: Any) -> Self:

@@ -33,10 +33,22 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
         if record.noise_std is not None and not isinstance(self.noise_std, SampledLevel):
             level = SampledLevel(record.t, record.noise_std, self.noise_std)
             self = replace(self, noise_std=level)
+        self.ask_model()
         result, box = run(self, record), self.system.state_box
         return result if box is None else kept_inside(result, box)
 
     return checked
+
+
+def asking_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the method ``reset(prior)`` which first asks for what updates need."""
+
+    @wraps(reset)
+    def asking(self: Any, prior: Any) -> Any:
+        self.ask_model()
+        return reset(self, prior)
+
+    return asking
 
 
 def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:

@@ -91,6 +91,10 @@ class RecursiveEstimator(Estimator):
         found = compiled_filter(self)
         return None if isinstance(found, str) else found
 
+    def ask_model(self) -> None:
+        if self.compiled is None:  # compiled filters contain the model's steps
+            super().ask_model()
+
     def plan_settings(self) -> dict[str, Any]:
         """Return the settings that the compiled code takes, by the fields of ``struct plan``."""
         return {}

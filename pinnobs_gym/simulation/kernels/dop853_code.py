@@ -8,9 +8,9 @@ from pinnobs_gym.simulation import dop853
 
 
 def coefficients() -> str:
-    """Return the numbers of stages and coefficients, the nonzero coefficients, and
-    ``EACH_STAGE(STAGE)``, a list of ``STAGE(i, state)`` with the state of each stage and, last, that
-    at the end of a step.
+    """Return the numbers of stages and coefficients, the nonzero coefficients, and the list
+    ``EACH_STAGE(STAGE)`` of ``STAGE(i, state)``, the state of each stage and, last, at the end of a
+    step.
 
     A state is component n of lane l of ``x`` plus the slopes ``k`` of earlier stages, weighted by
     ``w``, the step times the coefficients.

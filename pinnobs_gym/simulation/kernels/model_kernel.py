@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.kernels.asked import asked_library, is_asked
+from pinnobs_gym.simulation.kernels.asked import asked_library
 from pinnobs_gym.simulation.kernels.calls import address, plant_numbers
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.noise import AssumedNoise, Noise
@@ -49,13 +49,11 @@ class _Moved(ctypes.Structure):
 
 
 def model_kernel(system: System) -> ModelKernel | None:
-    """Return the compiled steps of a plant, None unless its library has been asked for. They are
-    kept with the plant."""
+    """Return the compiled steps of a plant whose library has been asked for, which are kept with
+    the plant; None if it has none."""
     kept = vars(system).get(_KEPT)
     if kept is not None:
         return kept
-    if not is_asked(system, "model"):
-        return None
     made = asked_library(system, "model")
     if made is None:
         return None
@@ -64,7 +62,8 @@ def model_kernel(system: System) -> ModelKernel | None:
 
 
 def _nothing() -> None:
-    """What a kernel becomes in a copy or in another process: its addresses hold in neither."""
+    """What a kernel becomes in a copy of its plant or in another process, where its addresses do
+    not hold."""
 
 
 class ModelKernel:
@@ -125,7 +124,7 @@ class ModelKernel:
         nx, (batch, m), points = self._nx, (x.shape[-2], L.shape[1]), call.points
         # All results are parts of one buffer.
         ends = nx * points * batch, nx * (points + nx) * batch
-        buffer = np.empty(ends[1] + (nx * nx * batch if m else 0))
+        buffer: Any = np.empty(ends[1] + (nx * nx * batch if m else 0))
         start = ctypes.addressof(ctypes.c_double.from_buffer(buffer))
         end = buffer[: ends[0]].reshape(nx, points, batch).transpose(1, 2, 0)
         call.end, call.end_point, call.end_row, call.end_state = start, batch, 1, points * batch
@@ -204,9 +203,7 @@ class ModelKernel:
             if kept is None:
                 return None, None
             times = 0.0, 0.0, address(kept[0]), address(kept[1])
-        elif not t0 <= t1 or (t1 - t0) / self._longest > _LARGEST_COUNT:
-            return None, None
-        elif self._discrete and (t0 != round(t0) or t1 != round(t1)):
+        elif not self._usual_times(t0, t1):
             return None, None
         states = _address(x), *_strides(x.strides, x.shape)
         inputs: Any = None, None, 0, 0, 0
@@ -231,11 +228,17 @@ class ModelKernel:
         except ValueError:
             return None
         whole = end - start
-        if not (0 <= whole.min() and whole.max() <= _LARGEST_COUNT * self._longest):
+        if not (whole.min() >= 0 and whole.max() / self._longest <= _LARGEST_COUNT):
             return None
         if self._discrete and not ((start % 1 == 0).all() and (end % 1 == 0).all()):
             return None
         return start, end
+
+    def _usual_times(self, t0: float, t1: float) -> bool:
+        """Return whether a time follows another one, both whole numbers for a map."""
+        if not (t0 <= t1 and (t1 - t0) / self._longest <= _LARGEST_COUNT):
+            return False
+        return not self._discrete or (t0 % 1 == 0 and t1 % 1 == 0)
 
     def _fits(self, u: Any, points: int, batch: int) -> bool:
         """Return whether inputs broadcast to (points, batch, nu)."""
@@ -263,7 +266,7 @@ def _strides(strides: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, int
     return 0, 0, strides[0] // 8
 
 
-def _address(array: np.ndarray) -> int:
+def _address(array: Any) -> int:
     """Return the address of an array's first entry, faster than NumPy if it is contiguous."""
     try:
         return ctypes.addressof(ctypes.c_double.from_buffer(array))
