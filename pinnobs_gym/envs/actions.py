@@ -18,6 +18,7 @@ from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.noise import AssumedNoise
 from pinnobs_gym.simulation.residual import nearest
@@ -222,6 +223,7 @@ class PredictionForm(Form):
             raise ValueError(
                 f"stack={self.stack} goes with estimates; {self.name!r} has a prediction"
             )
+        ask(self.system, "model")
         self.sigma, self.root_S = typical(self.system, self.setup)
         u = abs(np.asarray(self.system.input(self.setup.times))).max(axis=0, initial=0.0)
         self.u_scale = np.where(u > 0, u, 1.0)

@@ -20,6 +20,13 @@ def reward_weights(system: System) -> np.ndarray:
     return 1 / (np.asarray(system.scale, dtype=float) ** 2 * system.nx)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # half the time of a with statement
+def reward_of(system: System, estimates: np.ndarray, x: np.ndarray, weights: np.ndarray) -> Any:
+    """Return the rewards (...) of estimates (..., nx) of the states x (..., nx)."""
+    error = system.state_residual(estimates, x)
+    return -(error * error).dot(weights)
+
+
 def seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
     """Return the seed sequence of a generator made by Gymnasium."""
     seeds = rng.bit_generator.seed_seq

@@ -15,6 +15,7 @@ from pinnobs_gym.envs.arguments import (
     check_options,
     check_render_mode,
     given_x0,
+    reward_of,
     reward_weights,
     seeds_of,
 )
@@ -119,9 +120,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
             estimate = self.agent.act(estimate[None])[0]
         elif estimate.shape != x.shape:
             raise ValueError(f"action has shape {estimate.shape}; expected {x.shape}, an estimate")
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = self.source.system.state_residual(estimate, x)
-            reward = -float((error * error).dot(self._weights))
+        reward = float(reward_of(self.source.system, estimate, x, self._weights))
         if self.agent.improves:
             reward = float(self.agent.improvement(estimate[None], x[None])[0])
         terminated = False

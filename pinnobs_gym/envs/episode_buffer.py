@@ -33,7 +33,8 @@ class EpisodeBuffer:
 
     Simulating several episodes takes little longer than one. When rows restart one by one, a block
     of episodes is simulated at a time: one for each requested row and each other row without a
-    waiting episode, and then further ones of the requested rows, up to `MOST_AHEAD` of each.
+    waiting episode, and then further ones of the requested rows. Of a row these are 1, 2, 4 and so
+    on up to `MOST_AHEAD` episodes at a time as they are played, and 1 again after a new seed.
 
     Args:
         source: source of the episodes.
@@ -46,11 +47,13 @@ class EpisodeBuffer:
         self._source = source
         self._measured = measured
         self._waiting: list[deque[_Waiting]] = [deque() for _ in range(rows)]
+        self._ahead = [1] * rows
 
     def forget(self, rows: Iterable[int]) -> None:
         """Drop the waiting episodes of these rows, whose streams have changed."""
         for row in rows:
             self._waiting[row].clear()
+            self._ahead[row] = 1
 
     def any(self, rows: Iterable[int]) -> bool:
         """Return whether any of these rows has an episode that is not yet started."""
@@ -88,9 +91,12 @@ class EpisodeBuffer:
         have none."""
         requested = set(missing)
         others = (r for r, queue in enumerate(self._waiting) if not queue and r not in requested)
-        further = list(missing) * (MOST_AHEAD - 1)
+        further = (r for i in range(1, MOST_AHEAD) for r in missing if i < self._ahead[r])
         size = max(len(missing), _SAMPLES_AHEAD // len(self._source.times))
-        return list(islice(chain(missing, others, further), size))
+        block = list(islice(chain(missing, others, further), size))
+        for row in missing:
+            self._ahead[row] = min(2 * self._ahead[row], MOST_AHEAD)
+        return block
 
     def _simulate(self, block: Sequence[int], streams: Sequence[Stream]) -> None:
         """Simulate the next episodes of these rows."""

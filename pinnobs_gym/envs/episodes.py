@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypedDict, Unpack
 
 import numpy as np
 
 from pinnobs_gym.simulation.conditions import parse_condition
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
+from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
@@ -110,6 +112,7 @@ class EpisodeSource:
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.start = self.setup.start(self.system.nx)
+        ask(self.system, "truth")
         step = longest_step(self.system)
         self._drawn = noise_shape(self.system, self.noise, self.setup.dt, step)
 
@@ -171,7 +174,7 @@ class EpisodeSource:
         episodes = self._empty(len(start)) if into is None else into
         x, y, observations = episodes.x, episodes.y, episodes.observations
         u = episodes.u
-        u[:] = draws.u.swapaxes(0, 1)
+        _copy(draws.u.swapaxes(0, 1), u)
         inputs = u if self.system.draws_input else None
         rngs = [np.random.default_rng(seed) for seed in draws.seeds]
         plant = self.condition.plant(self.system, rngs)
@@ -192,8 +195,8 @@ class EpisodeSource:
             sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
             y[:] = self.condition.outputs(sent, rngs)
         ny = self.system.ny
-        observations[..., :ny] = y
-        observations[..., ny:-1] = u
+        _copy(y, observations[..., :ny])
+        _copy(u, observations[..., ny:-1])
         observations[..., -1] = (self.times / self.times[-1])[:, None]
         return episodes
 
@@ -215,6 +218,12 @@ class EpisodeSource:
         return Record(self.times[:last], episodes.y[:last].swapaxes(0, 1).copy(), u, prior)
 
 
+def _copy(values: np.ndarray, to: np.ndarray) -> None:
+    """Copy an array (..., n) component by component, whose loops are longer than those over n."""
+    for j in range(values.shape[-1]):
+        to[..., j] = values[..., j]
+
+
 class Stream:
     """The random number generators of one seed and system, and its queue of initial states.
 
@@ -228,13 +237,25 @@ class Stream:
 
     def __init__(self, seeds: np.random.SeedSequence, system: str) -> None:
         salt = np.frombuffer(hashlib.sha256(system.encode()).digest()[:16], "<u4").tolist()
-        salted = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, *salt))
-        states, noise, conditions, inputs = map(np.random.default_rng, salted.spawn(4))
-        self._states = states
+        self._entropy, self._key = seeds.entropy, (*seeds.spawn_key, *salt)
+        self._states, self.noise = self._generator(0), self._generator(1)
         self._queue: list[np.ndarray] = []
-        self.noise = noise
-        self.conditions = conditions
-        self.inputs = inputs
+
+    # Most setups draw neither of these, and to make a generator takes time.
+    @cached_property
+    def conditions(self) -> np.random.Generator:
+        """The generator of the seeds of conditions and process noise."""
+        return self._generator(2)
+
+    @cached_property
+    def inputs(self) -> np.random.Generator:
+        """The generator of inputs."""
+        return self._generator(3)
+
+    def _generator(self, number: int) -> np.random.Generator:
+        """Return the generator of the child with this number."""
+        key = (*self._key, number)
+        return np.random.default_rng(np.random.SeedSequence(self._entropy, spawn_key=key))
 
     def next_x0(self, source: EpisodeSource) -> np.ndarray:
         """Return the next initial state (nx,) from the setup's set, as changed by the condition.

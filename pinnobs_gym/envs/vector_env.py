@@ -18,6 +18,7 @@ from pinnobs_gym.envs.arguments import (
     check_options,
     check_render_mode,
     given_x0,
+    reward_of,
     reward_weights,
 )
 from pinnobs_gym.envs.episode_buffer import EpisodeBuffer
@@ -116,9 +117,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if not self.agent.plain:
             estimates = self.agent.act(estimates)
         over = self._over
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = self.source.system.state_residual(estimates, self._state)
-            rewards = -((error * error) @ self._weights)
+        rewards = reward_of(self.source.system, estimates, self._state, self._weights)
         if self.agent.improves:
             rewards = self.agent.improvement(estimates, self._state)
         terminated = np.zeros(self.num_envs, dtype=bool)

@@ -38,6 +38,7 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
         if record.noise_std is not None and not isinstance(self.noise_std, SampledLevel):
             level = SampledLevel(record.t, record.noise_std, self.noise_std)
             self = replace(self, noise_std=level)
+        self.ask_model()
         result, box = run(self, record), self.system.state_box
         return result if box is None else kept_inside(result, box)
 
@@ -45,11 +46,13 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def checked_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method ``reset(prior)`` with `Prior.check_fits` before it."""
+    """Return the method ``reset(prior)`` with `Prior.check_fits` before it, which also asks for the
+    compiled code that updates need."""
 
     @wraps(reset)
     def checked(self: Any, prior: Prior) -> Any:
         prior.check_fits(self.system, len(prior.mean))
+        self.ask_model()
         return reset(self, prior)
 
     return checked

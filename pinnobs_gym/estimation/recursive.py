@@ -93,6 +93,10 @@ class RecursiveEstimator(Estimator):
         settings, an empty text if it does."""
         return ""
 
+    def ask_model(self) -> None:
+        if self.compiled is None:  # compiled filters contain the model's steps
+            super().ask_model()
+
     def plan_settings(self) -> dict[str, Any]:
         """Return the settings that the compiled code takes, by the fields of ``struct plan``."""
         return {}

@@ -37,11 +37,11 @@ def _class_of(cls: type[System]) -> Any:
         "model_step",
     )
     shared = {name: property(lambda self, name=name: getattr(self.plant, name)) for name in names}
-    return dataclass(frozen=True)(type(cls.__name__, (_Driven,), shared))
+    return dataclass(frozen=True)(type(cls.__name__, (Driven,), shared))
 
 
 @dataclass(frozen=True)
-class _Driven(System):
+class Driven(System):
     """A plant with inputs that are given at two samples."""
 
     plant: System

@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.derivatives import central_differences
+from pinnobs_gym.simulation.kernels.asked import is_asked
 from pinnobs_gym.simulation.maps import Map
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
 from pinnobs_gym.simulation.motion import Interval, Motion, check_steps, inputs_at
@@ -20,6 +21,9 @@ from pinnobs_gym.simulation.own_flow import OwnFlow
 from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
 from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import Array, System, vector
+
+if TYPE_CHECKING:
+    from pinnobs_gym.simulation.kernels.model_kernel import ModelKernel
 
 _STAGES = np.array([0, 1, 1, 2])
 """Index into (start, middle, end) of the step for each of the four Runge-Kutta stages."""
@@ -39,6 +43,15 @@ def _motion(system: System) -> Motion | None:
     if system.discrete:
         return _MAP
     return _STIFF if system.stiff else None
+
+
+def _compiled(system: System) -> ModelKernel | None:
+    """Return the compiled steps of a plant, None unless its library has been asked for."""
+    if not is_asked(system, "model"):
+        return None
+    from pinnobs_gym.simulation.kernels.model_kernel import model_kernel
+
+    return model_kernel(system)
 
 
 def described(system: System, dt: float) -> str:
@@ -68,7 +81,15 @@ def model_step(
 
     ``u0`` and ``u1`` (..., nu) are the inputs sampled at t0 and t1. They are used only if the
     system's input is measured, between the samples as `System.input_hold` says.
+
+    This and the functions below run in compiled code where the plant's library has been asked for
+    (`pinnobs_gym.simulation.kernels.asked`), which agrees with NumPy to rounding.
     """
+    compiled = _compiled(system)
+    if compiled is not None:
+        end = compiled.step(t0, t1, x, u0, u1)
+        if end is not None:
+            return end
     motion = _motion(system)
     if motion is not None:
         return motion.step(Interval(system, t0, t1, u0, u1), x)
@@ -106,6 +127,11 @@ def noisy_model_step(
     Maps, stiff plants and those with a flow of their own have noise as
     `pinnobs_gym.simulation.maps`, ``stiff`` and ``own_flow`` say.
     """
+    compiled = _compiled(system)
+    if compiled is not None:
+        end = compiled.noisy(noise, t0, t1, x, u0, u1, normal)
+        if end is not None:
+            return end
     motion = _motion(system)
     if motion is not None:
         return motion.noisy(Interval(system, t0, t1, u0, u1), noise, x, normal)
@@ -163,6 +189,11 @@ def model_step_jacobian(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return `model_step` of x (batch, nx), and its exact Jacobian ∂x(t1)/∂x(t0), shape (batch, nx,
     nx), with the batch innermost in memory."""
+    compiled = _compiled(system)
+    if compiled is not None:
+        moved = compiled.moments(None, t0, t1, x, u0, u1)
+        if moved is not None:
+            return moved[0], moved[1].transpose(2, 0, 1)
     motion = _motion(system)
     if motion is not None:
         x, F, _ = motion.moments(Interval(system, t0, t1, u0, u1), None, x)
@@ -195,6 +226,11 @@ def model_step_moments(
     States x are (batch, nx), or (num_points, batch, nx); of several points, F and Q belong to the
     first.
     """
+    compiled = _compiled(system)
+    if compiled is not None:
+        moved = compiled.moments(noise, t0, t1, x, u0, u1)
+        if moved is not None:
+            return moved
     motion = _motion(system)
     if motion is not None:
         over = Interval(system, t0, t1, u0, u1)

@@ -63,7 +63,10 @@ def weighted(M: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return Mw (..., size) for M (size, m) and w (..., m). The terms of a row are added in the
     same order in batches of any size."""
     if M.shape[0] == M.shape[1] and not M[~np.eye(len(M), dtype=bool)].any():
-        return w * np.diagonal(M)
+        scaled = np.empty(w.shape)
+        for j, scale in enumerate(np.diagonal(M)):  # long loops, whatever the order in memory
+            np.multiply(w[..., j], scale, out=scaled[..., j])
+        return scaled
     total = np.zeros((*w.shape[:-1], len(M)))
     for j, column in enumerate(M.T):
         total += w[..., j, None] * column

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from pinnobs_gym.simulation import dop853
-from pinnobs_gym.simulation.driven import driven
+from pinnobs_gym.simulation.driven import Driven, driven
+from pinnobs_gym.simulation.kernels.asked import asked_library
 from pinnobs_gym.simulation.maps import Map
+from pinnobs_gym.simulation.mesh import NODES, Mesh, mesh_of
 from pinnobs_gym.simulation.motion import Interval, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
 from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import System, vector
 
+if TYPE_CHECKING:
+    from pinnobs_gym.simulation.kernels.truth_kernel import TruthKernel
+
 TOLERANCE = 3e-11
 """Largest accepted local error of the truth, relative to the larger of a state and its scale."""
 
-_Weights = Callable[[np.ndarray], np.ndarray]
-_NODES = 6
-"""Number of nodes of an interpolating polynomial, which has the state and its slope at each."""
 _HALVINGS = 7
 """Number of steps tried, each half the one before, before an episode is passed to an adaptive
 solver."""
@@ -64,6 +64,9 @@ def truth(
         out: array for the result.
         inputs: inputs at the samples, shape (num_samples, batch, nu), which replace those of
             `System.input`; between samples they are as `System.input_hold` says.
+
+    If the plant's library has been asked for (`pinnobs_gym.simulation.kernels.asked`), steps of
+    fixed length are those of compiled code, which agrees with NumPy to rounding.
 
     Returns:
         States, shape (num_samples, batch, nx).
@@ -182,6 +185,11 @@ def disturbed_truth(
     _check_gaps(system, times, longest)
     stages = np.empty((1 + len(dop853.B), *x0.shape))
     stages[0] = x0
+    compiled = None if system.discrete or system.stiff else _compiled(system)
+    if compiled is not None and type(noise).L is Noise.L:
+        compiled.disturbed(system, noise.L(0.0)[..., 0], times, draws, longest, x, inputs)
+        _check_finite(system, x0, x)
+        return x
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
             if system.discrete or system.stiff:
@@ -277,6 +285,17 @@ def _take_step(
     flat[0] = _combined(weights[-1], flat)[0]
 
 
+def _compiled(system: System) -> TruthKernel | None:
+    """Return the compiled solver of a plant, None unless its library has been asked for."""
+    plant = system.plant if isinstance(system, Driven) else system
+    made = asked_library(plant, "truth")
+    if made is None:
+        return None
+    from pinnobs_gym.simulation.kernels.truth_kernel import TruthKernel
+
+    return TruthKernel(made)
+
+
 def _check_finite(system: System, x0: np.ndarray, x: np.ndarray) -> None:
     if not np.isfinite(x.sum()):
         row = int(np.flatnonzero(~np.isfinite(x).all(axis=(0, 2)))[0])
@@ -296,7 +315,7 @@ def _solve_interval(
 ) -> np.ndarray:
     """Simulate the truth over an interval on which f is smooth, write it to ``out`` and return the
     state at the end."""
-    steps = max(_NODES, int(np.ceil((end - start) / max_step - 1e-9)))
+    steps = max(NODES, int(np.ceil((end - start) / max_step - 1e-9)))
     last = np.empty_like(x0)
     rows = np.arange(len(x0))
     with np.errstate(all="ignore"):
@@ -331,7 +350,10 @@ def _fixed_step(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate with a fixed mesh and write the states at the times to ``out`` (num_samples, batch,
     nx). Return the states at the end, and the local error of each episode (batch,)."""
-    mesh = _mesh(start, end, steps, times.tobytes())
+    mesh = mesh_of(start, end, steps, times.tobytes())
+    compiled = _compiled(system)
+    if compiled is not None:
+        return compiled.fixed_step(system, x0, mesh, out)
     last = np.nextafter(end, start)  # f may jump at the end: use its left limit
     batch, nx = x0.shape
     path = np.empty((len(mesh.nodes), 2, batch, nx))  # the states and their slopes at the nodes
@@ -354,7 +376,7 @@ def _fixed_step(
 
 
 def _local_error(
-    system: System, mesh: _Mesh, flat: np.ndarray, shape: tuple[int, int]
+    system: System, mesh: Mesh, flat: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
     """Return the largest local error of each episode, (batch,): the defect of the polynomials
     midway between nodes times the step, relative to the larger of state and scale."""
@@ -388,74 +410,6 @@ def _combined(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
     if values.shape[1] == 1:  # the innermost loop of einsum would be over the values
         return np.add.accumulate(weights * values[:, 0], axis=1)[:, -1:]
     return np.einsum("sk,kn->sn", weights, values)
-
-
-@dataclass(frozen=True)
-class _Mesh:
-    """The solver's nodes over an interval, and the interpolating polynomials between them."""
-
-    nodes: np.ndarray
-    steps: np.ndarray
-    bounds: np.ndarray
-    """Index of the first sample of each interval between nodes."""
-    intervals: list[tuple[slice, np.ndarray]]
-    """For each interval, the rows of (state, slope, state, slope, ...) at the nodes of its
-    polynomial, and their weights in the states at the interval's samples."""
-    checked: np.ndarray
-    """The intervals whose defect is checked: every third, and the last."""
-    checks: list[tuple[slice, np.ndarray]]
-    """For each checked interval, the same rows, and their weights in the state and slope midway."""
-
-
-@lru_cache(maxsize=64)
-def _mesh(start: float, end: float, steps: int, times: bytes) -> _Mesh:
-    samples = np.frombuffer(times)
-    step = (end - start) / steps
-    # Half steps at both ends, where the polynomials are one-sided and thus less accurate.
-    short = np.arange(6) / 2
-    nodes = start + step * np.concatenate([short, np.arange(3, steps - 2), steps - short[::-1]])
-    nodes[-1] = end
-    # Assign each sample to the interval between nodes that contains it.
-    interval = np.clip(np.searchsorted(nodes, samples, side="right") - 1, 0, len(nodes) - 2)
-    bounds = np.searchsorted(interval, np.arange(len(nodes)))
-    checked = np.unique(np.append(np.arange(0, len(nodes) - 1, 3), len(nodes) - 2))
-    intervals, checks = [], []
-    for k in range(len(nodes) - 1):
-        # The nearest nodes, shifted inwards at the ends; time is in steps from the first of them.
-        first = min(max(k - _NODES // 2 + 1, 0), len(nodes) - _NODES)
-        rows = slice(2 * first, 2 * (first + _NODES))
-        window = (nodes[first : first + _NODES] - nodes[first]) / step
-        inside = (samples[bounds[k] : bounds[k + 1]] - nodes[first]) / step
-        value, slope = _hermite(tuple(np.round(window, 6)))
-        units = np.tile([1.0, step], _NODES)  # slopes per s to slopes per step
-        intervals.append((rows, value(inside) * units))
-        if k in checked:
-            middle = window[k - first : k - first + 2].mean(keepdims=True)
-            checks.append((rows, np.concatenate([value(middle), slope(middle) / step]) * units))
-    return _Mesh(nodes, np.round(np.diff(nodes), 15), bounds, intervals, checked, checks)
-
-
-@lru_cache(maxsize=64)
-def _hermite(nodes: tuple[float, ...]) -> tuple[_Weights, _Weights]:
-    """Return two functions of times (num_times,) that give weights (num_times, 2·num_nodes): those
-    of (value, slope, value, slope, ...) at the nodes in the value, and in the slope, of the Hermite
-    interpolating polynomial."""
-    size = 2 * len(nodes)
-    # Chebyshev basis on the span of the nodes, for a well-conditioned system.
-    centre, half = (nodes[0] + nodes[-1]) / 2, (nodes[-1] - nodes[0]) / 2
-    derivative = chebyshev.chebder(np.eye(size)) / half
-
-    def values(t: np.ndarray) -> np.ndarray:
-        return chebyshev.chebvander((t - centre) / half, size - 1)
-
-    def slopes(t: np.ndarray) -> np.ndarray:
-        return chebyshev.chebvander((t - centre) / half, size - 2) @ derivative
-
-    # Solve the interpolation conditions for the coefficients.
-    at = np.asarray(nodes)
-    conditions = np.stack([values(at), slopes(at)], axis=1).reshape(size, size)
-    inverse = np.linalg.inv(conditions)
-    return lambda t: values(t) @ inverse, lambda t: slopes(t) @ inverse
 
 
 def _solve_adaptively(

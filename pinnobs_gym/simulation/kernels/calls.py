@@ -50,6 +50,14 @@ def address(array: np.ndarray) -> int:
     return array.ctypes.data
 
 
+def plant_numbers(system: System, numbers: Sequence[str]) -> np.ndarray:
+    """Return attributes of a system that its code takes as numbers, (n,), or (n, batch) if any has
+    one per row."""
+    values = [np.asarray(getattr(system, name), dtype=float) for name in numbers]
+    by_row = any(value.ndim for value in values)
+    return np.array(np.broadcast_arrays(*values) if by_row else values, dtype=float)
+
+
 @dataclass(eq=False)
 class Plan:
     """What stays the same over the samples of a call, with the arrays that it points to."""
@@ -68,9 +76,7 @@ class Plan:
             R: output noise, shape (samples or 1, ny, ny, batch or 1).
         """
         plan = Plan(PlanStructure(), [])
-        values = [np.asarray(getattr(system, name), dtype=float) for name in numbers]
-        by_row = any(value.ndim for value in values)
-        p = np.array(np.broadcast_arrays(*values) if by_row else values, dtype=float)
+        p = plant_numbers(system, numbers)
         breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
         measured = {"previous": 1, "linear": 2}[system.input_hold]
         plan.set(p=p, L=L, breaks=breaks, output_period=_periods(system.output_period))
@@ -78,7 +84,7 @@ class Plan:
         box = system.state_box
         plan.set(low=None if box is None else box.low, high=None if box is None else box.high)
         structure = plan.structure
-        structure.p_rows, structure.m = int(by_row), L.shape[1]
+        structure.p_rows, structure.m = int(p.ndim > 1), L.shape[1]
         structure.longest, structure.num_breaks = longest_step(system), len(breaks)
         structure.input = measured if system.measured_input else 0
         structure.discrete = int(system.discrete)
