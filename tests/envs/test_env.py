@@ -709,7 +709,7 @@ def test_episodes_that_wait_for_their_row_are_its_next(monkeypatch: pytest.Monke
         mask = np.arange(3) == row
         observations, _ = env.reset(options={"reset_mask": mask})
         played.append((row, episode, observations[row]))
-    assert len(blocks) == 2  # the first episodes, and those that were simulated ahead
+    assert len(blocks) == 3  # the first episodes, one more of each row, and further ones of row 1
     given = np.array([1.0, -0.5])
     observations, infos = env.reset(options={"reset_mask": np.arange(3) == 0, "x0": given})
     assert np.array_equal(infos["state"][0], given)
