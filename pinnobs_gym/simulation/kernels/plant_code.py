@@ -9,6 +9,7 @@ from typing import Any
 
 import sympy
 
+from pinnobs_gym.simulation.kernels.step_code import LARGEST, step_functions
 from pinnobs_gym.simulation.printer import Printer
 from pinnobs_gym.simulation.system import System, is_number
 from pinnobs_gym.simulation.traced_code import Trace
@@ -68,6 +69,8 @@ class PlantCode:
     """Sizes and tables, and ``plant_input``."""
     lanes: str
     """The functions ``plant_f`` and so on, for W lanes; see ``templates/lanes.h``."""
+    steps: str
+    """The functions of ``templates/steps.h``, for W lanes; empty if they are made by loops."""
     numbers: tuple[str, ...]
     """The attributes of the system that the functions take as numbers, in their order."""
 
@@ -105,7 +108,11 @@ def plant_code(system: System) -> PlantCode:
         ),
     ]
     once = "\n".join([*parts, _input_function(traces["input"])])
-    return PlantCode(once, "\n\n".join(functions), numbers)
+    steps = []
+    if system.nx <= LARGEST:
+        once += "\n#define STRAIGHT"
+        steps = step_functions(traces["f"], traces["h"], CPrinter)
+    return PlantCode(once, "\n\n".join(functions), "\n\n".join(steps), numbers)
 
 
 def _sizes(system: System, numbers: int) -> str:
@@ -136,8 +143,8 @@ def _function(name: str, trace: Trace, tables: str, results: dict[str, list[Any]
         first += len(values)
     arguments = ", ".join(f"lanes *restrict {array}" for array in results)
     head = (
-        f"static inline void AT_WIDTH({name})(const double *restrict times, const lanes *restrict x, "
-        f"const lanes *restrict u, const lanes *restrict p, {arguments})"
+        f"static inline void AT_WIDTH({name})(const double *restrict times, "
+        f"const lanes *restrict x, const lanes *restrict u, const lanes *restrict p, {arguments})"
     )
     unused = "(void)times; (void)x; (void)u; (void)p;"
     body = "\n        ".join([*lines, *stored])

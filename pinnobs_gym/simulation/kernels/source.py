@@ -25,6 +25,8 @@ def library_source(plant: PlantCode, *templates: str) -> str:
             f"#undef W\n#undef AT_WIDTH\n#define W {width}\n#define AT_WIDTH(name) name##_{width}",
             _template("lanes.h"),
             plant.lanes,
+            _template("steps.h"),
+            plant.steps or _template("loops.h"),
             _template("motion.h"),
             _template("filter.h"),
             *(_template(f"{name}.c") for name in templates),

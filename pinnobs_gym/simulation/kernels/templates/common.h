@@ -30,6 +30,8 @@ struct plan {
     int64_t p_rows;           /* 1, or 0 if p is the same in all rows */
     const double *L;          /* process noise, (NX, m) */
     int64_t m;
+    const double *D;          /* L L^T, (NX, NX) */
+    int64_t diagonal;         /* 1 if D is diagonal */
     const double *R;          /* output noise, (1 or samples, NY, NY, 1 or batch) */
     int64_t R_samples;        /* 1, or 0 if R is the same at all samples */
     int64_t R_rows;           /* 1, or 0 if R is the same in all rows */

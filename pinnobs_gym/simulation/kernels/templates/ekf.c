@@ -3,10 +3,11 @@
 /* Correct x and P by the outputs of sample k. 0 if NumPy has to do it. */
 static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
                                     int64_t row, int count, lanes *restrict x, lanes *restrict P,
-                                    int64_t *restrict beyond)
+                                    const int *restrict lost, int64_t *restrict beyond)
 {
     const struct plan *plan = c->plan;
     lanes t, y[NY], u[LU], e[NY], H[NY * NX], R[NY * NY], S[NY * NY], HP[NY * NX];
+    double rest[W];
     EACH_LANE t[l] = c->t[k];
     AT_WIDTH(load)(NY, c->y + k * NY * c->batch, c->batch, row, count, y);
     AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, u);
@@ -21,10 +22,7 @@ static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict 
         for (int j = 0; j < NX; j++)
             EACH_LANE H[i * NX + j][l] = y[i][l] != y[i][l] ? 0 : H[i * NX + j][l];
     }
-    /* S = H P H^T + R */
-    AT_WIDTH(product)(NY, NX, NX, H, P, HP);
-    AT_WIDTH(outer)(NY, NX, NY, HP, H, S);
-    for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
+    AT_WIDTH(output_moments)(H, P, R, HP, S);
     if (plan->gate) { /* restart rows that were beyond the gate for long */
         lanes Se[NY];
         int restarted = 0;
@@ -47,11 +45,7 @@ static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict 
                 restarted = 1;
             }
         }
-        if (restarted) {
-            AT_WIDTH(product)(NY, NX, NX, H, P, HP);
-            AT_WIDTH(outer)(NY, NX, NY, HP, H, S);
-            for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
-        }
+        if (restarted) AT_WIDTH(output_moments)(H, P, R, HP, S);
     }
     if (plan->huber) { /* enlarge variances of outputs with large innovations */
         for (int i = 0; i < NY; i++) {
@@ -66,29 +60,12 @@ static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict 
                 }
         }
     }
-    /* K = P H^T S^-1 */
-    lanes K[NX * NY];
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NY; j++) EACH_LANE K[i * NY + j][l] = HP[j * NX + i][l];
-    if (!AT_WIDTH(divide)(NX, S, K)) return 0;
-    /* x = x + K e, and P = (I - K H) P (I - K H)^T + K R K^T */
-    lanes M[NX * NX], KR[NX * NY], own[NX * NX];
-    AT_WIDTH(product)(NX, NY, NX, K, H, M);
-    for (int i = 0; i < NX * NX; i++) EACH_LANE M[i][l] = -M[i][l];
-    for (int i = 0; i < NX; i++) EACH_LANE M[i * NX + i][l] += 1;
-    AT_WIDTH(sandwich)(NX, M, P);
-    AT_WIDTH(product)(NX, NY, NY, K, R, KR);
-    AT_WIDTH(symmetric)(NX, NY, KR, K, own);
-    for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += own[i][l];
-    for (int i = 0; i < NX; i++) {
-        double step[W];
-        EACH_LANE step[l] = K[i * NY][l] * e[0][l];
-        for (int j = 1; j < NY; j++) EACH_LANE step[l] += K[i * NY + j][l] * e[j][l];
-        EACH_LANE x[i][l] += step[l];
-    }
+    AT_WIDTH(kalman_update)(H, HP, S, R, e, x, P, rest);
     AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
     AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
-    return !AT_WIDTH(outside)(plan, x);
+    int good = !AT_WIDTH(outside)(plan, x);
+    EACH_LANE good &= rest[l] == 0 || lost[l];
+    return good;
 }
 
 /* Filter W rows, of which ``count`` exist. Return the number of the sample that NumPy has to do, or
@@ -98,11 +75,13 @@ static int64_t AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int coun
     const struct plan *plan = c->plan;
     lanes p[LP], x[NX], P[NX * NX], F[NX * NX];
     struct interval over = {.plan = plan, .p = p};
+    int lost[W];              /* rows whose state is NaN */
     int64_t beyond[W];
     EACH_LANE beyond[l] = plan->gate ? c->beyond[row + MIN(l, count - 1)] : 0;
     AT_WIDTH(load)(NP, plan->p, plan->p_rows ? c->batch : 0, row, count, p);
     AT_WIDTH(load)(NX, c->x_before, c->batch, row, count, x);
     AT_WIDTH(load)(NX * NX, c->P_before, c->batch, row, count, P);
+    AT_WIDTH(find_lost)(x, P, lost);
     if (c->t_before) AT_WIDTH(load)(NU, c->u_before, c->batch, row, count, over.u1);
     for (int64_t k = 0; k < c->samples; k++) {
         const double *before = k ? c->t + k - 1 : c->t_before;
@@ -127,7 +106,7 @@ static int64_t AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int coun
             AT_WIDTH(store)(NX * NX, P, c->P_predicted + k * NX * NX * c->batch, c->batch, row,
                             count);
         }
-        if (!AT_WIDTH(correct)(c, p, k, row, count, x, P, beyond)) return k;
+        if (!AT_WIDTH(correct)(c, p, k, row, count, x, P, lost, beyond)) return k;
         AT_WIDTH(store)(NX, x, c->x + k * NX * c->batch, c->batch, row, count);
         AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * c->batch, c->batch, row, count);
         if (plan->gate)

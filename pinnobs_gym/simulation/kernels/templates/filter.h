@@ -59,6 +59,19 @@ static inline int AT_WIDTH(divide)(int n, const lanes *restrict S, lanes *restri
     return good;
 }
 
+/* Find the rows whose state and covariance are NaN throughout. They remain so. Rows in which some
+   values are not finite are left to NumPy, where the others become so in the order in which dense
+   products carry them. */
+static inline void AT_WIDTH(find_lost)(const lanes *restrict x, const lanes *restrict P,
+                                       int *restrict lost)
+{
+    EACH_LANE {
+        lost[l] = 1;
+        for (int i = 0; i < NX; i++) lost[l] &= x[i][l] != x[i][l];
+        for (int i = 0; i < NX * NX; i++) lost[l] &= P[i][l] != P[i][l];
+    }
+}
+
 /* 1 if a state is outside of its bounds */
 static inline int AT_WIDTH(outside)(const struct plan *plan, const lanes *restrict x)
 {
