@@ -1,18 +1,21 @@
 """Filters in compiled code, for estimators whose class names a template.
 
 The code in NumPy stays the reference. A sample that the compiled code leaves to it, because a state
-is beyond its bounds or a matrix has no root, is processed in NumPy, in the rows concerned.
+is beyond its bounds or a matrix has no root, is processed in NumPy, in the rows concerned, and so
+are rows that are carried by roots. Every row has the same result alone and in any batch.
 """
 
 from __future__ import annotations
 
 import ctypes
-from dataclasses import replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+import inspect
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pinnobs_gym.estimation.estimator import Estimates, State
+from pinnobs_gym.estimation.square_root import carried
 from pinnobs_gym.simulation.kernels.calls import CallStructure, Plan, address
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary, plant_library
 from pinnobs_gym.simulation.noise import AssumedNoise, Noise, SampledLevel
@@ -20,23 +23,43 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.truth import rows_of
 
 if TYPE_CHECKING:
-    from pinnobs_gym.estimation.estimator import State
     from pinnobs_gym.estimation.recursive import RecursiveEstimator
 
-FIELDS = ("xhat", "P", "innovation", "S")
+_FIELDS = ("xhat", "P", "innovation", "S")
 """The fields of `Estimates` that compiled filters compute."""
+_DOUBLE = np.dtype(float)
+_LAYOUTS = 16
+"""Number of layouts that are kept, one for each number of rows."""
 
 
-class Packed(NamedTuple):
-    """The arrays of a `State` in one buffer, in the layout of compiled code."""
+class Packed:
+    """The arrays of a `State` in one buffer, in the layout of compiled code. A copy of a state in
+    another process or place has none."""
 
-    start: int
-    """Address of the buffer."""
-    buffer: np.ndarray
-    """The buffer, which has to live as long as its address is used."""
-    xhat: np.ndarray
-    """The state's estimate, a view of the buffer; a state with another one is not packed."""
-    P: np.ndarray
+    __slots__ = ("buffer", "start")
+
+    def __init__(self, buffer: np.ndarray, start: int) -> None:
+        self.buffer = buffer
+        """The buffer, which has to live as long as its address is used."""
+        self.start = start
+        """Its address."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Where a buffer has the time, outputs, inputs, estimates, covariances, innovations and their
+    covariances of a batch, and the numbers by which compiled code marks rows; see ``update`` in
+    ``templates/filter.c``."""
+
+    size: int
+    """Number of entries."""
+    ends: tuple[int, ...]
+    """Index of the first entry after each part but the last, in the order above."""
+    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
+    """Shape, position in bytes and strides of the estimates (batch, nx) and so on."""
 
 
 def compiled_filter(estimator: RecursiveEstimator) -> CompiledFilter | str:
@@ -44,15 +67,30 @@ def compiled_filter(estimator: RecursiveEstimator) -> CompiledFilter | str:
     template = estimator.template
     if not template:
         return f"{type(estimator).__name__} has no compiled code"
-    owner = next(cls for cls in type(estimator).__mro__ if "template" in vars(cls))
-    for name in ("reset", "predict", "correct"):
-        if getattr(type(estimator), name) is not getattr(owner, name):
-            return f"{type(estimator).__name__} defines {name}"
+    changed = _changed(type(estimator))
+    if changed:
+        return f"{type(estimator).__name__} defines {changed}"
     noise = estimator.noise
     if type(noise) is not AssumedNoise or type(noise.told) is not Noise:
         return "its noise has methods of its own"
+    if reason := estimator.not_compiled():
+        return reason
     made = plant_library(estimator.system, template)
     return made if isinstance(made, str) else CompiledFilter(estimator, made)
+
+
+def _changed(cls: type[RecursiveEstimator]) -> str:
+    """Return the name of a method of the class that names the template which a subclass of it
+    overrides, an empty text if there is none."""
+    classes = cls.__mro__
+    place = next(i for i, each in enumerate(classes) if "template" in vars(each))
+    for name, value in ((n, v) for each in classes[:place] for n, v in vars(each).items()):
+        before = getattr(classes[place], name, None)
+        if name.startswith("__") or name == "run" or not inspect.isfunction(value):
+            continue
+        if before is not None and not getattr(before, "__isabstractmethod__", False):
+            return name
+    return ""
 
 
 class CompiledFilter:
@@ -68,87 +106,130 @@ class CompiledFilter:
         self._estimator, self._made = estimator, made
         self._sizes = system.nx, system.ny, system.nu
         self._by_sample = estimator.noise.samples is not None
-        self._by_row = any(np.ndim(getattr(system, name)) for name in made.numbers)
-        self._plan = self._planned(estimator.noise.R(0.0)[None])
+        # The number of rows that the model has, 1 if it is the same for any number
+        values = [getattr(system, name) for name in made.numbers]
+        self._rows = np.broadcast_shapes((1,), *(np.shape(value) for value in values))[0]
+        self._plan = self._planned(estimator, estimator.noise.R(0.0)[None])
         self._at = ctypes.addressof(self._plan.structure)
-        self._run = made.code.run
-        self._run.restype = ctypes.c_int64
-        self._run.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+        self._layouts: dict[int, _Layout] = {}
+        self._run, self._update = made.code.run, made.code.update
+        self._run.argtypes = [ctypes.c_void_p] * 2
+        self._update.argtypes = [ctypes.c_void_p, *[ctypes.c_int64] * 2, *[ctypes.c_void_p] * 3]
+        self._run.restype = self._update.restype = ctypes.c_int64
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State | None:
         """Return the state after a sample; None if NumPy has to process it. The arguments are those
         of `Estimator.update`."""
-        if state.root is not None or state.P is None or self._by_sample:
+        batch = len(state.xhat)
+        layout = self._layouts.get(batch) or self._layout(batch)
+        if self._rows not in (1, batch):
             return None
-        batch, (nx, ny, nu) = len(state.xhat), self._sizes
+        before = state.packed
+        if before is None:
+            if state.P is None:
+                return None
+            before = self._packed(state, layout)
         # All arrays are parts of one buffer, whose address is found once.
-        size, ends, offsets = _layout(nx, ny, nu, batch)
-        buffer = np.empty(size)
+        ends = layout.ends
+        buffer: Any = np.empty(layout.size)
         start = ctypes.addressof(ctypes.c_double.from_buffer(buffer))
-        buffer[0] = t
-        buffer[1 : ends[1]].reshape(ny, batch)[:] = y.T
-        if nu:
-            buffer[ends[1] : ends[2]].reshape(nu, batch)[:] = u.T
-        packed, kept = state.packed, None
-        if packed is not None and packed.xhat is state.xhat and packed.P is state.P:
-            before = packed.start
-            earlier = before, before + offsets[2], before + offsets[3], before + offsets[4]
+        if batch == 1:
+            buffer[0] = t
+            buffer[1 : ends[1]] = y[0]
+            if ends[2] > ends[1]:
+                buffer[ends[1] : ends[2]] = u[0]
         else:
-            kept = _arrays_of(state)
-            earlier = tuple(map(address, kept))
-        if state.t is None:
-            earlier = None, None, *earlier[2:]
+            _fill(buffer, layout, t, y, u)
+        at, plan = self._at, None
+        if self._by_sample:
+            plan = self._plan.with_R(self._estimator.noise.R(t)[None])
+            at = ctypes.addressof(plan.structure)
         memory, arrays = self._estimator.carried_memory(state)
-        call = CallStructure(self._at, batch, 1, *(start + at for at in offsets), *earlier)
-        for name, array in arrays.items():
-            setattr(call, name, address(array))
-        reached = (ctypes.c_int64 * batch)()
-        if self._run(ctypes.addressof(call), ctypes.addressof(reached)):
-            return None
-        x = buffer[ends[2] : ends[3]].reshape(nx, batch).T
-        P = buffer[ends[3] : ends[4]].reshape(nx, nx, batch).transpose(2, 0, 1)
-        innovation = buffer[ends[4] : ends[5]].reshape(ny, batch).T
-        S = buffer[ends[5] :].reshape(ny, ny, batch).transpose(2, 0, 1)
-        return type(state)(x, t, u, P, innovation, S, memory, None, Packed(start, buffer, x, P))
+        more = _call_with(arrays) if arrays else None
+        left = self._update(
+            at,
+            batch,
+            state.t is None,
+            start,
+            before.start,
+            None if more is None else ctypes.addressof(more),
+        )
+        x, P, innovation, S = [
+            np.ndarray(shape, _DOUBLE, buffer, place, strides)
+            for shape, place, strides in layout.views
+        ]
+        after = State(x, t, u, P, innovation, S, memory, state.root)
+        if left or state.root is not None:
+            return self._completed(state, after, y, buffer[ends[-1] :].view(np.int64) == 0)
+        vars(after)["packed"] = Packed(buffer, start)
+        return after
 
-    def run(self, record: Record) -> dict[str, np.ndarray] | None:
-        """Return the fields of the estimates of a record, (batch, num_samples, ...) each; None if
-        NumPy has to process it."""
+    def run(self, record: Record) -> Estimates | None:
+        """Return the estimates of a record; None if NumPy has to process it."""
         state = self._estimator.reset(record.prior)
-        if state.root is not None:
-            return None
         batch, n, (nx, ny, _) = record.batch, record.num_samples, self._sizes
+        rooted = np.zeros(batch, dtype=bool)
+        if state.root is not None:
+            rooted[carried(state.root)] = True
+        if self._rows not in (1, batch) or rooted.all():
+            return None
         shapes = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
-        results = {name: np.empty((n, *shapes[name], batch)) for name in FIELDS}
-        # Rows, the first of their samples that is not done, and their state before it
-        waiting = [(np.arange(batch), 0, state)]
-        while waiting:
-            rows, first, state = waiting.pop()
-            own, part = record, results
-            if len(rows) < batch:
-                own = record.rows(rows)
-                part = {name: a[..., rows] for name, a in results.items()}
-            memory, reached = self._through(own, rows, first, state, part)
-            if part is not results:
-                for name, array in part.items():
-                    results[name][first:, ..., rows] = array[first:]
-            for k in np.unique(reached[reached < n]).tolist():
-                chosen = np.flatnonzero(reached == k)
-                before = replace(state, memory=memory)
-                if k > first:
-                    before = replace(
-                        before,
-                        t=float(own.t[k - 1]),
-                        u=own.u[:, k - 1],
-                        xhat=np.moveaxis(part["xhat"][k - 1], -1, 0),
-                        P=np.moveaxis(part["P"][k - 1], -1, 0),
-                    )
-                after = self._by_numpy(own, k, before, chosen, rows)
-                for name in FIELDS:
-                    value = np.moveaxis(getattr(after, name), 0, -1)
-                    results[name][k][..., rows[chosen]] = value
-                waiting.append((rows[chosen], k + 1, after))
-        return {name: np.moveaxis(array, -1, 0) for name, array in results.items()}
+        results = {name: np.empty((n, *shapes[name], batch)) for name in _FIELDS}
+        # For each row, the number of the sample that NumPy has to process, n if there is none
+        reached = np.where(rooted, 0, n)
+        state = self._through(record, np.flatnonzero(~rooted), 0, state, results, reached)
+        while (k := int(reached.min())) < n:
+            rows = np.flatnonzero(reached == k)
+            state = self._by_numpy(record, rows, k, state, results)
+            reached[rows] = k + 1
+            rows = rows[~np.isin(rows, () if state.root is None else carried(state.root))]
+            if k + 1 < n and len(rows):
+                state = self._through(record, rows, k + 1, state, results, reached)
+        return Estimates(**{name: np.moveaxis(array, -1, 0) for name, array in results.items()})
+
+    def _completed(
+        self, state: State, after: State, y: np.ndarray, left: np.ndarray
+    ) -> State | None:
+        """Return the state after a sample, with the rows that are left to NumPy, bool (batch,), and
+        those that are carried by roots; None if these are all."""
+        if state.root is not None:
+            left[carried(state.root)] = True
+        if left.all():
+            return None
+        rows = np.flatnonzero(left)
+        if not len(rows):
+            return after
+        estimator = self._of_rows(rows)
+        assert after.t is not None
+        assert after.u is not None
+        own = self._state_of(estimator, state, rows)
+        part = estimator.update_by_numpy(
+            own, after.t, np.asarray(y)[rows], np.asarray(after.u)[rows]
+        )
+        for name in _FIELDS:
+            getattr(after, name)[rows] = getattr(part, name)
+        return self._with_rows(after, rows, part)
+
+    def _with_rows(self, state: State, rows: np.ndarray, part: State) -> State:
+        """Return the state with the memory and the roots of some rows replaced."""
+        root = state.root
+        if root is not None and part.root is not None:
+            root = root.copy()
+            root[rows] = part.root
+        memory = self._estimator.with_memory_rows(state.memory, rows, part.memory)
+        return replace(state, memory=memory, root=root)
+
+    def _state_of(self, estimator: RecursiveEstimator, state: State, rows: np.ndarray) -> State:
+        """Return the state of some rows, for the estimator of these."""
+        assert state.P is not None
+        return State(
+            state.xhat[rows],
+            state.t,
+            None if state.u is None else np.asarray(state.u)[rows],
+            state.P[rows],
+            memory=estimator.memory_rows(state.memory, rows),
+            root=None if state.root is None else state.root[rows],
+        )
 
     def _through(
         self,
@@ -157,87 +238,137 @@ class CompiledFilter:
         first: int,
         state: State,
         results: dict[str, np.ndarray],
-    ) -> tuple[Any, np.ndarray]:
-        """Filter a record from a sample on, and write the fields (num_samples, ..., batch) of its
-        estimates. Return the memory at the end, and the number of the sample that NumPy has to
-        process in each row, that of all samples if there is none.
+        reached: np.ndarray,
+    ) -> State:
+        """Filter rows of a record from a sample on. Set their estimates (num_samples, ..., batch),
+        and the numbers of the samples that NumPy has to process. Return the state with the memory
+        that follows in these rows.
 
         Args:
             record: the record.
-            rows: the numbers of its rows among those of the estimator.
+            rows: the numbers of the rows.
             first: number of the first sample.
-            state: the state before that sample.
+            state: the state before the first sample of the record, with the memory and the roots
+                before this one.
             results: the arrays of the results.
+            reached: the numbers of the samples, shape (batch,).
         """
-        batch, n = record.batch, record.num_samples
-        memory, arrays = self._estimator.carried_memory(state)
+        whole, n = len(rows) == record.batch, record.num_samples
+        estimator = self._estimator if whole else self._of_rows(rows)
+        own = record if whole else record.rows(rows)
+        before = self._state_of(estimator, self._before(record, first, state, results), rows)
+        memory, arrays = estimator.carried_memory(before)
         plan = self._plan
-        if self._by_sample or self._by_row:
-            estimator = self._of_rows(rows)
+        if self._by_sample or not whole:
             R = estimator.noise.R(0.0)[None]
             if self._by_sample:
-                R = np.stack([estimator.noise.R(float(t)) for t in record.t[first:]])
-            plan = self._planned(R, estimator)
-        y, u = (np.ascontiguousarray(a[:, first:].transpose(1, 2, 0)) for a in (record.y, record.u))
-        t = np.ascontiguousarray(record.t[first:], dtype=float)
-        fields = [results[name][first:] for name in FIELDS]
-        earlier = _arrays_of(state)
-        pointers = [address(array) for array in (t, y, u, *fields, *earlier)]
-        if state.t is None:
-            pointers[-4:-2] = None, None
-        at = ctypes.addressof(plan.structure)
-        call = CallStructure(at, batch, n - first, *pointers)
-        for name, array in arrays.items():
-            setattr(call, name, address(array))
-        reached = np.empty(batch, dtype=np.int64)
-        self._run(ctypes.addressof(call), address(reached))
-        return memory, first + reached
+                each = [estimator.noise.R(float(t)) for t in own.t[first:]]
+                R = np.stack(np.broadcast_arrays(*each))
+            plan = self._planned(estimator, R)
+        t = np.ascontiguousarray(own.t[first:], dtype=float)
+        y, u = (np.ascontiguousarray(a[:, first:].transpose(1, 2, 0)) for a in (own.y, own.u))
+        part = {name: array[first:] for name, array in results.items()}
+        if not whole:
+            part = {name: np.empty((*a.shape[:-1], len(rows))) for name, a in part.items()}
+        earlier = _arrays_of(before)
+        names = ["t", "y", "u", "x", "P", "innovation", "S", "x_before", "P_before"]
+        given = [t, y, u, *part.values(), *earlier[2:]]
+        if before.t is not None:
+            names, given = [*names, "t_before", "u_before"], [*given, *earlier[:2]]
+        call = _call_with(arrays | dict(zip(names, given, strict=True)))
+        call.plan, call.batch, call.samples = ctypes.addressof(plan.structure), len(rows), n - first
+        stopped = np.empty(len(rows), dtype=np.int64)
+        self._run(ctypes.addressof(call), address(stopped))
+        reached[rows] = first + stopped
+        if whole:
+            return replace(state, memory=memory)
+        for name, array in part.items():
+            results[name][first:, ..., rows] = array
+        return replace(state, memory=self._estimator.with_memory_rows(state.memory, rows, memory))
+
+    def _before(
+        self, record: Record, k: int, state: State, results: dict[str, np.ndarray]
+    ) -> State:
+        """Return the state before sample k; the arguments are those of `_through`."""
+        if k == 0:
+            return state
+        xhat, P = (np.moveaxis(results[name][k - 1], -1, 0) for name in ("xhat", "P"))
+        return replace(state, t=float(record.t[k - 1]), u=record.u[:, k - 1], xhat=xhat, P=P)
 
     def _by_numpy(
-        self, record: Record, k: int, state: State, chosen: np.ndarray, rows: np.ndarray
+        self, record: Record, rows: np.ndarray, k: int, state: State, results: dict[str, np.ndarray]
     ) -> State:
-        """Return the state after sample k in the chosen rows of a record, whose rows have the given
-        numbers among those of the estimator."""
-        estimator = self._of_rows(rows[chosen])
-        own = replace(
-            state,
-            xhat=state.xhat[chosen],
-            P=None if state.P is None else state.P[chosen],
-            u=None if state.u is None else state.u[chosen],
-            innovation=None,
-            S=None,
-            memory=estimator.memory_rows(state.memory, chosen),
-            packed=None,
-        )
-        t, y, u = float(record.t[k]), record.y[chosen, k], record.u[chosen, k]
-        return estimator.update_by_numpy(own, t, y, u)
+        """Process sample k in some rows of a record, and return the state with the memory and the
+        roots that follow; the arguments are those of `_through`."""
+        estimator = self._of_rows(rows)
+        before = self._state_of(estimator, self._before(record, k, state, results), rows)
+        t, y, u = float(record.t[k]), record.y[rows, k], record.u[rows, k]
+        with np.errstate(all="ignore"):
+            part = estimator.update_by_numpy(before, t, y, u)
+        for name in _FIELDS:
+            results[name][k][..., rows] = np.moveaxis(getattr(part, name), 0, -1)
+        return self._with_rows(state, rows, part)
 
     def _of_rows(self, rows: np.ndarray) -> RecursiveEstimator:
         """Return the estimator of some rows of the batch."""
-        level = self._estimator.noise_std
+        system, level = rows_of(self._estimator.system, rows), self._estimator.noise_std
+        if system is self._estimator.system and not isinstance(level, SampledLevel):
+            return self._estimator
         if isinstance(level, SampledLevel):
             level = level.rows(rows)
-        return replace(
-            self._estimator, system=rows_of(self._estimator.system, rows), noise_std=level
-        )
+        return replace(self._estimator, system=system, noise_std=level)
 
-    def _planned(self, R: np.ndarray, estimator: RecursiveEstimator | None = None) -> Plan:
-        """Return the plan of an estimator, by default the own one, with the output noise R (samples
-        or 1, ny, ny, batch or 1)."""
-        estimator = self._estimator if estimator is None else estimator
+    def _planned(self, estimator: RecursiveEstimator, R: np.ndarray) -> Plan:
+        """Return the plan of an estimator with the output noise R (samples or 1, ny, ny, batch or
+        1)."""
         L = estimator.noise.L(0.0)[..., 0]
         plan = Plan.of(estimator.system, self._made.numbers, L, R)
         plan.set(**estimator.plan_settings())
         return plan
 
+    def _layout(self, batch: int) -> _Layout:
+        """Return the layout of a buffer for a batch."""
+        nx, ny, nu = self._sizes
+        shapes = [(nx,), (nx, nx), (ny,), (ny, ny)]
+        sizes = [1, ny * batch, nu * batch, *(batch * int(np.prod(shape)) for shape in shapes)]
+        ends = np.cumsum(sizes).tolist()
+        views = []
+        for shape, first in zip(shapes, ends[2:], strict=False):
+            array = np.moveaxis(np.empty((*shape, batch)), -1, 0)
+            views.append((array.shape, 8 * first, array.strides))
+        layout = _Layout(ends[-1] + batch, tuple(ends), tuple(views))
+        if len(self._layouts) < _LAYOUTS:
+            self._layouts[batch] = layout
+        return layout
 
-@lru_cache(maxsize=256)
-def _layout(nx: int, ny: int, nu: int, batch: int) -> tuple[int, tuple[int, ...], tuple[int, ...]]:
-    """Return the number of entries of a buffer with t, y, u, x, P, the innovation and S, the ends
-    of all but the last, and the positions of all in bytes."""
-    sizes = [1, *(batch * size for size in (ny, nu, nx, nx * nx, ny, ny * ny))]
-    ends = np.cumsum(sizes).tolist()
-    return ends[-1], tuple(ends[:-1]), tuple(8 * at for at in [0, *ends[:-1]])
+    def _packed(self, state: State, layout: _Layout) -> Packed:
+        """Return the arrays of a state in a buffer."""
+        buffer: Any = np.zeros(layout.size)
+        start = ctypes.addressof(ctypes.c_double.from_buffer(buffer))
+        if state.t is not None:
+            buffer[0] = state.t
+        if state.u is not None and self._sizes[2]:
+            first, last = layout.ends[1:3]
+            buffer[first:last].reshape(self._sizes[2], -1)[:] = np.asarray(state.u).T
+        for value, (shape, place, strides) in zip(
+            (state.xhat, state.P), layout.views, strict=False
+        ):
+            np.ndarray(shape, _DOUBLE, buffer, place, strides)[:] = value
+        return Packed(buffer, start)
+
+
+def _fill(buffer: np.ndarray, layout: _Layout, t: float, y: np.ndarray, u: np.ndarray) -> None:
+    """Write a sample into a buffer."""
+    ends = layout.ends
+    buffer[0] = t
+    buffer[1 : ends[1]].reshape(-1, len(y))[:] = np.asarray(y).T
+    if ends[2] > ends[1]:
+        buffer[ends[1] : ends[2]].reshape(-1, len(y))[:] = np.asarray(u).T
+
+
+def _call_with(arrays: dict[str, np.ndarray]) -> CallStructure:
+    """Return a call with the arrays of some fields."""
+    return CallStructure(**{name: address(array) for name, array in arrays.items()})
 
 
 def _arrays_of(state: State) -> list[np.ndarray]:

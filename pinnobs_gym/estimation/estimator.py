@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, dataclass, field, fields
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from pinnobs_gym.estimation.compiled import Packed
 from pinnobs_gym.estimation.given import checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
@@ -19,6 +18,9 @@ from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.compiled import Packed
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,9 @@ class State:
     root: np.ndarray | None = None
     """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
     `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
-    packed: Packed | None = None
-    """The same arrays in the layout of compiled code, if it computed them."""
+    packed: Packed | None = field(default=None, init=False, repr=False, compare=False)
+    """The same arrays in the layout of compiled code, if it computed them. A state with a value
+    replaced has none."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class RecursiveEstimator(Estimator):
 
     template: ClassVar[str] = ""
     """The template of `pinnobs_gym.simulation.kernels` that computes the same; empty if there is
-    none. It is not used for a subclass that overrides `reset`, `predict` or `correct`."""
+    none. It is not used for a subclass that overrides a method of the class that names it."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -71,11 +71,8 @@ class RecursiveEstimator(Estimator):
 
     def run(self, record: Record) -> Estimates:
         compiled = self.compiled
-        if compiled is not None:
-            columns = compiled.run(record)
-            if columns is not None:
-                return Estimates(**columns)
-        return super().run(record)
+        estimates = None if compiled is None else compiled.run(record)
+        return super().run(record) if estimates is None else estimates
 
     @final
     def update_by_numpy(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
@@ -91,6 +88,11 @@ class RecursiveEstimator(Estimator):
         found = compiled_filter(self)
         return None if isinstance(found, str) else found
 
+    def not_compiled(self) -> str:
+        """Return in one line why the template does not compute the same with the estimator's
+        settings, an empty text if it does."""
+        return ""
+
     def plan_settings(self) -> dict[str, Any]:
         """Return the settings that the compiled code takes, by the fields of ``struct plan``."""
         return {}
@@ -102,4 +104,8 @@ class RecursiveEstimator(Estimator):
 
     def memory_rows(self, memory: Any, rows: np.ndarray) -> Any:
         """Return the memory of some rows of the batch."""
+        return memory
+
+    def with_memory_rows(self, memory: Any, rows: np.ndarray, part: Any) -> Any:
+        """Return the memory with that of some rows of the batch replaced."""
         return memory

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,7 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     a turn of that at x̂, so that their mean and deviations are those of numbers.
     """
 
+    template = "sigma_points"
     exempt_from = {
         "model_alone": "its mean is that of points that the model has moved apart",
         "blank_rows": "it draws its points anew at every row",
@@ -75,6 +77,25 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
     def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the points for the standard normal distribution, (num_points, nx), and their
         weights in means and in covariances, (num_points,) each. No weight is negative."""
+
+    def not_compiled(self) -> str:
+        count, most = len(self.points()[0]), 2 * self.system.nx + 1
+        return f"it has {count} points, more than {most}" if count > most else ""
+
+    def plan_settings(self) -> dict[str, Any]:
+        points, mean_weights, cov_weights = self.points()
+        settings = {"points": points, "weights": mean_weights, "roots": np.sqrt(cov_weights)}
+        return settings | {"num_points": len(points)}
+
+    def memory_rows(self, memory: SigmaPointMemory, rows: np.ndarray) -> SigmaPointMemory:
+        return replace(memory, jitter=memory.jitter[rows])
+
+    def with_memory_rows(
+        self, memory: SigmaPointMemory, rows: np.ndarray, part: SigmaPointMemory
+    ) -> SigmaPointMemory:
+        jitter = memory.jitter.copy()
+        jitter[rows] = part.jitter
+        return replace(memory, jitter=jitter)
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)

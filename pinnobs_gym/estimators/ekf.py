@@ -123,6 +123,11 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
     def memory_rows(self, memory: EKFMemory, rows: np.ndarray) -> EKFMemory:
         return replace(memory, P_restart=memory.P_restart[..., rows], beyond=memory.beyond[rows])
 
+    def with_memory_rows(self, memory: EKFMemory, rows: np.ndarray, part: EKFMemory) -> EKFMemory:
+        beyond = memory.beyond.copy()
+        beyond[rows] = part.beyond
+        return replace(memory, beyond=beyond)
+
     def _gate_bounds(self) -> np.ndarray:
         """Return the gate's bounds on the NIS of 0, 1, ... ny outputs, which are χ² quantiles."""
         if self.gate is None:

@@ -30,6 +30,8 @@ class PlanStructure(ctypes.Structure):
         *(("state_period", _POINTER), ("output_period", _POINTER)),
         *(("low", _POINTER), ("high", _POINTER)),
         *(("gate", _POINTER), ("patience", _INT), ("huber", _DOUBLE)),
+        *((name, _POINTER) for name in ("points", "weights", "roots")),
+        ("num_points", _INT),
     ]
 
 
@@ -72,7 +74,7 @@ class Plan:
         p = np.array(np.broadcast_arrays(*values) if by_row else values, dtype=float)
         breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
         measured = {"previous": 1, "linear": 2}[system.input_hold]
-        plan.set(p=p, L=L, R=R, breaks=breaks, output_period=_periods(system.output_period))
+        plan.set(p=p, L=L, breaks=breaks, output_period=_periods(system.output_period))
         D = L @ L.T
         plan.set(D=D, diagonal=int(not (D - np.diag(np.diag(D))).any()))
         plan.set(state_period=_periods(system.state_period))
@@ -80,10 +82,15 @@ class Plan:
         plan.set(low=None if box is None else box.low, high=None if box is None else box.high)
         structure = plan.structure
         structure.p_rows, structure.m = int(by_row), L.shape[1]
-        structure.R_samples, structure.R_rows = int(len(R) > 1), int(R.shape[-1] > 1)
         structure.longest, structure.num_breaks = longest_step(system), len(breaks)
         structure.input = measured if system.measured_input else 0
         structure.discrete = int(system.discrete)
+        return plan.with_R(R)
+
+    def with_R(self, R: np.ndarray) -> Plan:
+        """Return the plan with another output noise R (samples or 1, ny, ny, batch or 1)."""
+        plan = Plan(PlanStructure.from_buffer_copy(self.structure), [*self.kept])
+        plan.set(R=R, R_samples=int(len(R) > 1), R_rows=int(R.shape[-1] > 1))
         return plan
 
     def set(self, **values: np.ndarray | float | None) -> None:

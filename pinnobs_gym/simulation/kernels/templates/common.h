@@ -24,6 +24,12 @@ static inline double wrapped(double difference, double period)
     return rest >= half ? rest - period : rest;
 }
 
+/* Return the value less whole periods, within half a period of the reference. */
+static inline double nearest(double value, double reference, double period)
+{
+    return value - period * floor((value - reference) / period + 0.5);
+}
+
 /* What stays the same over the samples of a call. The batch is the last axis of all arrays. */
 struct plan {
     const double *p;          /* the plant's numbers, (NP, 1 or batch) */
@@ -47,4 +53,9 @@ struct plan {
     const double *gate;       /* bounds of the NIS, (NY + 1,), or NULL */
     int64_t patience;
     double huber;             /* 0 for none */
+    /* sigma-point filters; at most 2 NX + 1 points */
+    const double *points;     /* (num_points, NX) for the standard normal distribution */
+    const double *weights;    /* (num_points,) in means */
+    const double *roots;      /* (num_points,) square roots of the weights in covariances */
+    int64_t num_points;
 };

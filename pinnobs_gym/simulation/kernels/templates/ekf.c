@@ -1,9 +1,11 @@
 /* The extended Kalman filter, as pinnobs_gym/estimators/ekf.py says. */
 
-/* Correct x and P by the outputs of sample k. 0 if NumPy has to do it. */
-static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
+/* Correct x and P by the outputs of sample k. Lanes that NumPy has to correct are marked in
+   ``bad``. */
+static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
                                     int64_t row, int count, lanes *restrict x, lanes *restrict P,
-                                    const int *restrict lost, int64_t *restrict beyond)
+                                    const int64_t *restrict lost, int64_t *restrict beyond,
+                                    int64_t *restrict bad)
 {
     const struct plan *plan = c->plan;
     lanes t, y[NY], u[LU], e[NY], H[NY * NX], R[NY * NY], S[NY * NY], HP[NY * NX];
@@ -27,7 +29,7 @@ static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict 
         lanes Se[NY];
         int restarted = 0;
         for (int i = 0; i < NY; i++) EACH_LANE Se[i][l] = e[i][l];
-        if (!AT_WIDTH(divide)(1, S, Se)) return 0;
+        AT_WIDTH(divide)(1, S, Se, bad);
         EACH_LANE {
             int present = 0;
             double nis = 0;
@@ -63,20 +65,21 @@ static inline int AT_WIDTH(correct)(const struct call *c, const lanes *restrict 
     AT_WIDTH(kalman_update)(H, HP, S, R, e, x, P, rest);
     AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
     AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
-    int good = !AT_WIDTH(outside)(plan, x);
-    EACH_LANE good &= rest[l] == 0 || lost[l];
-    return good;
+    EACH_LANE bad[l] |= (rest[l] != 0) & !lost[l];
+    AT_WIDTH(mark_outside)(plan, x, bad);
 }
 
-/* Filter W rows, of which ``count`` exist. Return the number of the sample that NumPy has to do, or
-   the number of samples. */
-static int64_t AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count)
+/* Filter W rows, of which ``count`` exist. ``reached`` is set to the number of the sample that NumPy
+   has to do in each, or the number of samples. */
+static void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
+                                  int64_t *restrict reached)
 {
     const struct plan *plan = c->plan;
     lanes p[LP], x[NX], P[NX * NX], F[NX * NX];
     struct interval over = {.plan = plan, .p = p};
-    int lost[W];              /* rows whose state is NaN */
-    int64_t beyond[W];
+    int64_t beyond[W], bad[W], lost[W];
+    EACH_LANE bad[l] = 0;
+    for (int l = 0; l < count; l++) reached[l] = c->samples;
     EACH_LANE beyond[l] = plan->gate ? c->beyond[row + MIN(l, count - 1)] : 0;
     AT_WIDTH(load)(NP, plan->p, plan->p_rows ? c->batch : 0, row, count, p);
     AT_WIDTH(load)(NX, c->x_before, c->batch, row, count, x);
@@ -86,7 +89,8 @@ static int64_t AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int coun
     for (int64_t k = 0; k < c->samples; k++) {
         const double *before = k ? c->t + k - 1 : c->t_before;
         if (before) {
-            if (!AT_WIDTH(movable)(plan, *before, c->t[k])) return k;
+            if (!AT_WIDTH(movable)(plan, *before, c->t[k])) EACH_LANE bad[l] = 1;
+            if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
             over.t0 = *before;
             over.t1 = c->t[k];
             memcpy(over.u0, over.u1, sizeof over.u0);
@@ -106,11 +110,12 @@ static int64_t AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int coun
             AT_WIDTH(store)(NX * NX, P, c->P_predicted + k * NX * NX * c->batch, c->batch, row,
                             count);
         }
-        if (!AT_WIDTH(correct)(c, p, k, row, count, x, P, lost, beyond)) return k;
+        AT_WIDTH(correct)(c, p, k, row, count, x, P, lost, beyond, bad);
+        if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
         AT_WIDTH(store)(NX, x, c->x + k * NX * c->batch, c->batch, row, count);
         AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * c->batch, c->batch, row, count);
         if (plan->gate)
-            for (int l = 0; l < count; l++) c->beyond[row + l] = beyond[l];
+            for (int l = 0; l < count; l++)
+                if (!bad[l]) c->beyond[row + l] = beyond[l];
     }
-    return c->samples;
 }

@@ -1,16 +1,97 @@
-/* The entry: filter the rows in groups of WIDE lanes, or one by one if they are few. ``reached``
-   (batch,) is set to the number of the sample that NumPy has to do in each row, or the number of
-   samples. Returns 0 if there is none to do. */
+/* The entries. */
+
+/* Number of entries of results that are written before others: about a quarter of a megabyte */
+#define CACHED 32768
+
+/* Return the call of the samples from one on. */
+static struct call later(const struct call *c, int64_t k)
+{
+    struct call part = *c;
+    const int64_t rows = k * c->batch;
+    if (k == 0) return part;
+    part.t += k;
+    part.y += rows * NY;
+    part.u += rows * NU;
+    part.x += rows * NX;
+    part.P += rows * NX * NX;
+    part.innovation += rows * NY;
+    part.S += rows * NY * NY;
+    if (c->x_predicted) {
+        part.x_predicted += rows * NX;
+        part.P_predicted += rows * NX * NX;
+        part.F += rows * NX * NX;
+    }
+    part.t_before = part.t - 1;
+    part.u_before = part.u - c->batch * NU;
+    part.x_before = part.x - c->batch * NX;
+    part.P_before = part.P - c->batch * NX * NX;
+    return part;
+}
+
+/* Filter the rows in groups of WIDE lanes, or one by one if they are few. ``reached`` (batch,) is
+   set to the number of the sample that NumPy has to do in each row, or the number of samples.
+   Returns 0 if there is none to do.
+
+   All rows are filtered through some samples, whose results stay in the cache while they are
+   written, before the next samples. */
 int64_t run(const struct call *c, int64_t *reached)
 {
+    const int64_t entries = c->batch * (NX + NX * NX + NY + NY * NY);
+    const int64_t fitting = CACHED / entries, block = fitting < 8 ? 8 : fitting;
     int64_t left = 0;
-    for (int64_t row = 0; row < c->batch;) {
-        const int64_t rest = c->batch - row;
-        const int count = rest < 3 ? 1 : (int)MIN(rest, WIDE);
-        const int64_t k = count == 1 ? filter_rows_1(c, row, 1) : FILTER_WIDE(c, row, count);
-        for (int l = 0; l < count; l++) reached[row + l] = k;
-        left |= k < c->samples;
-        row += count;
+    for (int64_t row = 0; row < c->batch; row++) reached[row] = c->samples;
+    for (int64_t k = 0; k < c->samples; k += block) {
+        struct call part = later(c, k);
+        struct plan plan = *c->plan;
+        plan.R += k * plan.R_samples * NY * NY * (plan.R_rows ? c->batch : 1);
+        part.plan = &plan;
+        part.samples = MIN(block, c->samples - k);
+        for (int64_t row = 0; row < c->batch;) {
+            const int64_t rest = c->batch - row;
+            const int count = rest < 3 ? 1 : (int)MIN(rest, WIDE);
+            int64_t number[WIDE];
+            int stopped = 0;
+            for (int l = 0; l < count; l++) stopped += reached[row + l] < c->samples;
+            if (count > 1 && !stopped) FILTER_WIDE(&part, row, count, number);
+            else
+                for (int l = 0; l < count; l++)
+                    if (reached[row + l] == c->samples)
+                        filter_rows_1(&part, row + l, 1, number + l);
+            for (int l = 0; l < count; l++)
+                if (reached[row + l] == c->samples && number[l] < part.samples) {
+                    reached[row + l] = k + number[l];
+                    left = 1;
+                }
+            row += count;
+        }
     }
     return left;
+}
+
+/* Filter one sample. Buffers hold one after the other t, y, u, x, P, the innovation, S, and the
+   numbers of ``reached``, with the batch as the last axis: ``to`` with the sample's t, y and u, and
+   ``from`` the sample before. If this is the first sample, x and P of ``from`` are predictions.
+   ``more`` has further arrays, or is NULL. */
+int64_t update(const struct plan *plan, int64_t batch, int64_t first, double *to,
+               const double *from, const struct call *more)
+{
+    const int64_t u = 1 + NY * batch, x = u + NU * batch, P = x + NX * batch,
+                  e = P + NX * NX * batch, S = e + NY * batch, end = S + NY * NY * batch;
+    struct call c = {0};
+    if (more) c = *more;
+    c.plan = plan;
+    c.batch = batch;
+    c.samples = 1;
+    c.t = to;
+    c.y = to + 1;
+    c.u = to + u;
+    c.x = to + x;
+    c.P = to + P;
+    c.innovation = to + e;
+    c.S = to + S;
+    c.t_before = first ? NULL : from;
+    c.u_before = from + u;
+    c.x_before = from + x;
+    c.P_before = from + P;
+    return run(&c, (int64_t *)(to + end));
 }

@@ -40,30 +40,36 @@ static inline void AT_WIDTH(load_R)(const struct plan *plan, int64_t k, int64_t 
                 EACH_LANE if (y[i][l] != y[i][l] || y[j][l] != y[j][l]) R[i * NY + j][l] = 0;
 }
 
-/* X = X S^-1 for X (n, NY) and S (NY, NY) symmetric; 0 where rounding leaves S no root. */
-static inline int AT_WIDTH(divide)(int n, const lanes *restrict S, lanes *restrict X)
+/* Mark the lanes in which P (n, n) is finite and its factor L is not: it has none. */
+static inline void AT_WIDTH(mark_without_root)(int n, const lanes *restrict P,
+                                               const lanes *restrict L, int64_t *restrict bad)
+{
+    int64_t finite[W];
+    EACH_LANE finite[l] = 1;
+    for (int i = 0; i < n * n; i++) EACH_LANE finite[l] &= isfinite(P[i][l]) != 0;
+    EACH_LANE bad[l] |= finite[l] & !isfinite(L[n * n - 1][l]);
+}
+
+/* X = X S^-1 for X (n, NY) and S (NY, NY) symmetric. Lanes where rounding leaves S no root are
+   marked in ``bad``. */
+static inline void AT_WIDTH(divide)(int n, const lanes *restrict S, lanes *restrict X,
+                                    int64_t *restrict bad)
 {
     if (NY == 1) {
         for (int i = 0; i < n; i++) EACH_LANE X[i][l] /= S[0][l];
-        return 1;
+        return;
     }
     lanes root[NY * NY];
     AT_WIDTH(cholesky)(NY, S, root);
     AT_WIDTH(divide_factored)(n, NY, X, root);
-    int good = 1;
-    EACH_LANE {
-        int finite = 1;
-        for (int i = 0; i < NY * NY; i++) finite &= isfinite(S[i][l]) != 0;
-        good &= !finite || isfinite(root[NY * NY - 1][l]);
-    }
-    return good;
+    AT_WIDTH(mark_without_root)(NY, S, root, bad);
 }
 
 /* Find the rows whose state and covariance are NaN throughout. They remain so. Rows in which some
    values are not finite are left to NumPy, where the others become so in the order in which dense
    products carry them. */
 static inline void AT_WIDTH(find_lost)(const lanes *restrict x, const lanes *restrict P,
-                                       int *restrict lost)
+                                       int64_t *restrict lost)
 {
     EACH_LANE {
         lost[l] = 1;
@@ -72,14 +78,27 @@ static inline void AT_WIDTH(find_lost)(const lanes *restrict x, const lanes *res
     }
 }
 
-/* 1 if a state is outside of its bounds */
-static inline int AT_WIDTH(outside)(const struct plan *plan, const lanes *restrict x)
+/* Mark the lanes in which a state is outside of its bounds. */
+static inline void AT_WIDTH(mark_outside)(const struct plan *plan, const lanes *restrict x,
+                                          int64_t *restrict bad)
 {
-    int found = 0;
     if (plan->low)
         for (int i = 0; i < NX; i++)
-            EACH_LANE found |= x[i][l] < plan->low[i] || x[i][l] > plan->high[i];
-    return found;
+            EACH_LANE bad[l] |= (x[i][l] < plan->low[i]) | (x[i][l] > plan->high[i]);
+}
+
+/* Note the number of the sample in the lanes that are bad for the first time, which NumPy has to
+   go on with. Return whether all rows that exist are bad. The others go on, so that none depends
+   on its neighbours. */
+static inline int AT_WIDTH(note_bad)(const int64_t *restrict bad, int64_t k, int64_t samples,
+                                     int64_t *restrict reached, int count)
+{
+    int all = 1;
+    for (int l = 0; l < count; l++) {
+        if (bad[l] && reached[l] == samples) reached[l] = k;
+        all &= bad[l] != 0;
+    }
+    return all;
 }
 
 /* 1 if the model can be moved between these times here */
