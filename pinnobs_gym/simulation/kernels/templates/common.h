@@ -3,6 +3,13 @@
 #include <stdint.h>
 #include <string.h>
 
+/* A function whose code is not repeated where it is called, for the sake of compile time */
+#if defined(__GNUC__)
+#define SEPARATE static __attribute__((noinline))
+#else
+#define SEPARATE static
+#endif
+
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 
 /* NumPy's functions, NaN included, that C does not have. */

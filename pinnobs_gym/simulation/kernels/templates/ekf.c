@@ -2,7 +2,7 @@
 
 /* Correct x and P by the outputs of sample k. Lanes that NumPy has to correct are marked in
    ``bad``. */
-static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
+SEPARATE void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
                                     int64_t row, int count, lanes *restrict x, lanes *restrict P,
                                     const int64_t *restrict lost, int64_t *restrict beyond,
                                     int64_t *restrict bad)
@@ -71,7 +71,7 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
 
 /* Filter W rows, of which ``count`` exist. ``reached`` is set to the number of the sample that NumPy
    has to do in each, or the number of samples. */
-static void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
+SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
                                   int64_t *restrict reached)
 {
     const struct plan *plan = c->plan;

@@ -28,8 +28,17 @@ static struct call later(const struct call *c, int64_t k)
     return part;
 }
 
-/* Filter the rows in groups of WIDE lanes, or one by one if they are few. ``reached`` (batch,) is
-   set to the number of the sample that NumPy has to do in each row, or the number of samples.
+/* Return the number of rows from one on, at most WIDE, that are filtered side by side: those up to
+   the next that has been left to NumPy; -1 if this is one. */
+static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t samples)
+{
+    int64_t count = 0;
+    const int64_t most = MIN(batch - row, WIDE);
+    while (count < most && reached[row + count] == samples) count++;
+    return count ? count : -1;
+}
+
+/* Filter the rows in groups of WIDE lanes. ``reached`` (batch,) is set to the number of the sample that NumPy has to do in each row, or the number of samples.
    Returns 0 if there is none to do.
 
    All rows are filtered through some samples, whose results stay in the cache while they are
@@ -46,23 +55,19 @@ int64_t run(const struct call *c, int64_t *reached)
         plan.R += k * plan.R_samples * NY * NY * (plan.R_rows ? c->batch : 1);
         part.plan = &plan;
         part.samples = MIN(block, c->samples - k);
-        for (int64_t row = 0; row < c->batch;) {
-            const int64_t rest = c->batch - row;
-            const int count = rest < 3 ? 1 : (int)MIN(rest, WIDE);
+        for (int64_t row = 0, count; row < c->batch; row += count) {
             int64_t number[WIDE];
-            int stopped = 0;
-            for (int l = 0; l < count; l++) stopped += reached[row + l] < c->samples;
-            if (count > 1 && !stopped) FILTER_WIDE(&part, row, count, number);
-            else
-                for (int l = 0; l < count; l++)
-                    if (reached[row + l] == c->samples)
-                        filter_rows_1(&part, row + l, 1, number + l);
+            count = group(reached, row, c->batch, c->samples);
+            if (count < 0) { /* the row has stopped */
+                count = 1;
+                continue;
+            }
+            FILTER_WIDE(&part, row, (int)count, number);
             for (int l = 0; l < count; l++)
-                if (reached[row + l] == c->samples && number[l] < part.samples) {
+                if (number[l] < part.samples) {
                     reached[row + l] = k + number[l];
                     left = 1;
                 }
-            row += count;
         }
     }
     return left;

@@ -69,7 +69,7 @@ static inline void AT_WIDTH(add_density)(const struct plan *plan, double w, lane
 }
 
 /* Move P over a Runge-Kutta step, as said for move_moments. */
-static inline void AT_WIDTH(add_noisy_step)(const struct plan *plan, double h,
+SEPARATE void AT_WIDTH(add_noisy_step)(const struct plan *plan, double h,
                                             const lanes *restrict F, const lanes *restrict A_first,
                                             const lanes *restrict A_last, lanes *restrict P)
 {
@@ -143,7 +143,7 @@ static inline void AT_WIDTH(move)(const struct interval *over, lanes *restrict x
    start, the middle and the end of a step. Psi at the middle of a step is the cubic
    Hermite polynomial through its values and slopes -Psi A at the ends. If ``F`` is given, it is
    multiplied by the Jacobian. */
-static inline void AT_WIDTH(move_moments)(const struct interval *over, lanes *restrict x,
+SEPARATE void AT_WIDTH(move_moments)(const struct interval *over, lanes *restrict x,
                                           lanes *restrict P, lanes *restrict F)
 {
     lanes step_F[NX * NX], A_first[NX * NX], A_last[NX * NX];
