@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import ctypes
 import inspect
+from ctypes import addressof
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimates, State
+from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.square_root import carried
 from pinnobs_gym.simulation.kernels.calls import CallStructure, Plan, address
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary, plant_library
@@ -32,34 +34,20 @@ _LAYOUTS = 16
 """Number of layouts that are kept, one for each number of rows."""
 
 
-class Packed:
-    """The arrays of a `State` in one buffer, in the layout of compiled code. A copy of a state in
-    another process or place has none."""
-
-    __slots__ = ("buffer", "start")
-
-    def __init__(self, buffer: np.ndarray, start: int) -> None:
-        self.buffer = buffer
-        """The buffer, which has to live as long as its address is used."""
-        self.start = start
-        """Its address."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
-
-
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Where a buffer has the time, outputs, inputs, estimates, covariances, innovations and their
-    covariances of a batch, and the numbers by which compiled code marks rows; see ``update`` in
-    ``templates/filter.c``."""
+    """A buffer that has all arrays of a state one after the other: the time, outputs, inputs,
+    estimates, covariances, innovations and their covariances of a batch, and the numbers by which
+    compiled code marks rows; see ``update`` in ``templates/filter.c``."""
 
-    size: int
-    """Number of entries."""
-    ends: tuple[int, ...]
-    """Index of the first entry after each part but the last, in the order above."""
+    buffer: type[ctypes.Array[ctypes.c_double]]
+    """The type of the buffer."""
+    u: int
+    """Position of the inputs in bytes."""
     views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
     """Shape, position in bytes and strides of the estimates (batch, nx) and so on."""
+    marks: int
+    """Position of the numbers that mark rows in bytes."""
 
 
 def compiled_filter(estimator: RecursiveEstimator) -> CompiledFilter | str:
@@ -110,11 +98,13 @@ class CompiledFilter:
         values = [getattr(system, name) for name in made.numbers]
         self._rows = np.broadcast_shapes((1,), *(np.shape(value) for value in values))[0]
         self._plan = self._planned(estimator, estimator.noise.R(0.0)[None])
-        self._at = ctypes.addressof(self._plan.structure)
         self._layouts: dict[int, _Layout] = {}
         self._run, self._update = made.code.run, made.code.update
         self._run.argtypes = [ctypes.c_void_p] * 2
-        self._update.argtypes = [ctypes.c_void_p, *[ctypes.c_int64] * 2, *[ctypes.c_void_p] * 3]
+        self._update.argtypes = [
+            *(ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_double),
+            *[ctypes.c_void_p] * 5,
+        ]
         self._run.restype = self._update.restype = ctypes.c_int64
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State | None:
@@ -122,46 +112,42 @@ class CompiledFilter:
         of `Estimator.update`."""
         batch = len(state.xhat)
         layout = self._layouts.get(batch) or self._layout(batch)
-        if self._rows not in (1, batch):
+        if state.P is None or self._rows not in (1, batch):
             return None
         before = state.packed
-        if before is None:
-            if state.P is None:
-                return None
+        if type(before) is not layout.buffer:
             before = self._packed(state, layout)
-        # All arrays are parts of one buffer, whose address is found once.
-        ends = layout.ends
-        buffer: Any = np.empty(layout.size)
-        start = ctypes.addressof(ctypes.c_double.from_buffer(buffer))
-        if batch == 1:
-            buffer[0] = t
-            buffer[1 : ends[1]] = y[0]
-            if ends[2] > ends[1]:
-                buffer[ends[1] : ends[2]] = u[0]
-        else:
-            _fill(buffer, layout, t, y, u)
-        at, plan = self._at, None
+        # All arrays of the next state are parts of one buffer, whose address is found once.
+        buffer = layout.buffer()
+        plan = self._plan
         if self._by_sample:
-            plan = self._plan.with_R(self._estimator.noise.R(t)[None])
-            at = ctypes.addressof(plan.structure)
+            plan = plan.with_R(self._estimator.noise.R(t)[None])
         memory, arrays = self._estimator.carried_memory(state)
         more = _call_with(arrays) if arrays else None
         left = self._update(
-            at,
+            addressof(plan.structure),
             batch,
             state.t is None,
-            start,
-            before.start,
-            None if more is None else ctypes.addressof(more),
+            t,
+            _contiguous(y),
+            _contiguous(u) if self._sizes[2] else None,
+            addressof(buffer),
+            addressof(before),
+            addressof(more) if more else None,
         )
         x, P, innovation, S = [
             np.ndarray(shape, _DOUBLE, buffer, place, strides)
             for shape, place, strides in layout.views
         ]
-        after = State(x, t, u, P, innovation, S, memory, state.root)
+        # The attributes are set at once, in a quarter of the time that State(...) takes.
+        after = object.__new__(State)
+        after.__dict__.update(
+            xhat=x, t=t, u=u, P=P, innovation=innovation, S=S, memory=memory, root=state.root
+        )
         if left or state.root is not None:
-            return self._completed(state, after, y, buffer[ends[-1] :].view(np.int64) == 0)
-        vars(after)["packed"] = Packed(buffer, start)
+            marks = np.ndarray((batch,), np.int64, buffer, layout.marks)
+            return self._completed(state, after, y, marks == 0)
+        after.__dict__["packed"] = buffer
         return after
 
     def run(self, record: Record) -> Estimates | None:
@@ -276,9 +262,9 @@ class CompiledFilter:
         if before.t is not None:
             names, given = [*names, "t_before", "u_before"], [*given, *earlier[:2]]
         call = _call_with(arrays | dict(zip(names, given, strict=True)))
-        call.plan, call.batch, call.samples = ctypes.addressof(plan.structure), len(rows), n - first
+        call.plan, call.batch, call.samples = addressof(plan.structure), len(rows), n - first
         stopped = np.empty(len(rows), dtype=np.int64)
-        self._run(ctypes.addressof(call), address(stopped))
+        self._run(addressof(call), address(stopped))
         reached[rows] = first + stopped
         if whole:
             return replace(state, memory=memory)
@@ -305,6 +291,8 @@ class CompiledFilter:
         t, y, u = float(record.t[k]), record.y[rows, k], record.u[rows, k]
         with np.errstate(all="ignore"):
             part = estimator.update_by_numpy(before, t, y, u)
+        if (box := estimator.system.state_box) is not None:
+            part = kept_inside(part, box)
         for name in _FIELDS:
             results[name][k][..., rows] = np.moveaxis(getattr(part, name), 0, -1)
         return self._with_rows(state, rows, part)
@@ -331,39 +319,43 @@ class CompiledFilter:
         nx, ny, nu = self._sizes
         shapes = [(nx,), (nx, nx), (ny,), (ny, ny)]
         sizes = [1, ny * batch, nu * batch, *(batch * int(np.prod(shape)) for shape in shapes)]
-        ends = np.cumsum(sizes).tolist()
+        ends = [8 * int(end) for end in np.cumsum(sizes)]
         views = []
-        for shape, first in zip(shapes, ends[2:], strict=False):
+        for shape, place in zip(shapes, ends[2:], strict=False):
             array = np.moveaxis(np.empty((*shape, batch)), -1, 0)
-            views.append((array.shape, 8 * first, array.strides))
-        layout = _Layout(ends[-1] + batch, tuple(ends), tuple(views))
+            views.append((array.shape, place, array.strides))
+        kind = ctypes.c_double * (ends[-1] // 8 + batch)
+        buffer = type("Packed", (kind,), {"__reduce__": _left_behind})
+        layout = _Layout(buffer, ends[1], tuple(views), ends[-1])
         if len(self._layouts) < _LAYOUTS:
             self._layouts[batch] = layout
         return layout
 
-    def _packed(self, state: State, layout: _Layout) -> Packed:
+    def _packed(self, state: State, layout: _Layout) -> ctypes.Array[ctypes.c_double]:
         """Return the arrays of a state in a buffer."""
-        buffer: Any = np.zeros(layout.size)
-        start = ctypes.addressof(ctypes.c_double.from_buffer(buffer))
+        buffer, nu = layout.buffer(), self._sizes[2]
         if state.t is not None:
             buffer[0] = state.t
-        if state.u is not None and self._sizes[2]:
-            first, last = layout.ends[1:3]
-            buffer[first:last].reshape(self._sizes[2], -1)[:] = np.asarray(state.u).T
+        if state.u is not None and nu:
+            np.ndarray((nu, len(state.xhat)), _DOUBLE, buffer, layout.u)[:] = np.asarray(state.u).T
         for value, (shape, place, strides) in zip(
             (state.xhat, state.P), layout.views, strict=False
         ):
             np.ndarray(shape, _DOUBLE, buffer, place, strides)[:] = value
-        return Packed(buffer, start)
+        return buffer
 
 
-def _fill(buffer: np.ndarray, layout: _Layout, t: float, y: np.ndarray, u: np.ndarray) -> None:
-    """Write a sample into a buffer."""
-    ends = layout.ends
-    buffer[0] = t
-    buffer[1 : ends[1]].reshape(-1, len(y))[:] = np.asarray(y).T
-    if ends[2] > ends[1]:
-        buffer[ends[1] : ends[2]].reshape(-1, len(y))[:] = np.asarray(u).T
+def _left_behind(self: Any) -> tuple[Any, ...]:
+    """Return what is copied or pickled in place of a buffer: None, because its address holds in its
+    own place and process only."""
+    return type(None), ()
+
+
+def _contiguous(array: np.ndarray) -> bytes:
+    """Return the numbers of an array (batch, n) with the batch last."""
+    if getattr(array, "dtype", None) is not _DOUBLE:
+        array = np.asarray(array, dtype=float)
+    return array.T.tobytes()
 
 
 def _call_with(arrays: dict[str, np.ndarray]) -> CallStructure:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System
-
-if TYPE_CHECKING:
-    from pinnobs_gym.estimation.compiled import Packed
 
 
 @dataclass(frozen=True)
@@ -45,9 +42,9 @@ class State:
     root: np.ndarray | None = None
     """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
     `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
-    packed: Packed | None = field(default=None, init=False, repr=False, compare=False)
-    """The same arrays in the layout of compiled code, if it computed them. A state with a value
-    replaced has none."""
+    packed: Any = field(default=None, init=False, repr=False, compare=False)
+    """The buffer of which the arrays are views, if compiled code computed them. A state with a
+    value replaced has none, nor has one that is copied or comes from another process."""
 
 
 @dataclass(frozen=True)

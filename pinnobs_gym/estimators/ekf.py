@@ -161,4 +161,4 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         assert self.huber is not None
         std = np.sqrt(np.einsum("iib->ib", innovation_covariance(P, H, R)))
         excess = np.maximum(abs(innovation.T) / (self.huber * std), 1.0)
-        return R * excess[:, None]
+        return R * np.sqrt(excess[:, None] * excess)  # correlations stay

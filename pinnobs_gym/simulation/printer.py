@@ -158,7 +158,11 @@ class Printer:
 
     def _pieces(self, e: Any) -> str:
         x, number, order = e.args
-        return f"table{number}_{order}({self.code(x)})"
+        return f"{self.table(int(number), int(order))}({self.code(x)})"
+
+    def table(self, number: int, order: int) -> str:
+        """Return the name of the function that evaluates a derivative of a table."""
+        return f"table{number}_{order}"
 
     def _step(self, e: Any) -> str:
         return self.call("heaviside", [self.code(e.args[0]), "0.5"])

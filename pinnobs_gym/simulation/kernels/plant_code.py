@@ -56,9 +56,8 @@ class CPrinter(Printer):
     def line(self, name: str, code: str) -> str:
         return f"const double {name} = {code};"
 
-    def _pieces(self, e: Any) -> str:
-        x, number, order = e.args
-        return f"{self._tables}{number}_{order}({self.code(x)})"
+    def table(self, number: int, order: int) -> str:
+        return f"{self._tables}{number}_{order}"
 
 
 @dataclass(frozen=True)

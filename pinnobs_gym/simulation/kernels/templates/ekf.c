@@ -50,17 +50,18 @@ SEPARATE void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, i
         if (restarted) AT_WIDTH(output_moments)(H, P, R, HP, S);
     }
     if (plan->huber) { /* enlarge variances of outputs with large innovations */
-        for (int i = 0; i < NY; i++) {
-            double excess[W];
-            EACH_LANE excess[l] =
+        lanes excess[NY];
+        for (int i = 0; i < NY; i++)
+            EACH_LANE excess[i][l] =
                 maximum(fabs(e[i][l]) / (plan->huber * sqrt(S[i * NY + i][l])), 1.0);
+        for (int i = 0; i < NY; i++)
             for (int j = 0; j < NY; j++)
                 EACH_LANE {
-                    const double more = R[i * NY + j][l] * excess[l];
+                    const double more =
+                        R[i * NY + j][l] * sqrt(excess[i][l] * excess[j][l]); /* as correlated */
                     S[i * NY + j][l] += more - R[i * NY + j][l];
                     R[i * NY + j][l] = more;
                 }
-        }
     }
     AT_WIDTH(kalman_update)(H, HP, S, R, e, x, P, rest);
     AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);

@@ -74,29 +74,33 @@ int64_t run(const struct call *c, int64_t *reached)
 }
 
 /* Filter one sample. Buffers hold one after the other t, y, u, x, P, the innovation, S, and the
-   numbers of ``reached``, with the batch as the last axis: ``to`` with the sample's t, y and u, and
-   ``from`` the sample before. If this is the first sample, x and P of ``from`` are predictions.
-   ``more`` has further arrays, or is NULL. */
-int64_t update(const struct plan *plan, int64_t batch, int64_t first, double *to,
-               const double *from, const struct call *more)
+   numbers of ``reached``, with the batch as the last axis. ``from`` is that of the sample before; if
+   this is the first sample, x and P of it are predictions. ``more`` has further arrays, or is
+   NULL. */
+int64_t update(const struct plan *plan, int64_t batch, int64_t first, double t, const double *y,
+               const double *u, double *to, const double *from, const struct call *more)
 {
-    const int64_t u = 1 + NY * batch, x = u + NU * batch, P = x + NX * batch,
-                  e = P + NX * NX * batch, S = e + NY * batch, end = S + NY * NY * batch;
+    double *const to_y = to + 1, *const to_u = to_y + NY * batch, *const x = to_u + NU * batch,
+                  *const P = x + NX * batch, *const e = P + NX * NX * batch,
+                  *const S = e + NY * batch, *const end = S + NY * NY * batch;
     struct call c = {0};
     if (more) c = *more;
     c.plan = plan;
     c.batch = batch;
     c.samples = 1;
+    to[0] = t;
+    for (int64_t i = 0; i < NY * batch; i++) to_y[i] = y[i];
+    for (int64_t i = 0; i < NU * batch; i++) to_u[i] = u[i];
     c.t = to;
-    c.y = to + 1;
-    c.u = to + u;
-    c.x = to + x;
-    c.P = to + P;
-    c.innovation = to + e;
-    c.S = to + S;
+    c.y = to_y;
+    c.u = to_u;
+    c.x = x;
+    c.P = P;
+    c.innovation = e;
+    c.S = S;
     c.t_before = first ? NULL : from;
-    c.u_before = from + u;
-    c.x_before = from + x;
-    c.P_before = from + P;
-    return run(&c, (int64_t *)(to + end));
+    c.u_before = from + (to_u - to);
+    c.x_before = from + (x - to);
+    c.P_before = from + (P - to);
+    return run(&c, (int64_t *)end);
 }
