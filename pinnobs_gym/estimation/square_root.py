@@ -15,9 +15,9 @@ from __future__ import annotations
 import numpy as np
 
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.matrices import cholesky
 from pinnobs_gym.simulation.record import Prior
-from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.system import System, output_scale, vector
 
 WIDE = 1e5

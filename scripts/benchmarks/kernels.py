@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,6 +34,8 @@ ASKED = {1: 150.0, 256: 10.0}
 ASKED_OF_JAX = {1: 5.0, 256: 8.0}
 ASKED_OF_MOTOR = {1: 5.0, 256: 5.0}
 """The same of dynamax."""
+T = TypeVar("T", bound=RecursiveEstimator)
+
 PLAYED = 64
 """Number of different episodes; a larger batch repeats them."""
 _COMPILATION = """
@@ -80,7 +83,7 @@ def repeated(name: str, batch: int, samples: int) -> Record:
     return replace(record, t=record.t[:n], y=record.y[:, :n].copy(), u=record.u[:, :n].copy())
 
 
-def pair(name: str, cls: type[RecursiveEstimator]) -> list[RecursiveEstimator]:
+def pair(name: str, cls: type[T]) -> list[T]:
     """Return an estimator in NumPy, and the same in compiled code."""
     made = []
     for kernels in ("0", "1"):
@@ -155,7 +158,7 @@ def update(name: str, cls: type[RecursiveEstimator], repeats: int) -> Figure:
 
 def against_dynamax(name: str, repeats: int) -> Iterator[Figure]:
     """Compare the EKF with dynamax's, with the same model and Runge-Kutta steps."""
-    from benchmarks.jax_peers import dynamax_ekf
+    from jax_peers import dynamax_ekf
 
     fast = pair(name, EKF)[1]
     asked = ASKED_OF_MOTOR if name == "InductionMotor" else ASKED_OF_JAX

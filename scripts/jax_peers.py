@@ -1,4 +1,4 @@
-"""Filters of JAX libraries for a system, as functions of a record. This is no group of figures."""
+"""Filters of JAX libraries for a system, as functions of a record."""
 
 from __future__ import annotations
 
