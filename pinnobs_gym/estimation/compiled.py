@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import inspect
+import math
 from ctypes import addressof
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -162,7 +163,7 @@ class CompiledFilter:
         if self._rows not in (1, batch) or rooted.all():
             return None
         shapes = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
-        results = {name: np.empty((n, *shapes[name], batch)) for name in _FIELDS}
+        results = _empty({name: (n, *shapes[name], batch) for name in _FIELDS})
         # For each row, the number of the sample that NumPy has to process, n if there is none
         reached = np.where(rooted, 0, n)
         state = self._through(record, np.flatnonzero(~rooted), 0, state, results, reached)
@@ -358,6 +359,14 @@ def _contiguous(array: np.ndarray) -> bytes:
     if getattr(array, "dtype", None) is not _DOUBLE:
         array = np.asarray(array, dtype=float)
     return array.T.tobytes()
+
+
+def _empty(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """Return empty arrays of some shapes. They are views of a single one, because only large arrays
+    are allocated in large memory pages, whose first access takes less time."""
+    sizes = [math.prod(shape) for shape in shapes.values()]
+    parts = np.split(np.empty(sum(sizes)), np.cumsum(sizes)[:-1])
+    return {name: part.reshape(shapes[name]) for name, part in zip(shapes, parts, strict=True)}
 
 
 def _call_with(arrays: dict[str, np.ndarray]) -> CallStructure:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.matrices import cholesky
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System, output_scale, vector
@@ -23,6 +24,9 @@ WIDE = 1e5
 """Ratio of standard deviations, of the prior over the state's scale to the noise over the output's
 scale, beyond which an episode is carried by roots. Covariances then lose up to ten of their digits
 in the first update alone."""
+
+
+_output_scale = cached_by_plant(output_scale)
 
 
 def prior_root(system: System, prior: Prior, R: np.ndarray) -> np.ndarray | None:
@@ -36,7 +40,7 @@ def prior_root(system: System, prior: Prior, R: np.ndarray) -> np.ndarray | None
     """
     scale = vector(system.scale, system.nx, "scale")
     widest = np.sqrt(np.einsum("bii->bi", prior.cov)) / scale
-    noise = np.sqrt(np.einsum("iib->bi", R)) / output_scale(system)
+    noise = np.sqrt(np.einsum("iib->bi", R)) / _output_scale(system)
     wide = (widest > WIDE * noise.min(axis=1, keepdims=True)).any(axis=1)
     if not wide.any():
         return None

@@ -4,7 +4,8 @@ faster.
 Sums are formed in the order of the index, in batches of any size, so that the result of a row is
 the same to the last bit alone and in any batch. `numpy.einsum` does so in batches of several rows,
 where its innermost loop is over the batch. In a batch of one row its innermost loop may be over the
-index of the sum, which is then split into parts. BLAS chooses the order by the shape.
+index of the sum, which is then split into parts. Large products are formed by BLAS, which chooses
+the order by the shape, one matrix at a time.
 
 Functions annotated with `Array` take NumPy arrays and torch tensors, and preserve gradients.
 """
@@ -26,6 +27,8 @@ einsum = inspect.unwrap(np.einsum)
 """`numpy.einsum` for NumPy arrays alone: without its dispatch to other libraries, which takes a
 third of the time of a product of small matrices."""
 
+_BLAS = 8
+"""Number of rows or columns of a product from which it is formed by BLAS, which takes less time."""
 JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
 """Relative amounts added to the variances, in turn, until a covariance has a Cholesky factor."""
 
@@ -45,6 +48,8 @@ def sandwich(M: Array, P: Array) -> Array:
 
 def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return ABᵀ, shape (n, k, batch), for A (n, m, batch) and B (k, m, batch)."""
+    if max(len(A), len(B)) >= _BLAS:
+        return _by_blas(A, B.swapaxes(0, 1))
     if A.shape[-1] > 1:
         return einsum("imb,jmb->ijb", A, B)
     return np.add.accumulate(A[:, None] * B, axis=2)[:, :, -1]
@@ -150,17 +155,31 @@ def squared_size(innovation: np.ndarray, S: np.ndarray) -> np.ndarray:
 def product(a: Array, b: Array) -> Array:
     """Return the matrix products (n, m, batch) of (n, k, batch) and (k, m, batch). For small
     matrices this is several times faster than with the batch first."""
-    _, terms, batch = a.shape
+    rows, terms, batch = a.shape
     if terms == 1:
         return a * b
     if not isinstance(a, np.ndarray):
         return (a[:, :, None] * b[None]).sum(1)
+    if max(rows, b.shape[1]) >= _BLAS:
+        return _by_blas(a, b)
     if batch > 1 or terms == 2:
         return einsum("ijb,jkb->ikb", a, b)
     if b.shape[1] == 1:
         return np.add.accumulate(a * b[:, 0], axis=1)[:, -1:]
     # With rows of b contiguous in memory, the innermost loop is over k.
     return einsum("ijb,jkb->ikb", a, np.ascontiguousarray(b))
+
+
+def _by_blas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the products (n, m, batch) of `product` by BLAS. Each is formed by itself from
+    contiguous matrices, so that it does not depend on the others.
+
+    The batch is first in the memory of large results, so that further products need no copy. It is
+    last in that of small ones: `numpy.einsum`, which may use them, sums in order only then.
+    """
+    first, second = (np.ascontiguousarray(part.transpose(2, 0, 1)) for part in (a, b))
+    result = np.matmul(first, second).transpose(1, 2, 0)
+    return result if min(result.shape[:2]) >= _BLAS else np.ascontiguousarray(result)
 
 
 def mapped(M: np.ndarray, v: np.ndarray) -> np.ndarray:

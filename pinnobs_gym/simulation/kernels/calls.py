@@ -23,6 +23,7 @@ class PlanStructure(ctypes.Structure):
 
     _fields_ = [
         *(("p", _POINTER), ("p_rows", _INT), ("L", _POINTER), ("m", _INT)),
+        *(("D", _POINTER), ("diagonal", _INT)),
         *(("R", _POINTER), ("R_samples", _INT), ("R_rows", _INT)),
         *(("longest", _DOUBLE), ("breaks", _POINTER), ("num_breaks", _INT)),
         *(("input", _INT), ("discrete", _INT)),
@@ -80,6 +81,8 @@ class Plan:
         breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
         measured = {"previous": 1, "linear": 2}[system.input_hold]
         plan.set(p=p, L=L, breaks=breaks, output_period=_periods(system.output_period))
+        D = L @ L.T
+        plan.set(D=D, diagonal=int(not (D - np.diag(np.diag(D))).any()))
         plan.set(state_period=_periods(system.state_period))
         box = system.state_box
         plan.set(low=None if box is None else box.low, high=None if box is None else box.high)

@@ -9,6 +9,7 @@ from typing import Any
 
 import sympy
 
+from pinnobs_gym.simulation.kernels.step_code import LARGEST, step_functions
 from pinnobs_gym.simulation.plant_form import PlantForm
 from pinnobs_gym.simulation.printer import Printer
 from pinnobs_gym.simulation.system import System
@@ -68,6 +69,8 @@ class PlantCode:
     """Sizes and tables, and ``plant_input``."""
     lanes: str
     """The functions ``plant_f`` and so on, for W lanes; see ``templates/lanes.h``."""
+    steps: str
+    """The functions of ``templates/steps.h``, for W lanes; empty if they are made by loops."""
     numbers: tuple[str, ...]
     """The attributes of the system that the functions take as numbers, in their order."""
 
@@ -105,7 +108,11 @@ def plant_code(form: PlantForm) -> PlantCode:
         ),
     ]
     once = "\n".join([*parts, _input_function(traces["input"])])
-    return PlantCode(once, "\n\n".join(functions), numbers)
+    steps = []
+    if system.nx <= LARGEST:
+        once += "\n#define STRAIGHT"
+        steps = step_functions(traces["f"], traces["h"], CPrinter)
+    return PlantCode(once, "\n\n".join(functions), "\n\n".join(steps), numbers)
 
 
 def _sizes(system: System, numbers: int) -> str:

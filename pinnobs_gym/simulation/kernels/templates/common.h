@@ -3,6 +3,13 @@
 #include <stdint.h>
 #include <string.h>
 
+/* A function whose code is not repeated where it is called, for the sake of compile time */
+#if defined(__GNUC__)
+#define SEPARATE static __attribute__((noinline))
+#else
+#define SEPARATE static
+#endif
+
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 
 /* NumPy's functions, NaN included, that C does not have. */
@@ -36,6 +43,8 @@ struct plan {
     int64_t p_rows;           /* 1, or 0 if p is the same in all rows */
     const double *L;          /* process noise, (NX, m) */
     int64_t m;
+    const double *D;          /* L L^T, (NX, NX) */
+    int64_t diagonal;         /* 1 if D is diagonal */
     const double *R;          /* output noise, (1 or samples, NY, NY, 1 or batch) */
     int64_t R_samples;        /* 1, or 0 if R is the same at all samples */
     int64_t R_rows;           /* 1, or 0 if R is the same in all rows */

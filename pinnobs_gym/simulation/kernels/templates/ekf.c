@@ -2,12 +2,14 @@
 
 /* Correct x and P by the outputs of sample k. Lanes that NumPy has to correct are marked in
    ``bad``. */
-static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
+SEPARATE void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
                                     int64_t row, int count, lanes *restrict x, lanes *restrict P,
-                                    int64_t *restrict beyond, int64_t *restrict bad)
+                                    const int64_t *restrict lost, int64_t *restrict beyond,
+                                    int64_t *restrict bad)
 {
     const struct plan *plan = c->plan;
     lanes t, y[NY], u[LU], e[NY], H[NY * NX], R[NY * NY], S[NY * NY], HP[NY * NX];
+    double rest[W];
     EACH_LANE t[l] = c->t[k];
     AT_WIDTH(load)(NY, c->y + k * NY * c->batch, c->batch, row, count, y);
     AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, u);
@@ -22,10 +24,7 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
         for (int j = 0; j < NX; j++)
             EACH_LANE H[i * NX + j][l] = y[i][l] != y[i][l] ? 0 : H[i * NX + j][l];
     }
-    /* S = H P H^T + R */
-    AT_WIDTH(product)(NY, NX, NX, H, P, HP);
-    AT_WIDTH(outer)(NY, NX, NY, HP, H, S);
-    for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
+    AT_WIDTH(output_moments)(H, P, R, HP, S);
     if (plan->gate) { /* restart rows that were beyond the gate for long */
         lanes Se[NY];
         int restarted = 0;
@@ -48,11 +47,7 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
                 restarted = 1;
             }
         }
-        if (restarted) {
-            AT_WIDTH(product)(NY, NX, NX, H, P, HP);
-            AT_WIDTH(outer)(NY, NX, NY, HP, H, S);
-            for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
-        }
+        if (restarted) AT_WIDTH(output_moments)(H, P, R, HP, S);
     }
     if (plan->huber) { /* enlarge variances of outputs with large innovations */
         lanes excess[NY];
@@ -68,46 +63,29 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
                     R[i * NY + j][l] = more;
                 }
     }
-    /* K = P H^T S^-1 */
-    lanes K[NX * NY];
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NY; j++) EACH_LANE K[i * NY + j][l] = HP[j * NX + i][l];
-    AT_WIDTH(divide)(NX, S, K, bad);
-    /* x = x + K e, and P = (I - K H) P (I - K H)^T + K R K^T */
-    lanes M[NX * NX], KR[NX * NY], own[NX * NX];
-    AT_WIDTH(product)(NX, NY, NX, K, H, M);
-    for (int i = 0; i < NX * NX; i++) EACH_LANE M[i][l] = -M[i][l];
-    for (int i = 0; i < NX; i++) EACH_LANE M[i * NX + i][l] += 1;
-    AT_WIDTH(sandwich)(NX, M, P);
-    AT_WIDTH(product)(NX, NY, NY, K, R, KR);
-    AT_WIDTH(symmetric)(NX, NY, KR, K, own);
-    for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += own[i][l];
-    for (int i = 0; i < NX; i++) {
-        double step[W];
-        EACH_LANE step[l] = K[i * NY][l] * e[0][l];
-        for (int j = 1; j < NY; j++) EACH_LANE step[l] += K[i * NY + j][l] * e[j][l];
-        EACH_LANE x[i][l] += step[l];
-    }
+    AT_WIDTH(kalman_update)(H, HP, S, R, e, x, P, rest);
     AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
     AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
+    EACH_LANE bad[l] |= (rest[l] != 0) & !lost[l];
     AT_WIDTH(mark_outside)(plan, x, bad);
 }
 
 /* Filter W rows, of which ``count`` exist. ``reached`` is set to the number of the sample that NumPy
    has to do in each, or the number of samples. */
-static void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
+SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
                                   int64_t *restrict reached)
 {
     const struct plan *plan = c->plan;
     lanes p[LP], x[NX], P[NX * NX], F[NX * NX];
     struct interval over = {.plan = plan, .p = p};
-    int64_t beyond[W], bad[W];
+    int64_t beyond[W], bad[W], lost[W];
     EACH_LANE bad[l] = 0;
     for (int l = 0; l < count; l++) reached[l] = c->samples;
     EACH_LANE beyond[l] = plan->gate ? c->beyond[row + MIN(l, count - 1)] : 0;
     AT_WIDTH(load)(NP, plan->p, plan->p_rows ? c->batch : 0, row, count, p);
     AT_WIDTH(load)(NX, c->x_before, c->batch, row, count, x);
     AT_WIDTH(load)(NX * NX, c->P_before, c->batch, row, count, P);
+    AT_WIDTH(find_lost)(x, P, lost);
     if (c->t_before) AT_WIDTH(load)(NU, c->u_before, c->batch, row, count, over.u1);
     for (int64_t k = 0; k < c->samples; k++) {
         const double *before = k ? c->t + k - 1 : c->t_before;
@@ -133,7 +111,7 @@ static void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
             AT_WIDTH(store)(NX * NX, P, c->P_predicted + k * NX * NX * c->batch, c->batch, row,
                             count);
         }
-        AT_WIDTH(correct)(c, p, k, row, count, x, P, beyond, bad);
+        AT_WIDTH(correct)(c, p, k, row, count, x, P, lost, beyond, bad);
         if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
         AT_WIDTH(store)(NX, x, c->x + k * NX * c->batch, c->batch, row, count);
         AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * c->batch, c->batch, row, count);

@@ -1,18 +1,74 @@
 /* The entries. */
 
-/* Filter the rows in groups of WIDE lanes, or one by one if they are few. ``reached`` (batch,) is
-   set to the number of the sample that NumPy has to do in each row, or the number of samples.
-   Returns 0 if there is none to do. */
+/* Number of entries of results that are written before others: about a quarter of a megabyte */
+#define CACHED 32768
+
+/* Return the call of the samples from one on. */
+static struct call later(const struct call *c, int64_t k)
+{
+    struct call part = *c;
+    const int64_t rows = k * c->batch;
+    if (k == 0) return part;
+    part.t += k;
+    part.y += rows * NY;
+    part.u += rows * NU;
+    part.x += rows * NX;
+    part.P += rows * NX * NX;
+    part.innovation += rows * NY;
+    part.S += rows * NY * NY;
+    if (c->x_predicted) {
+        part.x_predicted += rows * NX;
+        part.P_predicted += rows * NX * NX;
+        part.F += rows * NX * NX;
+    }
+    part.t_before = part.t - 1;
+    part.u_before = part.u - c->batch * NU;
+    part.x_before = part.x - c->batch * NX;
+    part.P_before = part.P - c->batch * NX * NX;
+    return part;
+}
+
+/* Return the number of rows from one on, at most WIDE, that are filtered side by side: those up to
+   the next that has been left to NumPy; -1 if this is one. */
+static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t samples)
+{
+    int64_t count = 0;
+    const int64_t most = MIN(batch - row, WIDE);
+    while (count < most && reached[row + count] == samples) count++;
+    return count ? count : -1;
+}
+
+/* Filter the rows in groups of WIDE lanes. ``reached`` (batch,) is set to the number of the sample that NumPy has to do in each row, or the number of samples.
+   Returns 0 if there is none to do.
+
+   All rows are filtered through some samples, whose results stay in the cache while they are
+   written, before the next samples. */
 int64_t run(const struct call *c, int64_t *reached)
 {
+    const int64_t entries = c->batch * (NX + NX * NX + NY + NY * NY);
+    const int64_t fitting = CACHED / entries, block = fitting < 8 ? 8 : fitting;
     int64_t left = 0;
-    for (int64_t row = 0; row < c->batch;) {
-        const int64_t rest = c->batch - row;
-        const int count = rest < 3 ? 1 : (int)MIN(rest, WIDE);
-        if (count == 1) filter_rows_1(c, row, 1, reached + row);
-        else FILTER_WIDE(c, row, count, reached + row);
-        for (int l = 0; l < count; l++) left |= reached[row + l] < c->samples;
-        row += count;
+    for (int64_t row = 0; row < c->batch; row++) reached[row] = c->samples;
+    for (int64_t k = 0; k < c->samples; k += block) {
+        struct call part = later(c, k);
+        struct plan plan = *c->plan;
+        plan.R += k * plan.R_samples * NY * NY * (plan.R_rows ? c->batch : 1);
+        part.plan = &plan;
+        part.samples = MIN(block, c->samples - k);
+        for (int64_t row = 0, count; row < c->batch; row += count) {
+            int64_t number[WIDE];
+            count = group(reached, row, c->batch, c->samples);
+            if (count < 0) { /* the row has stopped */
+                count = 1;
+                continue;
+            }
+            FILTER_WIDE(&part, row, (int)count, number);
+            for (int l = 0; l < count; l++)
+                if (number[l] < part.samples) {
+                    reached[row + l] = k + number[l];
+                    left = 1;
+                }
+        }
     }
     return left;
 }

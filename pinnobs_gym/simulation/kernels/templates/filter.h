@@ -65,6 +65,19 @@ static inline void AT_WIDTH(divide)(int n, const lanes *restrict S, lanes *restr
     AT_WIDTH(mark_without_root)(NY, S, root, bad);
 }
 
+/* Find the rows whose state and covariance are NaN throughout. They remain so. Rows in which some
+   values are not finite are left to NumPy, where the others become so in the order in which dense
+   products carry them. */
+static inline void AT_WIDTH(find_lost)(const lanes *restrict x, const lanes *restrict P,
+                                       int64_t *restrict lost)
+{
+    EACH_LANE {
+        lost[l] = 1;
+        for (int i = 0; i < NX; i++) lost[l] &= x[i][l] != x[i][l];
+        for (int i = 0; i < NX * NX; i++) lost[l] &= P[i][l] != P[i][l];
+    }
+}
+
 /* Mark the lanes in which a state is outside of its bounds. */
 static inline void AT_WIDTH(mark_outside)(const struct plan *plan, const lanes *restrict x,
                                           int64_t *restrict bad)

@@ -27,17 +27,6 @@ static inline void AT_WIDTH(input_at)(const struct interval *over, double t, dou
     }
 }
 
-/* A step of the classical Runge-Kutta method: its times, inputs and length. */
-#define rk_step AT_WIDTH(rk_step)
-struct rk_step {
-    double h;
-    lanes t[3];
-    lanes u[3][LU];           /* at the start, the middle and the end */
-};
-
-static const int AT_WIDTH(stage)[4] = {0, 1, 1, 2};
-#define STAGE AT_WIDTH(stage)
-
 static inline void AT_WIDTH(set_step)(const struct interval *over, double start, double step,
                                       int64_t k, double last, struct rk_step *s)
 {
@@ -52,52 +41,6 @@ static inline void AT_WIDTH(set_step)(const struct interval *over, double start,
         }
         AT_WIDTH(input_at)(over, t, (t - over->t0) / whole, s->u[i]);
     }
-}
-
-/* x at the end of a step, from x at its start. */
-static inline void AT_WIDTH(runge_kutta)(const struct rk_step *s, const lanes *p, lanes *restrict x)
-{
-    lanes k[4][NX], point[NX];
-    const double h = s->h, part[4] = {0, h / 2, h / 2, h};
-    for (int q = 0; q < 4; q++) {
-        if (q == 0) memcpy(point, x, sizeof point);
-        else
-            for (int i = 0; i < NX; i++) EACH_LANE point[i][l] = part[q] * k[q - 1][i][l] + x[i][l];
-        AT_WIDTH(plant_f)(s->t[STAGE[q]], point, s->u[STAGE[q]], p, k[q]);
-    }
-    for (int i = 0; i < NX; i++)
-        EACH_LANE x[i][l] += h / 6 * ((k[1][i][l] + k[2][i][l]) * 2 + k[0][i][l] + k[3][i][l]);
-}
-
-/* The same, with the Jacobian F (NX, NX) of the step, and those of f at its first and last stage.
-   F integrates the variational equation F' = A F by the same method at the same stages. */
-static inline void AT_WIDTH(runge_kutta_linearised)(const struct rk_step *s, const lanes *p,
-                                                    lanes *restrict x, lanes *restrict F,
-                                                    lanes *restrict A_first,
-                                                    lanes *restrict A_last)
-{
-    lanes k[4][NX], point[NX], A[NX * NX], Phi[NX * NX], K[NX * NX];
-    const double h = s->h, part[4] = {0, h / 2, h / 2, h}, weight[4] = {1, 2, 2, 1};
-    for (int q = 0; q < 4; q++) {
-        if (q == 0) memcpy(point, x, sizeof point);
-        else
-            for (int i = 0; i < NX; i++) EACH_LANE point[i][l] = part[q] * k[q - 1][i][l] + x[i][l];
-        AT_WIDTH(plant_f_linearised)(s->t[STAGE[q]], point, s->u[STAGE[q]], p, k[q],
-                                     q == 0 ? A_first : q == 3 ? A_last : A);
-        if (q == 0) { /* Phi = I at the start */
-            memcpy(K, A_first, sizeof K);
-            for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] = K[i][l];
-        } else {
-            for (int i = 0; i < NX * NX; i++) EACH_LANE Phi[i][l] = part[q] * K[i][l];
-            for (int i = 0; i < NX; i++) EACH_LANE Phi[i * NX + i][l] += 1;
-            AT_WIDTH(product)(NX, NX, NX, q == 3 ? A_last : A, Phi, K);
-            for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] += weight[q] * K[i][l];
-        }
-    }
-    for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] *= h / 6;
-    for (int i = 0; i < NX; i++) EACH_LANE F[i * NX + i][l] += 1;
-    for (int i = 0; i < NX; i++)
-        EACH_LANE x[i][l] += h / 6 * ((k[1][i][l] + k[2][i][l]) * 2 + k[0][i][l] + k[3][i][l]);
 }
 
 /* P = P + B L L^T B^T w for B (NX, NX) */
@@ -122,13 +65,23 @@ static inline void AT_WIDTH(add_noise)(const struct plan *plan, const lanes *res
 /* P = P + w L L^T */
 static inline void AT_WIDTH(add_density)(const struct plan *plan, double w, lanes *restrict P)
 {
-    const int m = (int)plan->m;
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) {
-            double sum = 0;
-            for (int c = 0; c < m; c++) sum += plan->L[i * m + c] * plan->L[j * m + c];
-            EACH_LANE P[i * NX + j][l] += w * sum;
-        }
+    for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += w * plan->D[i];
+}
+
+/* Move P over a Runge-Kutta step, as said for move_moments. */
+SEPARATE void AT_WIDTH(add_noisy_step)(const struct plan *plan, double h,
+                                            const lanes *restrict F, const lanes *restrict A_first,
+                                            const lanes *restrict A_last, lanes *restrict P)
+{
+    lanes twice[NX * NX]; /* two times Psi at the middle */
+    AT_WIDTH(sandwich)(NX, F, P);
+    AT_WIDTH(product)(NX, NX, NX, F, A_first, twice);
+    for (int i = 0; i < NX * NX; i++)
+        EACH_LANE twice[i][l] = (A_last[i][l] - twice[i][l]) * (h / 4) + F[i][l];
+    for (int i = 0; i < NX; i++) EACH_LANE twice[i * NX + i][l] += 1;
+    AT_WIDTH(add_noise)(plan, F, h / 6, P);
+    AT_WIDTH(add_noise)(plan, twice, h / 6, P);
+    AT_WIDTH(add_density)(plan, h / 6, P);
 }
 
 /* The steps of an interval. Runge-Kutta steps are equal, at most the longest, and none crosses a
@@ -186,10 +139,11 @@ static inline void AT_WIDTH(move)(const struct interval *over, lanes *restrict x
 }
 
 /* Move x and its covariance P over an interval: P = F P F^T + Q, where
-   Q = integral of Psi L L^T Psi^T by Simpson's rule. Psi at the middle of a step is the cubic
+   Q = integral of Psi L L^T Psi^T by Simpson's rule, whose weights are 1/6, 4/6 and 1/6 at the
+   start, the middle and the end of a step. Psi at the middle of a step is the cubic
    Hermite polynomial through its values and slopes -Psi A at the ends. If ``F`` is given, it is
    multiplied by the Jacobian. */
-static inline void AT_WIDTH(move_moments)(const struct interval *over, lanes *restrict x,
+SEPARATE void AT_WIDTH(move_moments)(const struct interval *over, lanes *restrict x,
                                           lanes *restrict P, lanes *restrict F)
 {
     lanes step_F[NX * NX], A_first[NX * NX], A_last[NX * NX];
@@ -200,8 +154,7 @@ static inline void AT_WIDTH(move_moments)(const struct interval *over, lanes *re
             AT_WIDTH(input_at)(over, k, (k - over->t0) / (over->t1 - over->t0), u);
             AT_WIDTH(plant_f_linearised)(t, x, u, over->p, next, step_F);
             memcpy(x, next, sizeof next);
-            AT_WIDTH(sandwich)(NX, step_F, P);
-            AT_WIDTH(add_density)(over->plan, 1, P);
+            AT_WIDTH(add_map_step)(over->plan->D, step_F, P);
             if (F) {
                 AT_WIDTH(product)(NX, NX, NX, step_F, F, A_first);
                 memcpy(F, A_first, sizeof A_first);
@@ -213,18 +166,12 @@ static inline void AT_WIDTH(move_moments)(const struct interval *over, lanes *re
     struct rk_step s;
     while (AT_WIDTH(next_step)(over, &at, &s)) {
         AT_WIDTH(runge_kutta_linearised)(&s, over->p, x, step_F, A_first, A_last);
-        AT_WIDTH(sandwich)(NX, step_F, P);
-        if (over->plan->m) {
-            /* Weights 1/6, 4/6 and 1/6 at the start, the middle and the end */
-            lanes twice[NX * NX];
-            AT_WIDTH(product)(NX, NX, NX, step_F, A_first, twice);
-            for (int i = 0; i < NX * NX; i++)
-                EACH_LANE twice[i][l] = (A_last[i][l] - twice[i][l]) * (s.h / 4) + step_F[i][l];
-            for (int i = 0; i < NX; i++) EACH_LANE twice[i * NX + i][l] += 1;
-            AT_WIDTH(add_noise)(over->plan, step_F, s.h / 6, P);
-            AT_WIDTH(add_noise)(over->plan, twice, s.h / 6, P);
-            AT_WIDTH(add_density)(over->plan, s.h / 6, P);
-        }
+#ifdef STRAIGHT
+        if (over->plan->diagonal)
+            AT_WIDTH(add_step)(s.h, over->plan->D, step_F, A_first, A_last, P);
+        else
+#endif
+            AT_WIDTH(add_noisy_step)(over->plan, s.h, step_F, A_first, A_last, P);
         if (F) {
             AT_WIDTH(product)(NX, NX, NX, step_F, F, A_first);
             memcpy(F, A_first, sizeof A_first);
