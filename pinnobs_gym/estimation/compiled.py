@@ -22,7 +22,7 @@ from pinnobs_gym.estimation.square_root import carried
 from pinnobs_gym.simulation.kernels.calls import CallStructure, Plan, address
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary, plant_library
 from pinnobs_gym.simulation.noise import AssumedNoise, Noise, SampledLevel
-from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.record import Record, check_use
 from pinnobs_gym.simulation.truth import rows_of
 
 if TYPE_CHECKING:
@@ -147,6 +147,12 @@ class CompiledFilter:
         after.__dict__.update(
             xhat=x, t=t, u=u, P=P, innovation=innovation, S=S, memory=memory, root=state.root
         )
+        if left:  # the inputs may be others than the model uses
+            check_use(
+                self._estimator.system,
+                np.array([t], dtype=float),
+                np.asarray(u, dtype=float)[:, None],
+            )
         if left or state.root is not None:
             marks = np.ndarray((batch,), np.int64, buffer, layout.marks)
             return self._completed(state, after, y, marks == 0)

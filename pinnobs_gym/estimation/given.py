@@ -92,7 +92,9 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
             usual = False
         if not usual:
             _check_sample(system, before, t, y, u, shapes)
-        if (nu and not system.measured_input) or system.discrete:
+        # Compiled code compares inputs itself.
+        by_code = getattr(self, "compiled", None) is not None
+        if ((nu and not system.measured_input) or system.discrete) and not by_code:
             check_use(system, np.array([t], dtype=float), np.asarray(u, dtype=float)[:, None])
         return _inside(system, update(self, state, t, y, u))
 

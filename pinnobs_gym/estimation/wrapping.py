@@ -16,7 +16,7 @@ import numpy as np
 
 from pinnobs_gym.estimation import square_root
 from pinnobs_gym.estimation.estimator import State
-from pinnobs_gym.simulation.matrices import cholesky, product
+from pinnobs_gym.simulation.matrices import cholesky, product, total
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.residual import Periods
@@ -41,8 +41,8 @@ def wrapped_moments(variance: np.ndarray, period: float) -> tuple[np.ndarray, np
     wide: np.ndarray = variance > (_WIDE * period) ** 2  # not where it is not finite
     n = np.arange(1, _TERMS + 1)[:, None]
     terms = -((-1.0) ** n) * np.exp(-0.5 * n * n * np.where(wide, unit, np.inf))
-    slope = 2 * terms.sum(axis=0)
-    size = (period / (2 * np.pi)) ** 2 * (np.pi**2 / 3 - 4 * (terms / (n * n)).sum(axis=0))
+    slope = 2 * total(terms)
+    size = (period / (2 * np.pi)) ** 2 * (np.pi**2 / 3 - 4 * total(terms / (n * n)))
     return np.where(wide, slope, 1.0), np.where(wide, size, variance)
 
 

@@ -121,8 +121,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         if self.gate is None:
             return memory, {}
         memory = replace(memory, beyond=memory.beyond.astype(np.int64))
-        P_restart = np.ascontiguousarray(memory.P_restart)
-        return memory, {"beyond": memory.beyond, "P_restart": P_restart}
+        return memory, {"beyond": memory.beyond}
 
     def memory_rows(self, memory: EKFMemory, rows: np.ndarray) -> EKFMemory:
         return replace(memory, P_restart=memory.P_restart[..., rows], beyond=memory.beyond[rows])

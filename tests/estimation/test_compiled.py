@@ -10,6 +10,7 @@ from functools import cache
 import many_plants
 import numpy as np
 import pytest
+from fake_compilers import needs_compiler
 from linear import Linear, linear_record, record_of
 
 from pinnobs_gym.envs.episodes import EpisodeSource
@@ -19,12 +20,12 @@ from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
-from pinnobs_gym.simulation.kernels.build import _compiler
 from pinnobs_gym.simulation.noise import Noise, SampledLevel
+from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
-pytestmark = pytest.mark.skipif(_compiler() is None, reason="there is no C compiler")
+pytestmark = needs_compiler
 KINDS = pytest.mark.parametrize("kind", [EKF, UKF, CKF])
 PLANTS = pytest.mark.parametrize("plant", many_plants.PLANTS)
 FIELDS = [f.name for f in fields(Estimates)]
@@ -409,3 +410,18 @@ def test_kernels_are_turned_off(monkeypatch):
     monkeypatch.setenv("PINNOBS_KERNELS", "0")
     assert UKF(ReverseDuffing()).compiled is None
     assert "PINNOBS_KERNELS=0" in str(compiled_filter(EKF(Linear())))
+
+
+def test_an_update_refuses_inputs_that_the_model_does_not_use():
+    """Also in rows beyond the first, whose numbers are the same."""
+    system = SYSTEMS.resolve("InductionMotor")()
+    estimator = EKF.for_setup(system, system.setups["benchmark"])
+    assert estimator.compiled is not None
+    state = estimator.reset(Prior.of(system, system.setups["benchmark"], 3))
+    u = np.repeat(system.input(np.zeros(1)), 3, axis=0)
+    state = estimator.update(state, 0.0, np.zeros((3, 2)), u)
+    u = np.repeat(system.input(np.full(1, 1e-3)), 3, axis=0)
+    estimator.update(state, 1e-3, np.zeros((3, 2)), u * (1 + 5e-7))  # as rounded to few digits
+    u[2, 1] += 1.0
+    with pytest.raises(ValueError, match=r"input u2=.* is not that of InductionMotor.input"):
+        estimator.update(state, 1e-3, np.zeros((3, 2)), u)

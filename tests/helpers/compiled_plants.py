@@ -1,19 +1,14 @@
 """Plants with which compiled code is compared with NumPy, and both of a call's results."""
 
 import os
-import shutil
 from dataclasses import dataclass
 from unittest import mock
 
-import pytest
 from array_api_compat import array_namespace
 
 from pinnobs_gym.simulation.kernels import asked
 from pinnobs_gym.simulation.system import Setup, System, stack
 
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "clang", "gcc"))), reason="there is no C compiler"
-)
 JUMP = 0.73
 
 

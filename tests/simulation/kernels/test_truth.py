@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from compiled_plants import Held, Kepler, Pushed, by_numpy, compiled, needs_compiler
+from compiled_plants import Held, Kepler, Pushed, by_numpy, compiled
+from fake_compilers import needs_compiler
 from scipy.integrate import solve_ivp
 
 from pinnobs_gym.envs.vector_env import EstimationVectorEnv

@@ -25,29 +25,21 @@ SEPARATE void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, i
             EACH_LANE H[i * NX + j][l] = y[i][l] != y[i][l] ? 0 : H[i * NX + j][l];
     }
     AT_WIDTH(output_moments)(H, P, R, HP, S);
-    if (plan->gate) { /* restart rows that were beyond the gate for long */
+    AT_WIDTH(mark_wide)(plan, P, S, bad);
+    if (plan->gate) { /* rows that were beyond the gate for long are restarted in NumPy */
         lanes Se[NY];
-        int restarted = 0;
         for (int i = 0; i < NY; i++) EACH_LANE Se[i][l] = e[i][l];
         AT_WIDTH(divide)(1, S, Se, bad);
         EACH_LANE {
             int present = 0;
             double nis = 0;
             for (int i = 0; i < NY; i++) {
-                int seen = 0;
-                for (int j = 0; j < NX; j++) seen |= H[i * NX + j][l] != 0;
-                present += seen;
+                present += y[i][l] == y[i][l];
                 nis += Se[i][l] * e[i][l];
             }
             if (present) beyond[l] = nis <= plan->gate[present] ? 0 : beyond[l] + 1;
-            if (beyond[l] >= plan->patience) {
-                const int64_t at = row + MIN(l, count - 1);
-                for (int i = 0; i < NX * NX; i++) P[i][l] = c->P_restart[i * c->batch + at];
-                beyond[l] = 0;
-                restarted = 1;
-            }
+            bad[l] |= beyond[l] >= plan->patience;
         }
-        if (restarted) AT_WIDTH(output_moments)(H, P, R, HP, S);
     }
     if (plan->huber) { /* enlarge variances of outputs with large innovations */
         lanes excess[NY];

@@ -38,8 +38,8 @@ static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t
     return count ? count : -1;
 }
 
-/* Filter the rows in groups of WIDE lanes. ``reached`` (batch,) is set to the number of the sample that NumPy has to do in each row, or the number of samples.
-   Returns 0 if there is none to do.
+/* Filter the rows in groups of WIDE lanes. ``reached`` (batch,) is set to the number of the sample
+   that NumPy has to do in each row, or the number of samples. Returns 0 if there is none to do.
 
    All rows are filtered through some samples, whose results stay in the cache while they are
    written, before the next samples. */
@@ -73,6 +73,31 @@ int64_t run(const struct call *c, int64_t *reached)
     return left;
 }
 
+/* Leave rows to NumPy, which says what is wrong, at a time between the steps of a map, and those
+   whose inputs are not the ones that the plant defines. Returns 0 if there are none. */
+static int64_t mark_unusable(const struct call *c, int64_t *reached)
+{
+    const struct plan *plan = c->plan;
+    double p[LP], known[LU];
+    int64_t found = 0;
+    for (int64_t row = 0; row < c->batch; row++) {
+        int wrong = plan->discrete && c->t[0] != floor(c->t[0]);
+        if (NU && plan->input == 0) {
+            if (row == 0 || plan->p_rows) {
+                for (int i = 0; i < NP; i++) p[i] = plan->p[plan->p_rows ? i * c->batch + row : i];
+                plant_input(c->t[0], p, 1, known, 1);
+            }
+            for (int i = 0; i < NU; i++) {
+                const double given = c->u[i * c->batch + row];
+                const double size = fmax(fabs(given), fabs(known[i]));
+                wrong |= !(fabs(given - known[i]) <= 1e-6 * size);
+            }
+        }
+        if (wrong) reached[row] = 0, found = 1;
+    }
+    return found;
+}
+
 /* Filter one sample. Buffers hold one after the other t, y, u, x, P, the innovation, S, and the
    numbers of ``reached``, with the batch as the last axis. ``from`` is that of the sample before; if
    this is the first sample, x and P of it are predictions. ``more`` has further arrays, or is
@@ -102,5 +127,6 @@ int64_t update(const struct plan *plan, int64_t batch, int64_t first, double t, 
     c.u_before = from + (to_u - to);
     c.x_before = from + (x - to);
     c.P_before = from + (P - to);
-    return run(&c, (int64_t *)end);
+    const int64_t left = run(&c, (int64_t *)end);
+    return mark_unusable(&c, (int64_t *)end) | left;
 }

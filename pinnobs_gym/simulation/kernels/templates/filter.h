@@ -3,6 +3,8 @@
 /* The arrays of a call, with the batch as the last axis. The row of a sample is (n, batch). */
 #ifndef CALL
 #define CALL
+#define MOST_STEPS 100000 /* between two samples */
+
 struct call {
     const struct plan *plan;
     int64_t batch, samples;
@@ -19,7 +21,6 @@ struct call {
     const double *P_before;   /* (NX, NX, batch) */
     /* EKF with a gate */
     int64_t *beyond;          /* (batch,) samples in a row beyond the gate */
-    const double *P_restart;  /* (NX, NX, batch) */
     /* results of a forward pass, or NULL */
     double *x_predicted;      /* (samples, NX, batch) */
     double *P_predicted;      /* (samples, NX, NX, batch) */
@@ -87,6 +88,22 @@ static inline void AT_WIDTH(mark_outside)(const struct plan *plan, const lanes *
             EACH_LANE bad[l] |= (x[i][l] < plan->low[i]) | (x[i][l] > plan->high[i]);
 }
 
+/* Mark the lanes in which an angle is so uncertain that whole turns count: the standard deviation of
+   a state is above a twelfth of its period, or that of an output above a sixth. See
+   pinnobs_gym/estimation/wrapping.py. */
+static inline void AT_WIDTH(mark_wide)(const struct plan *plan, const lanes *restrict P,
+                                       const lanes *restrict S, int64_t *restrict bad)
+{
+    for (int i = 0; plan->state_period && i < NX; i++) {
+        const double widest = plan->state_period[i] / 12;
+        if (widest) EACH_LANE bad[l] |= P[i * NX + i][l] > widest * widest;
+    }
+    for (int i = 0; plan->output_period && i < NY; i++) {
+        const double widest = plan->output_period[i] / 6;
+        if (widest) EACH_LANE bad[l] |= S[i * NY + i][l] > widest * widest;
+    }
+}
+
 /* Note the number of the sample in the lanes that are bad for the first time, which NumPy has to
    go on with. Return whether all rows that exist are bad. The others go on, so that none depends
    on its neighbours. */
@@ -101,10 +118,11 @@ static inline int AT_WIDTH(note_bad)(const int64_t *restrict bad, int64_t k, int
     return all;
 }
 
+
 /* 1 if the model can be moved between these times here */
 static inline int AT_WIDTH(movable)(const struct plan *plan, double t0, double t1)
 {
     if (!(t1 > t0)) return 0;
-    if (plan->discrete) return t0 == floor(t0) && t1 == floor(t1);
-    return (t1 - t0) / plan->longest < 1e6;
+    if (!((t1 - t0) / (plan->discrete ? 1 : plan->longest) < MOST_STEPS)) return 0;
+    return !plan->discrete || (t0 == floor(t0) && t1 == floor(t1));
 }

@@ -143,6 +143,7 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
     /* S = Y Y^T + R, and K = X Y^T S^-1 */
     AT_WIDTH(squared)(NY, num_points, Y, S);
     for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
+    AT_WIDTH(mark_wide)(plan, P, S, bad);
     AT_WIDTH(outer)(NX, num_points, NY, X, Y, K);
     AT_WIDTH(divide)(NX, S, K, bad);
     /* x = x + K e, and P = (X - K Y) (X - K Y)^T + K R K^T */
