@@ -2,8 +2,9 @@
 
 The syntax trees of a module and of all modules of its project that it imports are hashed, also
 those imported inside functions or by ``importlib.import_module`` and ``__import__`` with a constant
-name, and the packages that these are in. Docstrings and comments do not count. Packages of others
-count by their version alone, which rows carry; files that code reads at run time are not seen.
+name, the packages that these are in, and the templates of compiled code. Docstrings and comments of
+Python do not count. Packages of others count by their version alone, which rows carry; files that
+code reads at run time are not seen.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from importlib.machinery import ModuleSpec
+from importlib.resources import files
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -29,6 +31,8 @@ from pinnobs_gym.simulation.system import System
 _OWN = frozenset({"pinnobs_gym", "trainers"})
 """Packages that are followed wherever they are installed. Their own files ``__init__`` only export
 names, and count where they are imported themselves."""
+_TEMPLATED = "pinnobs_gym.simulation.kernels.source"
+"""The module whose templates of compiled code count with it."""
 _FACE = "pinnobs_gym"
 """The package whose names are imported lazily from the modules below it."""
 
@@ -61,10 +65,19 @@ def module_hashes(*subjects: type | str, without: str = "") -> dict[str, str]:
         name = waiting.pop()
         if name not in digests and not (without and f"{name}.".startswith(f"{without}.")):
             digests[name], imports = _loaded(name)
+            if name == _TEMPLATED:
+                digests[f"{name}/templates"] = _templates()
             waiting += _packages_of(name)
             followed = [pair for pair in imports if _is_followed(pair[0], home)]
             waiting += [_home_of(base, part) for base, part in followed]
     return digests
+
+
+@lru_cache(maxsize=1)
+def _templates() -> str:
+    """Return the digest of the templates of compiled code, in C."""
+    folder = files("pinnobs_gym.simulation.kernels") / "templates"
+    return digest(sorted((file.name, file.read_text("utf-8")) for file in folder.iterdir()))
 
 
 def content(value: Any) -> Any:

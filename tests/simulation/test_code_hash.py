@@ -312,3 +312,12 @@ def test_equal_values_have_equal_content_and_others_have_not():
     assert len(set(shown)) == len(values)
     assert content({"a": 1, "b": 2}) == content({"b": 2, "a": 1})
     assert content(np.array([1.0, 2.0])) == content(np.array([1.0, 2.0]))
+
+
+def test_templates_of_compiled_code_count(monkeypatch):
+    module = "pinnobs_gym.simulation.code_hash"
+    before = code_hash("pinnobs_gym.estimators.ekf"), code_hash("pinnobs_gym.files")
+    monkeypatch.setattr(f"{module}._templates", lambda: "another")
+    after = code_hash("pinnobs_gym.estimators.ekf"), code_hash("pinnobs_gym.files")
+    assert after[0] != before[0]
+    assert after[1] == before[1]
