@@ -14,6 +14,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.trained import Ending, Trained
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
+from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -98,6 +99,8 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         """Number of iterations so far."""
         self.ending: Ending = "running"
         self._record, self._game = record, game
+        for template in ("truth", "model"):
+            ask(system, template)  # now, so that a training does not depend on calls before it
         self._earlier, self._started_at = 0.0, time.process_time()
         self.start()
 

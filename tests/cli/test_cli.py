@@ -136,11 +136,11 @@ def test_estimate_with_process_noise(folder, level):
         (["estimate", "--system", "Academic", "--log", "none_at_all.csv"], "no output at all"),
         (
             ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", "-1"],
-            "process_noise=-1.0 of Academic; expected numbers of at least 0",
+            "process_noise=-1.0; expected numbers of at least 0",
         ),
         (
             ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", "1", "nan"],
-            "process_noise=(1.0, nan) of Academic; expected numbers of at least 0",
+            "process_noise=(1.0, nan); expected numbers of at least 0",
         ),
         (
             ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", *"123"],
@@ -148,7 +148,7 @@ def test_estimate_with_process_noise(folder, level):
         ),
         (
             ["estimate", "--system", "Academic", "--log", "a.csv", "--process-noise", "x"],
-            "invalid",
+            "parsing --process-noise",
         ),
         (["estimate", "--system", "Academic", "--log", "twice.csv"], "has column y1 twice"),
         (["evaluate", "--system", "failing_plug_in:X"], "'failing_plug_in:X': SyntaxError"),

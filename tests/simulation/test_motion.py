@@ -86,8 +86,9 @@ def test_a_map_takes_its_steps_and_their_noise():
     np.testing.assert_allclose(x, expected.T, rtol=0, atol=1e-14)
     np.testing.assert_allclose(F, np.repeat(np.linalg.matrix_power(A, 3)[..., None], 2, -1))
     np.testing.assert_allclose(Q[..., 0], cov, rtol=1e-13)
-    assert np.array_equal(model_step(system, 2.0, 5.0, x0), x)
-    assert np.array_equal(truth(system, x0, np.array([2.0, 3.0, 5.0]))[-1], x)
+    np.testing.assert_allclose(model_step(system, 2.0, 5.0, x0), x, rtol=0, atol=1e-15)
+    last = truth(system, x0, np.array([2.0, 3.0, 5.0]))[-1]
+    np.testing.assert_allclose(last, x, rtol=0, atol=1e-15)
 
 
 def test_rows_of_a_map_may_take_different_numbers_of_steps():

@@ -11,7 +11,6 @@ import numpy as np
 
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
-from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.trainer import Trainer
@@ -67,7 +66,6 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
 
     def start(self) -> None:
         _check(self.system, self.record)
-        ask(self.system, "truth")
         self.sweep: list[dict[str, float]] = []
         """The results at each cut-off so far."""
         self.search: PoleSearch | None = None

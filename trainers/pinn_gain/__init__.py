@@ -21,7 +21,6 @@ from pinnobs_gym.estimation.learned.gain_network import memory_size, shapes
 from pinnobs_gym.estimation.learned.perceptron import Layers
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
-from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System, output_scale, vector
 from pinnobs_gym.training.trainer import Trainer
@@ -79,7 +78,6 @@ class PinnGainTrainer(Trainer[PinnGainConfig, TrainedGain]):
     def start(self) -> None:
         config, system, record = self.config, self.system, self.record
         _check(system, record, config)
-        ask(system, "model")
         ekf = EKF(system, *self.levels)
         self.std = np.sqrt(np.einsum("iib->i", ekf.noise.R(0.0)))
         scale = torch.tensor(vector(system.scale, system.nx, "scale"))[:, None]

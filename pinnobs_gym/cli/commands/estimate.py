@@ -37,9 +37,9 @@ class Estimate:
     """Initial estimate; the benchmark's if not given."""
     P0_std: tuple[float, ...] | None = None
     """Its standard deviations; the benchmark's if not given."""
-    noise_std: tuple[float, ...] | None = None
+    noise_std: tuple[float, ...] = ()
     """Standard deviations of the output noise; the benchmark's if not given."""
-    process_noise: tuple[float, ...] | None = None
+    process_noise: tuple[float, ...] = ()
     """Standard deviations of the process noise after one second (of a map: after one step), in
     state units per √s: one for all states or one for each; the benchmark's if not given."""
     out: Path = Path("estimates.csv")
@@ -49,9 +49,9 @@ class Estimate:
         """Estimate, and write the results."""
         env_id(self.system)  # checks and registers the user's own system
         cls = SYSTEMS.resolve(self.system)
-        noise_std = None if self.noise_std is None else _level(self.noise_std)
+        noise_std = _level(self.noise_std) if self.noise_std else None
         system, setup = cls.configured(noise_std=noise_std)
-        if self.process_noise is not None:
+        if self.process_noise:
             setup = replace(setup, process_noise=_level(self.process_noise))
             system.noise(setup.noise_std, setup.process_noise)
         if self.xhat0:

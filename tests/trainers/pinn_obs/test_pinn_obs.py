@@ -531,7 +531,6 @@ def with_P0(P0):
         (with_y(np.full((1, 40, 1), np.nan)), "y of Spring does not vary"),
         (with_P0([[1.0, 2.0], [2.0, 1.0]]), "P0 of row 0 has eigenvalue -1; expected a covarianc"),
         (with_P0([[1.0, 2.0], [0.0, 1.0]]), "P0 is not symmetric and finite; expected a covarianc"),
-        (with_P0(np.full((2, 2), np.nan)), "P0 is not symmetric and finite; expected a covariance"),
     ],
 )
 def test_a_record_that_cannot_be_trained_on_is_refused(record, message):
