@@ -7,6 +7,7 @@ import many_plants
 import numpy as np
 import pytest
 from agreement import FIELDS, assert_near, assert_same
+from array_api_compat import array_namespace
 from fake_compilers import needs_compiler
 from linear import H as OUTPUTS
 from linear import Linear, linear_record, record_of, runge_kutta_matrix
@@ -15,6 +16,7 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.compiled_smoother import compiled_smoother
 from pinnobs_gym.estimation.estimator import Estimates
 from pinnobs_gym.estimation.smoother import LEAST, forward
+from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.rts_smoother import RTSSmoother
 from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.simulation.system import Setup, System, stack
@@ -141,6 +143,38 @@ def test_rows_near_to_singular_are_found():
     assert 5 < len(left) < 35
     # Just above the bound, the recursion itself is off by 1e-7.
     assert_near(smoother.run(record), in_numpy(smoother).run(record), rtol=1e-6)
+
+
+@dataclass(frozen=True)
+class Chain(System):
+    """More states than straight code is written for."""
+
+    state_names = tuple(f"x{i}" for i in range(1, 8))
+    output_names = ("y1", "y2")
+    scale = (1.0,) * 7
+    setups = {"benchmark": Setup((-1.0,) * 7, (1.0,) * 7, duration=2.0, dt=0.1, noise_std=0.1)}
+
+    def f(self, t, x, u):
+        xp = array_namespace(x)
+        before = [x[..., i - 1] for i in range(7)]
+        return stack(x, *(xp.sin(before[i]) - 0.3 * (i + 1) * x[..., i] for i in range(7)))
+
+    def h(self, t, x, u):
+        return stack(x, x[..., 0] + x[..., 6], x[..., 3] * x[..., 4])
+
+
+@pytest.mark.parametrize("kind", [RTSSmoother, EKF])
+def test_a_plant_with_many_states(kind):
+    system = Chain()
+    record = many_plants.simulated(system, many_plants.times(), 6)
+    estimator = kind(system, process_noise=0.05)
+    assert estimator.compiled is not None
+    whole = estimator.run(record)
+    assert_near(whole, in_numpy(estimator).run(record))
+    alone = estimator.run(record.rows(np.array([4])))
+    np.testing.assert_array_equal(alone.xhat[0], whole.xhat[4])
+    if kind is RTSSmoother:
+        assert not left_of(estimator, record)
 
 
 def test_wide_priors_of_plants_with_one_number_per_row():

@@ -36,8 +36,8 @@ PrinterOf = Callable[[set[Any], str], Printer]
 
 def step_functions(f: Trace, h: Trace, printer: PrinterOf) -> list[str]:
     """Return the functions ``runge_kutta``, ``runge_kutta_linearised``, ``add_step``,
-    ``add_map_step``, ``output_moments`` and ``kalman_update``, whose comments are in
-    ``templates/steps.h``.
+    ``add_map_step``, ``output_moments``, ``kalman_update`` and ``smooth_step``, whose comments are
+    in ``templates/steps.h``.
 
     Args:
         f: the trace of f.
@@ -48,7 +48,8 @@ def step_functions(f: Trace, h: Trace, printer: PrinterOf) -> list[str]:
     slopes, (F, first, last) = _runge_kutta(f, printer, linearised=True)
     A = [["A" if e != 0 else ZERO for e in row] for row in f.jacobian()]
     H = [["H" if e != 0 else ZERO for e in row] for row in h.jacobian()]
-    return [value, slopes, _add_step(F, first, last), _add_map_step(A), *_update(H)]
+    steps = [value, slopes, _add_step(F, first, last), _add_map_step(A), *_update(H)]
+    return [*steps, _smooth_step(len(f.x))]
 
 
 def evaluated(
@@ -260,20 +261,51 @@ def _less(s: Straight, a: str, b: str) -> str:
     return a if b == ZERO else s.let(f"-{b}" if a == ZERO else f"{a} - {b}")
 
 
-def _gain(s: Straight, A: Rows, S: Rows) -> Rows:
-    """Return AS⁻¹ by the Cholesky factor L of S."""
+def _smooth_step(n: int) -> str:
+    s = Straight()
+    F, P, Q = s.load("F", n, n), s.load_symmetric("P", n), s.load_symmetric("Q", n)
+    ahead, after = s.load_symmetric("P_ahead", n), s.load_symmetric("P_next", n)
+    x, x_ahead, x_next = (s.load(name, n, 1) for name in ("x", "x_ahead", "x_next"))
+    L, inverse, pivots = _factor(s, ahead)
+    C = _divided(s, s.product(P, transposed(F)), L, inverse)
+    moved = [[s.let(f"{b[0]} - {a[0]}")] for a, b in zip(x_ahead, x_next, strict=True)]
+    x = [s.total([a[0], b[0]]) for a, b in zip(x, s.product(C, moved), strict=True)]
+    CF = s.product(C, F)
+    M = [[_less(s, ONE if i == j else ZERO, CF[i][j]) for j in range(n)] for i in range(n)]
+    noisy = [[s.total([after[i][j], Q[i][j]]) for j in range(i + 1)] for i in range(n)]
+    noisy = [[noisy[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+    rest = s.symmetric(s.product(C, noisy), C)
+    s.store_all("x", x)
+    s.store_all("P", flat(s.symmetric(s.product(M, P), M, rest)))
+    parts = [f"({pivots[i]} / {ahead[i][i]})" for i in range(n)]
+    s.store("determinant[l]", " * ".join(parts))
+    head = (
+        "AT_WIDTH(smooth_step)(const lanes *restrict F, const lanes *restrict Q, "
+        "const lanes *restrict x_ahead, const lanes *restrict P_ahead, "
+        "const lanes *restrict x_next, const lanes *restrict P_next, "
+        "lanes *restrict x, lanes *restrict P, double *restrict determinant)"
+    )
+    return _function(head, s)
+
+
+def _factor(s: Straight, S: Rows) -> tuple[Rows, list[str], list[str]]:
+    """Return the Cholesky factor L of S, the inverses of its diagonal, and the squares of that."""
     m = len(S)
-    if m == 1:
-        inverse = s.let(f"1.0 / {S[0][0]}")
-        return [[s.let(f"{row[0]} * {inverse}")] for row in A]
-    L, inverse = [[ZERO] * m for _ in range(m)], []
+    L, inverse, pivots = [[ZERO] * m for _ in range(m)], [], []
     for j in range(m):
         for i in range(j, m):
             taken = s.total(times(L[i][q], L[j][q]) for q in range(j))
             rest = _less(s, S[i][j], taken)
             if i == j:
+                pivots.append(rest)
                 inverse.append(s.let(f"1.0 / sqrt({rest})"))
             L[i][j] = s.let(f"{rest} * {inverse[j]}")
+    return L, inverse, pivots
+
+
+def _divided(s: Straight, A: Rows, L: Rows, inverse: list[str]) -> Rows:
+    """Return A(LLᵀ)⁻¹, given the inverses of the diagonal of L."""
+    m = len(L)
     X = [list(row) for row in A]
     for row in X:
         for j in range(m):  # forward substitution
@@ -283,3 +315,13 @@ def _gain(s: Straight, A: Rows, S: Rows) -> Rows:
             taken = s.total(times(row[q], L[q][j]) for q in range(j + 1, m))
             row[j] = s.let(f"{_less(s, row[j], taken)} * {inverse[j]}")
     return X
+
+
+def _gain(s: Straight, A: Rows, S: Rows) -> Rows:
+    """Return AS⁻¹ by the Cholesky factor L of S."""
+    m = len(S)
+    if m == 1:
+        inverse = s.let(f"1.0 / {S[0][0]}")
+        return [[s.let(f"{row[0]} * {inverse}")] for row in A]
+    L, inverse, _ = _factor(s, S)
+    return _divided(s, A, L, inverse)
