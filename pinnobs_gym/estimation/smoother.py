@@ -27,11 +27,12 @@ from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.truth import rows_of
 
 _ROWS = 2000
 """Approximate number of samples, over all rows, that are processed at a time."""
 
-_LEAST = 1e-10
+LEAST = 1e-10
 """Least eigenvalue of correlations below which the smoother's inverse loses too many digits. Its
 covariances are then off by about 1e-7 in relative terms."""
 
@@ -116,7 +117,7 @@ def forward(
 
 def ill_conditioned(filtered: Filtered) -> np.ndarray:
     """Return the rows (number,) whose predicted covariances are finite, but too near to singular
-    for the inverse in `backward`: of correlations, the least eigenvalue is less than `_LEAST`."""
+    for the inverse in `backward`: of correlations, the least eigenvalue is less than `LEAST`."""
     P = np.ascontiguousarray(filtered.predicted.P[1:].transpose(1, 2, 0, 3))
     n, batch = P.shape[0], P.shape[3]
     P = P.reshape(n, n, -1)
@@ -124,11 +125,11 @@ def ill_conditioned(filtered: Filtered) -> np.ndarray:
         L, variances = cholesky(P, semidefinite=True), np.einsum("iib->ib", P)
         # The determinant of correlations is not greater than the least eigenvalue times e.
         pivots = np.square(np.einsum("iib->ib", L)) / variances
-        near = np.flatnonzero((pivots.prod(axis=0) < np.e * _LEAST) & np.isfinite(P).all((0, 1)))
+        near = np.flatnonzero((pivots.prod(axis=0) < np.e * LEAST) & np.isfinite(P).all((0, 1)))
         std = np.sqrt(variances[:, near])
         correlations = (P[..., near] / (std[:, None] * std)).transpose(2, 0, 1)
     correlations = np.where(np.isfinite(correlations), correlations, np.eye(n))
-    small = np.linalg.eigvalsh(correlations)[:, 0] < _LEAST
+    small = np.linalg.eigvalsh(correlations)[:, 0] < LEAST
     return np.unique(near[small] % batch)
 
 
@@ -241,7 +242,8 @@ def flows(
         starts, stops = slice(first, first + size), slice(first + 1, first + size + 1)
         t0, t1 = np.repeat(t[starts], batch), np.repeat(t[stops], batch)
         u0, u1 = (u[part].reshape(size * batch, u.shape[-1]) for part in (starts, stops))
-        end, *moved = model_step_moments(system, noise, t0, t1, x[starts].reshape(-1, nx), u0, u1)
+        each = rows_of(system, np.tile(np.arange(batch), size))
+        end, *moved = model_step_moments(each, noise, t0, t1, x[starts].reshape(-1, nx), u0, u1)
         ends[starts] = end.reshape(size, batch, nx)
         for whole, part in zip((F, Q), moved, strict=True):
             part = np.broadcast_to(part, (nx, nx, size * batch)).reshape(nx, nx, size, batch)

@@ -4,12 +4,13 @@ import copy
 import itertools
 import pickle
 import threading
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import many_plants
 import numpy as np
 import pytest
+from agreement import FIELDS, assert_near, assert_same
 from fake_compilers import needs_compiler
 from linear import Linear, linear_record, record_of
 
@@ -28,7 +29,6 @@ from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 pytestmark = needs_compiler
 KINDS = pytest.mark.parametrize("kind", [EKF, UKF, CKF])
 PLANTS = pytest.mark.parametrize("plant", many_plants.PLANTS)
-FIELDS = [f.name for f in fields(Estimates)]
 
 
 def in_numpy(estimator):
@@ -68,24 +68,6 @@ def steps(estimator, record, samples=None, state=None, first=0):
             state = estimator.update(state, float(record.t[k]), record.y[:, k], record.u[:, k])
             states.append(state)
     return states
-
-
-def assert_near(found, expected, rtol=1e-9):
-    """Both have the same NaN pattern, and differ by at most rtol of the field's scale in a row."""
-    for name in FIELDS:
-        a, b = getattr(found, name), getattr(expected, name)
-        assert a.shape == b.shape
-        np.testing.assert_array_equal(np.isfinite(a), np.isfinite(b), err_msg=name)
-        size = np.nan_to_num(abs(b), posinf=0.0).max(axis=(0, 1), initial=1e-300)
-        scale = np.maximum(size, np.nan_to_num(abs(b)))
-        with np.errstate(invalid="ignore"):
-            error = abs(a - b) / scale
-        assert np.nanmax(np.where(np.isfinite(b), error, 0.0)) <= rtol, name
-
-
-def assert_same(found, expected):
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
 def stacked(states):

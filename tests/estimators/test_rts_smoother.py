@@ -124,7 +124,7 @@ def test_smoothing_by_roots_is_the_backward_recursion():
     other = source.record(source.play(source.draw(source.streams(range(2)))))
     duffing = RTSSmoother(source.system, noise_std=0.1, process_noise=0.05)
     for each, played in ((smoother, record), (duffing, other)):
-        own, roots = each.run(played), each._by_roots(played, each.noise)
+        own, roots = each.run(played), each._by_roots(played)
         np.testing.assert_allclose(roots.xhat, own.xhat, atol=1e-12)
         np.testing.assert_allclose(roots.P, own.P, atol=1e-14)
 

@@ -42,7 +42,7 @@ class CallStructure(ctypes.Structure):
         *(("plan", _POINTER), ("batch", _INT), ("samples", _INT)),
         *((name, _POINTER) for name in ("t", "y", "u", "x", "P", "innovation", "S")),
         *((name, _POINTER) for name in ("t_before", "u_before", "x_before", "P_before")),
-        *((name, _POINTER) for name in ("beyond", "x_predicted", "P_predicted", "F")),
+        *((name, _POINTER) for name in ("beyond", "x_predicted", "P_predicted", "F", "Q")),
     ]
 
 

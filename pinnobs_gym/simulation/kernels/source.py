@@ -15,6 +15,8 @@ _WIDE_FILTER = 4
 but one of a single episode, or a second library for that, takes half as long again."""
 _ALONE = {"truth": "truth_entry.c", "model": "model_entry.c"}
 """Algorithms that are no filters, with the templates of their entries."""
+_AFTER = {"smoother": ("ekf", "smoother_entry.c")}
+"""Algorithms that follow a filter, with its template and those of their entries."""
 
 
 def library_source(plant: PlantCode, *templates: str) -> str:
@@ -25,6 +27,8 @@ def library_source(plant: PlantCode, *templates: str) -> str:
         plant: the equations.
         templates: names of templates with an algorithm for any number of lanes, such as ``ekf``.
     """
+    entries = [(_ALONE.get(n) or _AFTER.get(n, ("", "filter.c"))[1]) for n in templates]
+    templates = tuple(part for n in templates for part in (*_AFTER.get(n, ())[:1], n))
     alone = all(name in _ALONE for name in templates)
     wide = _WIDE if alone else _WIDE_FILTER
     parts = [_template("common.h"), plant.once]
@@ -46,10 +50,9 @@ def library_source(plant: PlantCode, *templates: str) -> str:
         ]
     called = "".join(
         f"#define {name.upper()}_WIDE {name}_rows_{wide}\n"
-        for name in ("filter", "solve", "step", "linearise")
+        for name in ("filter", "smooth", "solve", "step", "linearise")
     )
-    entries = dict.fromkeys(_ALONE.get(name, "filter.c") for name in templates)
-    parts += [f"#define WIDE {wide}\n{called}", *map(_template, entries)]
+    parts += [f"#define WIDE {wide}\n{called}", *map(_template, dict.fromkeys(entries))]
     return "\n".join([*parts, _template("check.c")])
 
 

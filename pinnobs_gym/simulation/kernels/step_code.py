@@ -10,6 +10,13 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from pinnobs_gym.simulation.kernels.covariance_code import (
+    add_map_step,
+    add_step,
+    function,
+    smooth_step,
+    update,
+)
 from pinnobs_gym.simulation.kernels.straight import (
     ONE,
     ZERO,
@@ -17,15 +24,14 @@ from pinnobs_gym.simulation.kernels.straight import (
     Straight,
     flat,
     times,
-    transposed,
 )
 from pinnobs_gym.simulation.printer import Printer
 from pinnobs_gym.simulation.traced_code import Trace
 
 LARGEST = 6
 """Largest number of states for which straight-line code is written."""
-_LINE = re.compile(r"const double (\w+) = (.*);")
 _NAME = re.compile(r"[A-Za-z_]\w*")
+_LINE = re.compile(r"const double (\w+) = (.*);")
 _STAGES = ((0, ""), (1, "half"), (1, "half"), (2, "h"))
 """Of the classical Runge-Kutta method: number of the time and the inputs, and what the slope of the
 stage before is multiplied by."""
@@ -36,8 +42,8 @@ PrinterOf = Callable[[set[Any], str], Printer]
 
 def step_functions(f: Trace, h: Trace, printer: PrinterOf) -> list[str]:
     """Return the functions ``runge_kutta``, ``runge_kutta_linearised``, ``add_step``,
-    ``add_map_step``, ``output_moments`` and ``kalman_update``, whose comments are in
-    ``templates/steps.h``.
+    ``add_map_step``, ``output_moments``, ``kalman_update`` and ``smooth_step``, whose comments are
+    in ``templates/steps.h``.
 
     Args:
         f: the trace of f.
@@ -48,7 +54,8 @@ def step_functions(f: Trace, h: Trace, printer: PrinterOf) -> list[str]:
     slopes, (F, first, last) = _runge_kutta(f, printer, linearised=True)
     A = [["A" if e != 0 else ZERO for e in row] for row in f.jacobian()]
     H = [["H" if e != 0 else ZERO for e in row] for row in h.jacobian()]
-    return [value, slopes, _add_step(F, first, last), _add_map_step(A), *_update(H)]
+    steps = [value, slopes, add_step(F, first, last), add_map_step(A), *update(H)]
+    return [*steps, smooth_step(len(f.x))]
 
 
 def evaluated(
@@ -145,7 +152,7 @@ def _runge_kutta(
     )
     steps = "const double h = s->h, half = h / 2, sixth = h / 6;\n    (void)p; (void)half;"
     structure = (F, ends[0], ends[3]) if linearised else (F, F, F)
-    return _function(head, s, steps), structure
+    return function(head, s, steps), structure
 
 
 def _moved(s: Straight, part: str, slope: str, start: str) -> str:
@@ -159,127 +166,3 @@ def _weighted(s: Straight, k: list[str], start: str) -> str:
         return start
     twice = s.total([k[1], k[2]])
     return s.total([start, f"sixth * ({s.total([times(twice, '2.0'), k[0], k[3]])})"])
-
-
-def _function(head: str, s: Straight, first: str = "") -> str:
-    first = f"    {first}\n" if first else ""
-    return f"static void {head}\n{{\n{first}{s.body()}\n}}"
-
-
-def _loaded(s: Straight, array: str, rows: Rows) -> Rows:
-    """Return the entries of a stored matrix of a known structure."""
-    width = len(rows[0])
-    return [
-        [e if _is_number(e) else s.loaded(array, i * width + j) for j, e in enumerate(row)]
-        for i, row in enumerate(rows)
-    ]
-
-
-def _is_number(entry: str) -> bool:
-    return not _NAME.fullmatch(entry)
-
-
-def _add_step(F: Rows, A_first: Rows, A_last: Rows) -> str:
-    n, s = len(F), Straight()
-    F, first, last = (
-        _loaded(s, "F", F),
-        _loaded(s, "A_first", A_first),
-        _loaded(s, "A_last", A_last),
-    )
-    P = s.load_symmetric("P", n)
-    w = [s.let(f"h / 6 * D[{i * n + i}]") for i in range(n)]
-    for i in range(n):
-        P[i][i] = s.total([P[i][i], w[i]])
-    FA = s.product(F, first)
-    twice = [[ZERO] * n for _ in range(n)]  # two times Psi at the middle
-    for i in range(n):
-        for j in range(n):
-            terms = [last[i][j], *([f"-{FA[i][j]}"] if FA[i][j] != ZERO else [])]
-            slope = s.let(s.total(terms))
-            own = [] if slope == ZERO else [times(slope, "quarter")]
-            twice[i][j] = s.total([*own, F[i][j], ONE if i == j else ZERO])
-    scaled = [[s.let(times(e, w[j])) for j, e in enumerate(row)] for row in twice]
-    middle = s.symmetric(scaled, twice)
-    for i in range(n):
-        middle[i][i] = s.total([middle[i][i], w[i]])
-    s.store_all("P", flat(s.symmetric(s.product(F, P), F, middle)))
-    head = (
-        "AT_WIDTH(add_step)(double h, const double *restrict D, const lanes *restrict F, "
-        "const lanes *restrict A_first, const lanes *restrict A_last, lanes *restrict P)"
-    )
-    return _function(head, s, "const double quarter = h / 4;")
-
-
-def _add_map_step(A: Rows) -> str:
-    n, s = len(A), Straight()
-    F, P = _loaded(s, "F", A), s.load_symmetric("P", n)
-    D = [[s.let(f"D[{i * n + j}]") for j in range(n)] for i in range(n)]
-    s.store_all("P", flat(s.symmetric(s.product(F, P), F, D)))
-    return _function(
-        "AT_WIDTH(add_map_step)(const double *restrict D, const lanes *restrict F, "
-        "lanes *restrict P)",
-        s,
-    )
-
-
-def _update(structure: Rows) -> list[str]:
-    ny, nx = len(structure), len(structure[0])
-    s = Straight()
-    H, P, R = _loaded(s, "H", structure), s.load_symmetric("P", nx), s.load("R", ny, ny)
-    HP = s.product(H, P)
-    s.store_all("HP", flat(HP))
-    s.store_all("S", flat(s.symmetric(HP, H, R)))
-    head = (
-        "AT_WIDTH(output_moments)(const lanes *restrict H, const lanes *restrict P, "
-        "const lanes *restrict R, lanes *restrict HP, lanes *restrict S)"
-    )
-    moments = _function(head, s)
-    s = Straight()
-    H, P, R = _loaded(s, "H", structure), s.load_symmetric("P", nx), s.load("R", ny, ny)
-    K = _gain(s, transposed(s.load("HP", ny, nx)), s.load_symmetric("S", ny))
-    KH = s.product(K, H)
-    M = [[_less(s, ONE if i == j else ZERO, KH[i][j]) for j in range(nx)] for i in range(nx)]
-    noise = s.symmetric(s.product(K, R), K)
-    P = s.symmetric(s.product(M, P), M, noise)
-    x, e = s.load("x", nx, 1), s.load("e", ny, 1)
-    x = [s.total([start[0], step[0]]) for start, step in zip(x, s.product(K, e), strict=True)]
-    s.store_all("x", x)
-    s.store_all("P", flat(P))
-    everything = s.total([*x, *(P[i][j] for i in range(nx) for j in range(i + 1))])
-    s.store("rest[l]", f"{everything} - {everything}")
-    head = (
-        "AT_WIDTH(kalman_update)(const lanes *restrict H, const lanes *restrict HP, "
-        "const lanes *restrict S, const lanes *restrict R, const lanes *restrict e, "
-        "lanes *restrict x, lanes *restrict P, double *restrict rest)"
-    )
-    return [moments, _function(head, s)]
-
-
-def _less(s: Straight, a: str, b: str) -> str:
-    """Return a − b."""
-    return a if b == ZERO else s.let(f"-{b}" if a == ZERO else f"{a} - {b}")
-
-
-def _gain(s: Straight, A: Rows, S: Rows) -> Rows:
-    """Return AS⁻¹ by the Cholesky factor L of S."""
-    m = len(S)
-    if m == 1:
-        inverse = s.let(f"1.0 / {S[0][0]}")
-        return [[s.let(f"{row[0]} * {inverse}")] for row in A]
-    L, inverse = [[ZERO] * m for _ in range(m)], []
-    for j in range(m):
-        for i in range(j, m):
-            taken = s.total(times(L[i][q], L[j][q]) for q in range(j))
-            rest = _less(s, S[i][j], taken)
-            if i == j:
-                inverse.append(s.let(f"1.0 / sqrt({rest})"))
-            L[i][j] = s.let(f"{rest} * {inverse[j]}")
-    X = [list(row) for row in A]
-    for row in X:
-        for j in range(m):  # forward substitution
-            taken = s.total(times(row[q], L[j][q]) for q in range(j))
-            row[j] = s.let(f"{_less(s, row[j], taken)} * {inverse[j]}")
-        for j in reversed(range(m)):  # back substitution
-            taken = s.total(times(row[q], L[q][j]) for q in range(j + 1, m))
-            row[j] = s.let(f"{_less(s, row[j], taken)} * {inverse[j]}")
-    return X

@@ -56,10 +56,28 @@ SEPARATE void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, i
                 }
     }
     AT_WIDTH(kalman_update)(H, HP, S, R, e, x, P, rest);
-    AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
-    AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
+    if (c->S) {
+        AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
+        AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
+    }
     EACH_LANE bad[l] |= (rest[l] != 0) & !lost[l];
     AT_WIDTH(mark_outside)(plan, x, bad);
+}
+
+/* Predict sample k by the Jacobian F of the model's step and the process noise Q over it, which a
+   smoother needs: P = F P F^T + Q. */
+SEPARATE void AT_WIDTH(predict_apart)(const struct call *c, const struct interval *over, int64_t k,
+                                      int64_t row, int count, lanes *restrict x,
+                                      lanes *restrict P)
+{
+    const int64_t place = k * NX * NX * c->batch;
+    lanes F[NX * NX], Q[NX * NX];
+    for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] = i % (NX + 1) == 0, Q[i][l] = 0;
+    AT_WIDTH(move_moments)(over, x, Q, F);
+    AT_WIDTH(sandwich)(NX, F, P);
+    for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += Q[i][l];
+    AT_WIDTH(store)(NX * NX, F, c->F + place, c->batch, row, count);
+    AT_WIDTH(store)(NX * NX, Q, c->Q + place, c->batch, row, count);
 }
 
 /* Filter W rows, of which ``count`` exist. ``reached`` is set to the number of the sample that NumPy
@@ -68,7 +86,7 @@ SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count
                                   int64_t *restrict reached)
 {
     const struct plan *plan = c->plan;
-    lanes p[LP], x[NX], P[NX * NX], F[NX * NX];
+    lanes p[LP], x[NX], P[NX * NX];
     struct interval over = {.plan = plan, .p = p};
     int64_t beyond[W], bad[W], lost[W];
     EACH_LANE bad[l] = 0;
@@ -89,15 +107,8 @@ SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count
             memcpy(over.u0, over.u1, sizeof over.u0);
         }
         AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, over.u1);
-        if (before) {
-            if (c->F) {
-                for (int i = 0; i < NX * NX; i++) EACH_LANE F[i][l] = i % (NX + 1) == 0;
-                AT_WIDTH(move_moments)(&over, x, P, F);
-                AT_WIDTH(store)(NX * NX, F, c->F + k * NX * NX * c->batch, c->batch, row, count);
-            } else {
-                AT_WIDTH(move_moments)(&over, x, P, NULL);
-            }
-        }
+        if (before && c->F) AT_WIDTH(predict_apart)(c, &over, k, row, count, x, P);
+        else if (before) AT_WIDTH(move_moments)(&over, x, P, NULL);
         if (c->x_predicted) {
             AT_WIDTH(store)(NX, x, c->x_predicted + k * NX * c->batch, c->batch, row, count);
             AT_WIDTH(store)(NX * NX, P, c->P_predicted + k * NX * NX * c->batch, c->batch, row,

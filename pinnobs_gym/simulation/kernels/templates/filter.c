@@ -16,11 +16,6 @@ static struct call later(const struct call *c, int64_t k)
     part.P += rows * NX * NX;
     part.innovation += rows * NY;
     part.S += rows * NY * NY;
-    if (c->x_predicted) {
-        part.x_predicted += rows * NX;
-        part.P_predicted += rows * NX * NX;
-        part.F += rows * NX * NX;
-    }
     part.t_before = part.t - 1;
     part.u_before = part.u - c->batch * NU;
     part.x_before = part.x - c->batch * NX;

@@ -21,10 +21,11 @@ struct call {
     const double *P_before;   /* (NX, NX, batch) */
     /* EKF with a gate */
     int64_t *beyond;          /* (batch,) samples in a row beyond the gate */
-    /* results of a forward pass, or NULL */
+    /* results of the forward pass of a smoother, or NULL; innovation and S are then NULL */
     double *x_predicted;      /* (samples, NX, batch) */
     double *P_predicted;      /* (samples, NX, NX, batch) */
-    double *F;                /* (samples, NX, NX, batch) */
+    double *F;                /* (samples, NX, NX, batch) of the step to a sample */
+    double *Q;                /* (samples, NX, NX, batch) of the same */
 };
 #endif
 

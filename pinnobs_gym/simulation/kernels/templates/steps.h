@@ -9,7 +9,9 @@
    add_map_step            P = F P F^T + D
    output_moments          H P and S = H P H^T + R
    kalman_update           x = x + K e and P = (I - K H) P (I - K H)^T + K R K^T for
-                           K = P H^T S^-1; ``rest`` (W,) is zero where all of these are finite */
+                           K = P H^T S^-1; ``rest`` (W,) is zero where all of these are finite
+   smooth_step             x and P of a smoother, see smoother.c; ``determinant`` (W,) is that of the
+                           correlations of P_ahead */
 /* A step of the classical Runge-Kutta method: its times, inputs and length. */
 #define rk_step AT_WIDTH(rk_step)
 struct rk_step {

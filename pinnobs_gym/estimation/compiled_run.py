@@ -1,0 +1,190 @@
+"""Filters in compiled code over whole records; see `pinnobs_gym.estimation.compiled`."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from ctypes import addressof
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pinnobs_gym.estimation.compiled_code import noise_at, of_rows, plan_of, rows_of_numbers
+from pinnobs_gym.estimation.estimator import Estimates, State
+from pinnobs_gym.estimation.projection import kept_inside
+from pinnobs_gym.estimation.square_root import carried
+from pinnobs_gym.simulation.kernels.calls import CallStructure, Plan, address
+from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
+from pinnobs_gym.simulation.record import Record
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.recursive import RecursiveEstimator
+
+FIELDS = ("xhat", "P", "innovation", "S")
+"""The fields of `Estimates` that compiled filters compute."""
+
+
+class CompiledRun:
+    """The compiled code of one estimator for whole records.
+
+    Args:
+        estimator: the estimator; its class names the template.
+        made: the library.
+        plan: the estimator's plan.
+    """
+
+    def __init__(self, estimator: RecursiveEstimator, made: PlantLibrary, plan: Plan) -> None:
+        self._estimator, self._made, self._plan = estimator, made, plan
+        self._by_sample = estimator.noise.samples is not None
+        self._rows = rows_of_numbers(estimator, made)
+        self._run = made.code.run
+        self._run.argtypes = [ctypes.c_void_p] * 2
+        self._run.restype = ctypes.c_int64
+
+    def __call__(self, record: Record) -> Estimates | None:
+        """Return the estimates of a record; None if NumPy has to process it."""
+        state = self._estimator.reset(record.prior)
+        batch, n, system = record.batch, record.num_samples, self._estimator.system
+        nx, ny = system.nx, system.ny
+        rooted = np.zeros(batch, dtype=bool)
+        if state.root is not None:
+            rooted[carried(state.root)] = True
+        if self._rows not in (1, batch) or rooted.all():
+            return None
+        shapes = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
+        results = _empty({name: (n, *shapes[name], batch) for name in FIELDS})
+        # For each row, the number of the sample that NumPy has to process, n if there is none
+        reached = np.where(rooted, 0, n)
+        state = self._through(record, np.flatnonzero(~rooted), 0, state, results, reached)
+        while (k := int(reached.min())) < n:
+            rows = np.flatnonzero(reached == k)
+            state = self._by_numpy(record, rows, k, state, results)
+            reached[rows] = k + 1
+            rows = rows[~np.isin(rows, () if state.root is None else carried(state.root))]
+            if k + 1 < n and len(rows):
+                state = self._through(record, rows, k + 1, state, results, reached)
+        return Estimates(**{name: np.moveaxis(array, -1, 0) for name, array in results.items()})
+
+    def _through(
+        self,
+        record: Record,
+        rows: np.ndarray,
+        first: int,
+        state: State,
+        results: dict[str, np.ndarray],
+        reached: np.ndarray,
+    ) -> State:
+        """Filter rows of a record from a sample on. Set their estimates (num_samples, ..., batch),
+        and the numbers of the samples that NumPy has to process. Return the state with the memory
+        that follows in these rows.
+
+        Args:
+            record: the record.
+            rows: the numbers of the rows.
+            first: number of the first sample.
+            state: the state before the first sample of the record, with the memory and the roots
+                before this one.
+            results: the arrays of the results.
+            reached: the numbers of the samples, shape (batch,).
+        """
+        whole, n = len(rows) == record.batch, record.num_samples
+        estimator = self._estimator if whole else of_rows(self._estimator, rows)
+        own = record if whole else record.rows(rows)
+        before = state_of(estimator, self._before(record, first, state, results), rows)
+        memory, arrays = estimator.carried_memory(before)
+        plan = self._plan
+        if self._by_sample or not whole:
+            R = noise_at(estimator.noise, own.t[first:])
+            plan = plan_of(estimator, self._made, R, **estimator.plan_settings())
+        t = np.ascontiguousarray(own.t[first:], dtype=float)
+        y, u = (np.ascontiguousarray(a[:, first:].transpose(1, 2, 0)) for a in (own.y, own.u))
+        part = {name: array[first:] for name, array in results.items()}
+        if not whole:
+            part = {name: np.empty((*a.shape[:-1], len(rows))) for name, a in part.items()}
+        earlier = _arrays_of(before)
+        names = ["t", "y", "u", "x", "P", "innovation", "S", "x_before", "P_before"]
+        given = [t, y, u, *part.values(), *earlier[2:]]
+        if before.t is not None:
+            names, given = [*names, "t_before", "u_before"], [*given, *earlier[:2]]
+        call = call_with(arrays | dict(zip(names, given, strict=True)))
+        call.plan, call.batch, call.samples = addressof(plan.structure), len(rows), n - first
+        stopped = np.empty(len(rows), dtype=np.int64)
+        self._run(addressof(call), address(stopped))
+        reached[rows] = first + stopped
+        if whole:
+            return replace(state, memory=memory)
+        for name, array in part.items():
+            results[name][first:, ..., rows] = array
+        return replace(state, memory=self._estimator.with_memory_rows(state.memory, rows, memory))
+
+    def _before(
+        self, record: Record, k: int, state: State, results: dict[str, np.ndarray]
+    ) -> State:
+        """Return the state before sample k; the arguments are those of `_through`."""
+        if k == 0:
+            return state
+        xhat, P = (np.moveaxis(results[name][k - 1], -1, 0) for name in ("xhat", "P"))
+        return replace(state, t=float(record.t[k - 1]), u=record.u[:, k - 1], xhat=xhat, P=P)
+
+    def _by_numpy(
+        self, record: Record, rows: np.ndarray, k: int, state: State, results: dict[str, np.ndarray]
+    ) -> State:
+        """Process sample k in some rows of a record, and return the state with the memory and the
+        roots that follow; the arguments are those of `_through`."""
+        estimator = of_rows(self._estimator, rows)
+        before = state_of(estimator, self._before(record, k, state, results), rows)
+        t, y, u = float(record.t[k]), record.y[rows, k], record.u[rows, k]
+        with np.errstate(all="ignore"):
+            part = estimator.update_by_numpy(before, t, y, u)
+        if (box := estimator.system.state_box) is not None:
+            part = kept_inside(part, box)
+        for name in FIELDS:
+            results[name][k][..., rows] = np.moveaxis(getattr(part, name), 0, -1)
+        return with_rows(self._estimator, state, rows, part)
+
+
+def state_of(estimator: RecursiveEstimator, state: State, rows: np.ndarray) -> State:
+    """Return the state of some rows, for the estimator of these."""
+    assert state.P is not None
+    return State(
+        state.xhat[rows],
+        state.t,
+        None if state.u is None else np.asarray(state.u)[rows],
+        state.P[rows],
+        memory=estimator.memory_rows(state.memory, rows),
+        root=None if state.root is None else state.root[rows],
+    )
+
+
+def with_rows(estimator: RecursiveEstimator, state: State, rows: np.ndarray, part: State) -> State:
+    """Return the state with the memory and the roots of some rows replaced."""
+    root = state.root
+    if root is not None and part.root is not None:
+        root = root.copy()
+        root[rows] = part.root
+    memory = estimator.with_memory_rows(state.memory, rows, part.memory)
+    return replace(state, memory=memory, root=root)
+
+
+def _empty(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """Return empty arrays of some shapes. They are views of a single one, because only large arrays
+    are allocated in large memory pages, whose first access takes less time."""
+    sizes = [math.prod(shape) for shape in shapes.values()]
+    parts = np.split(np.empty(sum(sizes)), np.cumsum(sizes)[:-1])
+    return {name: part.reshape(shapes[name]) for name, part in zip(shapes, parts, strict=True)}
+
+
+def call_with(arrays: dict[str, np.ndarray]) -> CallStructure:
+    """Return a call with the arrays of some fields."""
+    return CallStructure(**{name: address(array) for name, array in arrays.items()})
+
+
+def _arrays_of(state: State) -> list[np.ndarray]:
+    """Return the time, inputs, estimate and covariance of a state in the layout of compiled
+    code."""
+    assert state.P is not None
+    t = np.array([np.nan if state.t is None else state.t])
+    u = np.empty((0, len(state.xhat))) if state.u is None else state.u.T
+    parts = (t, u, state.xhat.T, state.P.transpose(1, 2, 0))
+    return [np.ascontiguousarray(part, dtype=float) for part in parts]
