@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -79,7 +79,8 @@ class Drawn(System):
     rates: Any = None
     outputs: Any = None
     input_names = ()
-    jumps = ()
+    jumps: ClassVar[tuple[float, ...]] = ()
+    begin: ClassVar[float] = 0.0
 
     def f(self, t, x, u):
         xp, own = array_namespace(x), type(self).rates
@@ -101,7 +102,7 @@ class Drawn(System):
         return self.jumps
 
 
-def matrix_or_level(rng, n):
+def matrix_or_level(rng: np.random.Generator, n: int) -> Any:
     """A noise level: zero, one for all, one for each, or a matrix."""
     kind = rng.integers(4)
     if kind == 0:
