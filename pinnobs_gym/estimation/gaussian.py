@@ -12,6 +12,7 @@ from pinnobs_gym.estimation.estimator import BaseEstimator, Range, State
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.simulation.noise import AssumedNoise, Noise
 from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.plant_form import first_row
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
 
@@ -51,7 +52,7 @@ class GaussianEstimator(BaseEstimator):
         The default is a share of the state's scale, which is right where the scale is the range of
         a state. It is not where a state varies little about a large value.
         """
-        system, setup = self.system, self.system.setups["benchmark"]
+        system, setup = first_row(self.system), self.system.setups["benchmark"]
         mean = Prior.of(system, setup, 1).mean
         with np.errstate(all="ignore"):  # an output that is not defined there says nothing
             H = np.asarray(system.h_jacobian(0.0, mean, np.zeros((1, system.nu))))[0]

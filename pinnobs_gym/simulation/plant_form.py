@@ -59,13 +59,8 @@ def plant_form(system: System, literal: bool = False) -> PlantForm:
     Raises:
         ValueError: in one line, if a number that has to be kept differs between rows.
     """
-    usual = _defaults(type(system))
     values = {f.name: getattr(system, f.name) for f in fields(system)}
-    by_row = {
-        name: value
-        for name, value in values.items()
-        if isinstance(value, np.ndarray) and value.ndim == 1 and value.size and name in usual
-    }
+    by_row = _by_row(system)
     single: dict[str, Any] = {name: float(value[0]) for name, value in by_row.items()}
     if system.measured_input:
         single["measured_input"] = False
@@ -85,6 +80,25 @@ def plant_form(system: System, literal: bool = False) -> PlantForm:
     except Exception:  # whatever pickle raises for a lambda or an open file
         return form
     return replace(form, key=(type(system), numbers, properties, rest))
+
+
+def first_row(system: System) -> System:
+    """Return the system of the first row, if its numbers differ between rows."""
+    first = {name: value[:1] for name, value in _by_row(system).items()}
+    return replace(system, **first) if first else system
+
+
+def _by_row(system: System) -> dict[str, np.ndarray]:
+    """Return the fields (batch,) of a system that have one number per row."""
+    usual, values = (
+        _defaults(type(system)),
+        {f.name: getattr(system, f.name) for f in fields(system)},
+    )
+    return {
+        name: value
+        for name, value in values.items()
+        if isinstance(value, np.ndarray) and value.ndim == 1 and value.size and name in usual
+    }
 
 
 def _finite_properties(system: System, one: System) -> tuple[str, ...]:

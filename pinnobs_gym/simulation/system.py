@@ -612,8 +612,12 @@ def output_scale(system: System) -> np.ndarray:
 
     It is the largest change of the output, to first order, when one state changes by its scale: the
     largest over `_STATES` states of the benchmark's initial set, and `_TIMES` times of the episode
-    and their inputs; one if no state changes the output.
+    and their inputs; one if no state changes the output. The numbers of the first row stand for
+    all.
     """
+    from pinnobs_gym.simulation.plant_form import first_row
+
+    system = first_row(system)
     setup, scale = system.setups["benchmark"], vector(system.scale, system.nx, "scale")
     t = np.repeat(np.linspace(0.0, setup.duration, _TIMES), _STATES)
     x = np.tile(initial_states(system, setup, _STATES), (_TIMES, 1))

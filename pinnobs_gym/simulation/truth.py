@@ -472,8 +472,9 @@ def _solve_adaptively(
 
 def rows_of(system: System, rows: np.ndarray) -> System:
     """Return the system with its array parameters (batch,) restricted to some rows, and those of a
-    plant that is one of its parameters."""
+    plant that is one of its parameters. Arrays of a single entry hold for all rows."""
     values = {f.name: getattr(system, f.name) for f in fields(system)}
-    changes = {name: value[rows] for name, value in values.items() if getattr(value, "ndim", 0)}
+    arrays = {name: value for name, value in values.items() if getattr(value, "ndim", 0)}
+    changes = {name: value[rows] for name, value in arrays.items() if len(value) > 1}
     changes |= {n: rows_of(value, rows) for n, value in values.items() if isinstance(value, System)}
     return replace(system, **changes) if changes else system

@@ -23,6 +23,7 @@ from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.noise import Noise, SampledLevel
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
@@ -407,3 +408,48 @@ def test_an_update_refuses_inputs_that_the_model_does_not_use():
     u[2, 1] += 1.0
     with pytest.raises(ValueError, match=r"input u2=.* is not that of InductionMotor.input"):
         estimator.update(state, 1e-3, np.zeros((3, 2)), u)
+
+
+@KINDS
+def test_an_array_of_one_number_holds_for_all_rows(kind):
+    system, record = played(many_plants.cart, 9)
+    estimator = kind(replace(system, drag=np.array([0.3]), gain=np.array([0.8])))
+    assert estimator.compiled is not None
+    assert_same(estimator.run(record), kind(system).run(record))
+    assert_same(stacked(steps(estimator, record, 5)), stacked(steps(kind(system), record, 5)))
+
+
+@KINDS
+def test_no_rows(kind):
+    estimator = kind(many_plants.Escape())
+    assert estimator.compiled is not None
+    prior = Prior(np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    state = estimator.reset(prior)
+    for t in (0.0, 0.1):
+        state = estimator.update(state, t, np.zeros((0, 2)), np.zeros((0, 0)))
+        assert state.xhat.shape == (0, 2)
+
+
+@dataclass(frozen=True)
+class Sensed(many_plants.Henon):
+    """Its sensor has a gain."""
+
+    sensitivity: float = 1.0
+
+    def h(self, t, x, u):
+        return stack(x, self.sensitivity * x[..., 0])
+
+
+@KINDS
+def test_outputs_that_depend_on_numbers_of_rows(kind, caplog):
+    gains = np.linspace(0.5, 1.5, 3)
+    system, t = Sensed(sensitivity=gains), np.arange(8.0)
+    record = many_plants.simulated(system, t, 3, missing=0.0)
+    estimator = kind(system)
+    assert estimator.compiled is not None
+    found = estimator.run(record)
+    assert_near(found, in_numpy(estimator).run(record))
+    for i, gain in enumerate(gains):
+        alone = kind(Sensed(sensitivity=gain)).run(record.rows(np.array([i])))
+        assert_same(alone, Estimates(*(getattr(found, name)[i : i + 1] for name in FIELDS)))
+    assert "differentiated" not in caplog.text

@@ -53,8 +53,9 @@ def address(array: np.ndarray) -> int:
 
 def plant_numbers(system: System, numbers: Sequence[str]) -> np.ndarray:
     """Return attributes of a system that its code takes as numbers, (n,), or (n, batch) if any has
-    one per row."""
+    one per row. Arrays of a single number hold for any number of rows."""
     values = [np.asarray(getattr(system, name), dtype=float) for name in numbers]
+    values = [value.reshape(()) if value.shape == (1,) else value for value in values]
     by_row = any(value.ndim for value in values)
     return np.array(np.broadcast_arrays(*values) if by_row else values, dtype=float)
 

@@ -190,6 +190,8 @@ class ModelKernel:
         used; None if NumPy has to do it."""
         if type(x) is not np.ndarray or x.dtype is not _FLOAT or not x.size:
             return None, None
+        if not x.flags.aligned:
+            return None, None
         *outer, nx = x.shape
         if nx != self._nx or len(outer) > 2:
             return None, None
@@ -210,6 +212,8 @@ class ModelKernel:
         if self._input:
             joined = self._input == 2
             if not self._fits(u0, points, batch) or (joined and not self._fits(u1, points, batch)):
+                return None, None
+            if joined and u1.shape != u0.shape:
                 return None, None
             if joined and u1.strides != u0.strides:
                 u0, u1 = kept_u = np.ascontiguousarray(u0), np.ascontiguousarray(u1)
@@ -243,6 +247,8 @@ class ModelKernel:
     def _fits(self, u: Any, points: int, batch: int) -> bool:
         """Return whether inputs broadcast to (points, batch, nu)."""
         if type(u) is not np.ndarray or u.dtype is not _FLOAT or u.shape[-1:] != (self._nu,):
+            return False
+        if not u.flags.aligned:
             return False
         outer = u.shape[:-1]
         wanted = (points, batch)[2 - len(outer) :] if len(outer) < 3 else ()

@@ -64,6 +64,7 @@ class TruthKernel:
         if isinstance(system, Driven):
             part = (flat.t - system.start) / (system.end - system.start)
             u = np.stack([system.first, system.second])
+            u = np.broadcast_to(u, (2, len(x0), system.nu))
             inputs |= _given(system, u, part, np.zeros(len(mesh.steps)))
             system = system.plant
         fields = {
@@ -86,9 +87,12 @@ class TruthKernel:
         """Write the states with process noise L (nx, m) at samples 1 and later to ``x``
         (num_samples, batch, nx), whose first is given. The other arguments are those of
         `pinnobs_gym.simulation.truth.disturbed_truth`."""
+        parts = len(times) - 1, draws.shape[1]
+        draws = np.broadcast_to(draws, (*parts, 2, len(x[0]), L.shape[1]))
         steps = _disturbed_steps(times, draws.shape[1], tuple(system.breakpoints()), longest)
         given: dict[str, Any] = {"t": steps.t}
         if inputs is not None:
+            inputs = np.broadcast_to(inputs, (len(times), len(x[0]), system.nu))
             start, end = (np.repeat(times[steps.interval + k], _STAGES) for k in (0, 1))
             given |= _given(system, inputs, (steps.t - start) / (end - start), steps.interval)
         force = {"part": steps.part, "part_start": steps.start, "part_length": steps.length}
@@ -101,6 +105,8 @@ class TruthKernel:
         """Call the solver with these arrays of ``struct solution``; return the states at the end,
         (batch, nx)."""
         p, end = plant_numbers(system, self._numbers), np.empty((len(x0), system.nx))
+        if p.ndim > 1:  # or a ValueError in one line, as of NumPy
+            p = np.broadcast_to(p, (len(p), len(x0)))
         if p.ndim == 1 and "u_ends" not in arrays and system.nu:
             u = np.asarray(system.input(arrays["t"]), dtype=float)
             arrays["u"] = np.broadcast_to(u, (len(arrays["t"]), system.nu))

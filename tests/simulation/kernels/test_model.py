@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import threading
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -289,3 +290,49 @@ def test_plants_are_copied_and_pickled_without_their_kernel(used):
 
     compiled("model", system, steps)
     assert used[0] == 4
+
+
+class Often(Pushed):
+    """Its breakpoints are more than a small stack holds."""
+
+    def breakpoints(self):
+        return tuple(np.linspace(0.0, 1.0, 200_000))
+
+
+def test_any_number_of_breakpoints():
+    x, results = np.random.default_rng(0).normal(size=(5, 2)), []
+
+    def step():
+        return [model_step(Often(), 0.0, 3e-5, x)]
+
+    def in_thread():
+        before = threading.stack_size(1 << 20)
+        thread = threading.Thread(target=lambda: results.extend(step()))
+        thread.start()
+        thread.join()
+        threading.stack_size(before)
+        return results
+
+    (found,), (expected,) = compiled("model", Often(), in_thread), by_numpy(step)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_an_array_of_one_number_holds_for_all_rows(used):
+    one, x = Pushed(damping=np.array([0.4])), np.random.default_rng(0).normal(size=(9, 2))
+    agree(one, lambda: [model_step(one, 0.0, 1.0, x), *model_step_jacobian(one, 0.0, 1.0, x)])
+    assert used[0] == 2
+
+
+def test_inputs_and_states_of_other_shapes_and_layouts():
+    rng = np.random.default_rng(0)
+    joined = type("Joined", (Pushed,), {"input_hold": "linear"})(measured_input=True)
+    points, u = rng.normal(size=(4, 5, 2)), rng.normal(size=(4, 5, 1))
+    ends = [(u[0], u[1, 0]), (u, u[0]), (u[:, :1], u), (u[0], u[:1])]
+    agree(joined, lambda: [model_step(joined, 0.0, 0.5, points, *each) for each in ends])
+    packed = np.zeros((5, 2), dtype=[("number", "i4"), ("x", "f8")])
+    packed["x"] = points[0]
+    packed = packed["x"]  # twelve bytes from one number to the next
+    given = np.zeros((5, 1), dtype=[("number", "i4"), ("u", "f8")])
+    given["u"] = u[0]
+    agree(joined, lambda: [model_step(joined, 0.0, 0.5, packed, u[0], u[1])])
+    agree(joined, lambda: [model_step(joined, 0.0, 0.5, points[0], given["u"], given["u"])])

@@ -250,3 +250,29 @@ def test_plants_are_copied_and_pickled_without_their_library():
             assert (truth(other, x0, setup.times) == first).all()
 
     compiled("truth", system, solve)
+
+
+def test_an_array_of_one_number_holds_for_all_rows():
+    one, x0 = Pushed(damping=np.array([0.4])), np.random.default_rng(0).normal(size=(5, 2))
+
+    def solve(system):
+        return lambda: truth(system, x0, np.linspace(0.0, 2.0, 21))
+
+    found = compiled("truth", one, solve(one))
+    np.testing.assert_array_equal(found, compiled("truth", one, solve(Pushed(damping=0.4))))
+    assert same(by_numpy(solve(one)), found, one.scale)
+
+
+def test_noise_of_another_number_of_rows_is_refused():
+    system, t = Pushed(damping=np.linspace(0.1, 0.5, 5)), np.linspace(0.0, 1.0, 6)
+    noise, rng = system.noise(None, 0.1), np.random.default_rng(0)
+    shape = (5, *noise_shape(system, noise, 0.2, 0.05)[:2])
+
+    def solve(rows, drawn):
+        x0, draws = np.zeros((rows, 2)), rng.normal(size=(*shape, drawn, 2))
+        return lambda: disturbed_truth(system, noise, x0, t, draws, 0.05)
+
+    for rows, drawn in ((3, 3), (5, 3)):
+        for way in (by_numpy, lambda call: compiled("truth", system, call)):
+            with pytest.raises(ValueError, match="broadcast"):
+                way(solve(rows, drawn))

@@ -41,7 +41,7 @@ static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t
 int64_t run(const struct call *c, int64_t *reached)
 {
     const int64_t entries = c->batch * (NX + NX * NX + NY + NY * NY);
-    const int64_t fitting = CACHED / entries, block = fitting < 8 ? 8 : fitting;
+    const int64_t fitting = entries ? CACHED / entries : 0, block = fitting < 8 ? 8 : fitting;
     int64_t left = 0;
     for (int64_t row = 0; row < c->batch; row++) reached[row] = c->samples;
     for (int64_t k = 0; k < c->samples; k += block) {
