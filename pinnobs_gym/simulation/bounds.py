@@ -32,6 +32,15 @@ class StateBox:
         return beyond
 
 
+def absorbed(x: np.ndarray, box: StateBox | None) -> np.ndarray:
+    """Return the states x (..., nx) of a plant with process noise, of which those that the noise
+    moved beyond a bound are at that bound, where they stay until f or the noise moves them back.
+    States that are not finite remain, so that a plant that diverges is not hidden."""
+    if box is None or not box.outside(x).any():
+        return x
+    return np.where(np.isfinite(x), box.clipped(x), x)
+
+
 def box(low: Bounds | None, high: Bounds | None, nx: int) -> StateBox | None:
     """Return the box of bounds, or None if no state has one.
 

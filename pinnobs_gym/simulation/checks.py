@@ -20,11 +20,12 @@ from pinnobs_gym.simulation.conformance import (
 from pinnobs_gym.simulation.derivatives import central_differences, traced_jacobian
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import described, model_step
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.probe import ModelError, probe
 from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
-from pinnobs_gym.simulation.truth import truth
+from pinnobs_gym.simulation.truth import disturbed_truth, noise_shape, truth
 
 EXACT = 1e-12
 """Largest difference, relative to scale, between two evaluations of the same equations."""
@@ -93,6 +94,16 @@ def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> tuple[np.ndar
     t = times[np.unique(np.linspace(0, len(times) - 1, 200).astype(int))]
     x, u = truth(system, x0, t, setup.truth_step), np.asarray(system.input(t))
     return x, np.asarray(system.h(t[:, None], x, u[:, None]))
+
+
+def _disturbed(system: System, setup: Setup, noise: Noise, x0: np.ndarray) -> np.ndarray:
+    """Return the truth with process noise (num_samples, batch, nx) at the first samples, no more
+    than 200 of them."""
+    times = setup.times[:200]
+    each = noise_shape(system, noise, setup.dt, longest_step(system))
+    shape = (len(times) - 1, *each[:2], len(x0), each[2])
+    draws = np.random.default_rng(3).standard_normal(shape)
+    return disturbed_truth(system, noise, x0, times, draws, setup.truth_step)
 
 
 @add_check(SYSTEM_CHECKS, "attributes")
@@ -292,13 +303,16 @@ def _system_initial_states(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "bounds")
 def _system_bounds(cls: type[System]) -> None:
-    """The truth of every setup, without process noise, stays within the bounds of the states."""
+    """The truth of every setup stays within the bounds of the states, also with process noise."""
     for name, system, setup in _setups(cls):
         box = system.state_box
         if box is None:
             continue
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
         x, _ = _trajectories(system, setup, x0)
+        noise = system.noise(setup.noise_std, setup.process_noise)
+        if noise.stochastic:
+            x = np.concatenate([x, _disturbed(system, setup, noise, x0)])
         size = vector(system.scale, system.nx, "scale")
         for what, bound, beyond in (
             ("below state_low", box.low, box.low - x),

@@ -200,10 +200,10 @@ class System(ABC):
     whole periods are the same state, for `f`, `h` and the scores."""
     state_low: ClassVar[Bounds | None] = None
     """Value below which each state cannot be, such as ``(0.0, None)``, in its unit; None for no
-    bound. Estimates are never below."""
+    bound. Neither estimates nor a truth with process noise are below."""
     state_high: ClassVar[Bounds | None] = None
-    """Value above which each state cannot be, in its unit; None for no bound. Estimates are never
-    above."""
+    """Value above which each state cannot be, in its unit; None for no bound. Neither
+    estimates nor a truth with process noise are above."""
     setups: ClassVar[Mapping[str, Setup]]
     """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
