@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.conformance import (
     Found,
     add_check,
@@ -305,26 +306,19 @@ def _system_initial_states(cls: type[System]) -> None:
 def _system_bounds(cls: type[System]) -> None:
     """The truth of every setup stays within the bounds of the states, also with process noise."""
     for name, system, setup in _setups(cls):
-        box = system.state_box
-        if box is None:
+        if system.state_box is None:
             continue
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
         x, _ = _trajectories(system, setup, x0)
         noise = system.noise(setup.noise_std, setup.process_noise)
         if noise.stochastic:
             x = np.concatenate([x, _disturbed(system, setup, noise, x0)])
-        size = vector(system.scale, system.nx, "scale")
-        for what, bound, beyond in (
-            ("below state_low", box.low, box.low - x),
-            ("above state_high", box.high, x - box.high),
-        ):
-            k, row, i = np.unravel_index(np.argmax(beyond / size), x.shape)
-            require(
-                beyond[k, row, i] <= TRUTH_TOLERANCE * size[i],
-                f"{system.state_names[i]} of the truth of setup {name!r} comes to "
-                f"{x[k, row, i]:.6g}, {what}={bound[i]:g}; expected a plant that stays within its "
-                "bounds",
-            )
+        found = beyond(system, x)
+        require(
+            found is None,
+            f"in the truth of setup {name!r}, {found}; expected a plant that stays within its "
+            "bounds",
+        )
 
 
 @add_check(SYSTEM_CHECKS, "prior")
