@@ -404,7 +404,7 @@ class System(ABC):
         changes: dict[str, Any] = {"dt": dt, "duration": duration, "noise_std": noise_std}
         changes = {name: value for name, value in changes.items() if value is not None}
         own = cls.setups[setup].transient
-        if own is not None and is_number(duration) and 0 < duration < own:
+        if own is not None and duration is not None and 0 < duration < own:
             changes["transient"] = None
         chosen = replace(cls.setups[setup], **changes)
         system = cls()
