@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.at_bounds import faults_at_bounds
 from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.conformance import (
     Found,
@@ -48,8 +49,9 @@ def check_system(cls: type[System]) -> None:
     """Run all `SYSTEM_CHECKS` on a system.
 
     Warns:
-        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup, if the model
-            takes several Runge-Kutta steps per sample, or if it differs from the truth after one.
+        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup, if one is
+            not finite within the bounds of states, or too steep at one, if the model takes several
+            Runge-Kutta steps per sample, or if it differs from the truth after one.
 
     Raises:
         CheckFailed: if any check fails; one line per failure with the check's name, what it found
@@ -304,10 +306,13 @@ def _system_initial_states(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "bounds")
 def _system_bounds(cls: type[System]) -> None:
-    """The truth of every setup stays within the bounds of the states, also with process noise."""
+    """The truth of every setup stays within the bounds of the states, also with process noise. A
+    warning says where f or h is not finite or nearly infinitely steep at a bound."""
     for name, system, setup in _setups(cls):
         if system.state_box is None:
             continue
+        for line in faults_at_bounds(system, setup):
+            warnings.warn(f"system {cls.__name__}, setup {name!r}: {line}", stacklevel=2)
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
         x, _ = _trajectories(system, setup, x0)
         noise = system.noise(setup.noise_std, setup.process_noise)

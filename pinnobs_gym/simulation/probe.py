@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.at_bounds import faults_at_bounds
 from pinnobs_gym.simulation.declared import check_declared, check_starts
 from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number
 
 
@@ -35,7 +37,8 @@ _ADVICE = "array functions of xp = array_namespace(x), on the last axis: x[..., 
 @functools.cache
 def probe(cls: type[System]) -> None:
     """Call the functions of a system on small batches in NumPy, once per class, with the
-    benchmark's parameters.
+    benchmark's parameters. A line in the log says where they are not finite within the bounds of
+    the states, or nearly infinitely steep at one.
 
     Raises:
         TypeError: in one line, if the class declares what it should not, see `check_declared`.
@@ -74,6 +77,8 @@ def probe(cls: type[System]) -> None:
             _call(system, "f_jacobian", (system.nx, system.nx), t=t, x=x, u=u)
         if cls.h_jacobian is not System.h_jacobian:
             _call(system, "h_jacobian", (system.ny, system.nx), t=t, x=x, u=u)
+    for line in faults_at_bounds(system, setup):
+        say_once(line)
 
 
 @functools.cache

@@ -371,8 +371,8 @@ class System(ABC):
         return None
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times in s at which f or the input jumps; steps of the truth and of the model
-        end at each."""
+        """Return the times in s at which f, the input or the process noise jumps; steps of truth
+        and model end at each."""
         return ()
 
     @property
