@@ -24,6 +24,7 @@ from pinnobs_gym.estimation.estimator import (
 )
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.high_gain import HighGain
 from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.simulation.checks import SYSTEM_CHECKS, check_system
 from pinnobs_gym.simulation.conformance import CheckFailed
@@ -813,3 +814,8 @@ def test_observers_that_amplify_rounding_are_given_more_room():
     grown = 10 * 1e-9 * np.exp(3 * 3.9)
     assert tolerated(estimator.run, Saddle(), record, 1e-6) == pytest.approx(grown, rel=1e-2)
     assert tolerated(EKF(Linear()).run, Linear(), short_record(EKF(Linear())), 1e-6) == 1e-6
+
+
+@pytest.mark.parametrize("process_noise", [None, 0.3, ((0.0, 0.0), (0.2, 0.5))])
+def test_high_gain_forgets_the_same_with_blank_rows_and_without(process_noise):
+    ESTIMATOR_CHECKS["blank_rows"](HighGain(Linear(), process_noise=process_noise))
