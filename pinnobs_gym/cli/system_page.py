@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
+from math import isfinite
 from types import ModuleType
+from typing import Any
 
 from docstring_parser import parse_from_object
 
@@ -42,6 +44,7 @@ def page(cls: type[System], env_id: str) -> str:
             ],
         ),
         *_repeating(system, system.state_names, system.state_period),
+        *_bounded(system),
         "\n## Observation Space\n",
         f"`Box(({system.ny + system.nu + 1},), float32)`: the outputs, the inputs, then time.\n",
         _table(
@@ -123,26 +126,49 @@ def _repeating(system: System, names: Sequence[str], periods: Periods | None) ->
     return [f"\n{'; '.join(found)}: whole periods do not count."] if found else []
 
 
+def _bounded(system: System) -> list[str]:
+    """Return a line about the states that have bounds, if there are any."""
+    box, found = system.state_box, []
+    if box is None:
+        return []
+    for name, low, high in zip(system.state_names, box.low, box.high, strict=True):
+        unit = _unit(type(system), name)
+        sides = [
+            f"{what} {side:.6g} {unit}".rstrip()
+            for what, side in (("at least", low), ("at most", high))
+            if isfinite(side)
+        ]
+        if sides:
+            found.append(f"`{name}` is {' and '.join(sides)}")
+    return [f"\n{'; '.join(found)}: the plant and all estimates stay within these bounds."]
+
+
+def _rounded(values: Any) -> Any:
+    """Return numbers, or rows of them, with six digits."""
+    if isinstance(values, list | tuple):
+        return [_rounded(each) for each in values]
+    return float(f"{values:.6g}")
+
+
 def _setups(cls: type[System]) -> str:
     lines, time = [], "step" if cls.discrete else "√s"
     for name in cls.setups:
         system, setup = cls.configured(name)
-        xhat0, P0 = (moments.tolist() for moments in prior_moments(system, setup))
+        xhat0, P0 = (_rounded(moments.tolist()) for moments in prior_moments(system, setup))
         law = setup.start(system.nx)
         start = law.sentence + ("" if law.fixed else ", where admissible")
-        noise = noise_std(setup.noise_std, system.ny, "noise_std").tolist()
+        noise = noise_std(setup.noise_std, system.ny, "noise_std")
         process = noise_std(setup.process_noise, system.nx, "process_noise")
         lines.append(
             f"- `{name}`: {start}; x̂₀ = {xhat0}, P₀ = {P0}; output "
-            f"noise {noise}"
-            + (f"; process noise {process.tolist()} per {time}" if process.any() else "")
+            f"noise {_rounded(noise.tolist())}"
+            + (f"; process noise {_rounded(process.tolist())} per {time}" if process.any() else "")
             + (f"; {dict(setup.parameters)}" if setup.parameters else "")
         )
         if setup.poor_prior is not None:
-            xhat0, P0 = setup.poor_prior.xhat0, setup.poor_prior.P0
-            lines[-1] += (
-                f"; under `poor_prior`, x̂₀ = {list(xhat0)}, P₀ = {[list(row) for row in P0]}"
-            )
+            poor = setup.poor_prior
+            xhat0, P0 = _rounded(list(poor.xhat0)), _rounded([list(row) for row in poor.P0])
+            lines[-1] += f"; under `poor_prior`, x̂₀ = {xhat0}, P₀ = {P0}"
     note = inspect.getdoc(cls.admissible) or ""
     return "\n".join([*lines, f"\nAdmissible: {note}" if "admissible" in vars(cls) else ""])
 

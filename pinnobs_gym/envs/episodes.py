@@ -10,10 +10,12 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.conditions import parse_condition
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, noise_scale
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import Level
+from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import longest_step
@@ -189,6 +191,12 @@ class EpisodeSource:
             x[:] = truth(plant, start[:1], self.times, self.setup.truth_step)
         else:
             truth(plant, start, self.times, self.setup.truth_step, x, inputs)
+        if (found := beyond(self.system, x)) is not None:
+            name, state = type(self.system).__name__, found.split(" comes to ")[0]
+            say_once(
+                f"{name}: {state} of the true states leaves its bounds (state_low, state_high), "
+                "within which estimates are kept; scores are worse for it"
+            )
         y[:] = self.noise.outputs(self.times, draws.noise.swapaxes(0, 1))
         y += plant.h(self.times[:, None], x, u)
         if not self.trivial:

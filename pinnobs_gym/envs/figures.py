@@ -18,7 +18,7 @@ TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
 _ROUNDING = 1e-9
 """Largest difference, over its period, of an angle and an output that measures it."""
 _LARGEST = 1e100
-"""Largest absolute estimate that is drawn, since an axis cannot span all numbers."""
+"""Largest absolute value that is drawn, since an axis cannot span all numbers."""
 
 
 def state_figure(
@@ -56,7 +56,7 @@ def state_figure(
         unit = system.units.get(name)
         panel.set_ylabel(f"{name} ({unit})" if unit else name)
         if y is not None and i in measured:
-            dots = y[:, measured[i]]
+            dots = _drawable(y[:, measured[i]])
             panel.plot(t, dots, ".", ms=2, color=MEASURED, label="measured")
         if x is not None:
             true = x[:, i]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import initial_states
+from pinnobs_gym.simulation.system import System, initial_states, vector
 from pinnobs_gym.simulation.truth import truth
 
 NUM_SAMPLES = 40
@@ -42,3 +43,22 @@ def copied(record: Record) -> Record:
     prior = Prior(record.prior.mean.copy(), record.prior.cov.copy())
     t, y, u = record.t.copy(), record.y.copy(), record.u.copy()
     return replace(record, t=t, y=y, u=u, prior=prior)
+
+
+def tolerated(
+    run: Callable[[Record], Estimates], system: System, record: Record, tolerance: float
+) -> float:
+    """Return the difference over scale up to which estimates count as the same where they should
+    be: the tolerance or, if that is more, ten times what a change of the prior's mean and of the
+    outputs by a thousandth of it changes in the estimates.
+
+    An observer that diverges on a plant amplifies rounding beyond any fixed tolerance, for which
+    neither the observer's code nor the plant is wrong.
+    """
+    size, scale = 1e-3 * tolerance, vector(system.scale, system.nx, "scale")
+    changed = copied(record)
+    changed.prior.mean[:] += size * scale
+    changed.y[:] *= 1 + size
+    with np.errstate(all="ignore"):
+        off = abs(system.state_residual(run(changed).xhat, run(record).xhat)) / scale
+    return max(tolerance, 10 * float(np.nan_to_num(off, nan=0.0).max()))

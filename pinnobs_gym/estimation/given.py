@@ -22,6 +22,7 @@ from pinnobs_gym.simulation.record import Prior, Record, check_use
 from pinnobs_gym.simulation.system import System
 
 _INF = float("inf")
+_FLOAT = np.dtype(float)
 
 
 def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
@@ -64,8 +65,9 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
 
     The sample has to be what `Record` and `Record.check_fits` accept: a later time, a whole number
     if the system is a map, outputs that are finite or NaN, finite inputs, and those that the system
-    defines if it uses no measured ones. The check takes about a microsecond, more for such a system
-    with inputs. The attribute ``unchecked`` is the method without it, for the samples of a record,
+    defines if it uses no measured ones. What is like an array of real numbers, such as a list, is
+    taken as one. The check takes about a microsecond, more for such a system with inputs. The
+    attribute ``unchecked`` is the method without it, for the samples of a record,
     which are checked all at once.
     """
 
@@ -81,7 +83,8 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
             # A sum of squares is finite if all numbers are, unless some are huge.
             usual = (
                 (y.shape, u.shape) == shapes
-                and y.dtype.kind != "c"
+                and y.dtype is _FLOAT
+                and u.dtype is _FLOAT
                 and not getattr(t, "ndim", 0)
                 and (before is None or t > before)
                 and -_INF < t < _INF
@@ -92,6 +95,7 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
             usual = False
         if not usual:
             _check_sample(system, before, t, y, u, shapes)
+            y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
         # Compiled code compares inputs itself.
         by_code = getattr(self, "compiled", None) is not None
         if ((nu and not system.measured_input) or system.discrete) and not by_code:

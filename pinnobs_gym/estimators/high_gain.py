@@ -14,10 +14,11 @@ from pinnobs_gym.estimation.gaussian import (
     covariances,
     predicted,
 )
-from pinnobs_gym.estimation.kalman import observe
+from pinnobs_gym.estimation.kalman import observe, predict
 from pinnobs_gym.estimation.observer_gains import default_rate
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
+from pinnobs_gym.simulation.matrices import sandwich
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -32,6 +33,9 @@ class HighGainMemory:
     """Size of P after the last sample with an output."""
     last: np.ndarray
     """Time of that sample in s, or of the first one."""
+    added: np.ndarray | None = None
+    """The part of P that process noise has added since that sample, shape (nx, nx, batch), which is
+    not forgotten before the next one; None without process noise, or with roots."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     process noise. Without a limit, P would grow without bound in directions that the outputs do not
     determine. From the last sample with an output on, the factor is therefore no larger than that
     which makes the P of this sample as large as P₀ + diag(scale²), as measured by the sum of the
-    variances over scale². Samples without any output do not change what is forgotten.
+    variances over scale². Samples without any output do not change what is forgotten: process noise
+    since the last output is none of it (but where a very wide prior is computed with roots).
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, the noise is the known
     one, and a benchmark episode lasts 20 time constants 1/θ.
@@ -76,14 +81,25 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)
         size = self._size(prior.cov.transpose(1, 2, 0))
-        memory = HighGainMemory(size + self.system.nx, size, np.full(len(size), np.nan))
         L = prior_root(self.system, prior, self.noise.R(0.0))
+        added = None
+        if self.noise.stochastic and L is None:
+            added = np.zeros((self.system.nx, self.system.nx, len(size)))
+        memory = HighGainMemory(size + self.system.nx, size, np.full(len(size), np.nan), added)
         return State(prior.mean, P=prior.cov, memory=memory, root=L)
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
         growth = self._growth(state.memory, t) - self._growth(state.memory, state.t)
-        P = covariances(state) * np.exp(growth)
+        P, memory = covariances(state), state.memory
+        if memory.added is not None:
+            P = (P - memory.added) * np.exp(growth) + memory.added
+            ends = (state.t, t), state.xhat, P, self.noise, (state.u, u)
+            xhat, P, F, Q = predict(self.system, *ends)
+            memory = replace(memory, added=sandwich(F, memory.added) + Q)
+            covariance = P.transpose(2, 0, 1)
+            return State(xhat, state.t, state.u, covariance, state.innovation, None, memory)
+        P = P * np.exp(growth)
         if state.root is not None:
             state = replace(state, root=state.root * np.exp(growth / 2)[:, None, None])
         return predicted(self.system, state, P, self.noise, t, u)
@@ -103,7 +119,9 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
         memory: HighGainMemory = state.memory
         seen = ~np.isnan(y).all(axis=1) | np.isnan(memory.last)
         size = np.where(seen, self._size(covariances(new)), memory.size)
-        memory = replace(memory, size=size, last=np.where(seen, t, memory.last))
+        added = None if memory.added is None else np.where(seen, 0.0, memory.added)
+        last = np.where(seen, t, memory.last)
+        memory = replace(memory, size=size, last=last, added=added)
         return replace(new, memory=memory)
 
     def _size(self, P: np.ndarray) -> np.ndarray:

@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from pinnobs_gym.simulation.system import System
+
 Bounds: TypeAlias = Sequence[float | None]
 """One bound per state, in its unit; None where a state has none."""
+
+TOLERANCE = 1e-8
+"""How far beyond a bound, relative to its scale, a state of the truth counts as within."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +28,11 @@ class StateBox:
     high: np.ndarray
     """Upper bounds, shape (nx,); ∞ where there is none."""
 
+    @property
+    def bounded(self) -> np.ndarray:
+        """Which states have a bound, bool (nx,)."""
+        return np.isfinite(self.low) | np.isfinite(self.high)
+
     def clipped(self, x: np.ndarray) -> np.ndarray:
         """Return the states x (..., nx) with each component moved to the bound that it exceeds."""
         return np.clip(x, self.low, self.high)
@@ -30,6 +41,31 @@ class StateBox:
         """Return which of the states x (..., nx) exceed a bound, bool (...)."""
         beyond: np.ndarray = np.any((x < self.low) | (x > self.high), axis=-1)
         return beyond
+
+
+def beyond(system: System, x: np.ndarray) -> str | None:
+    """Return in words which of the states x (..., nx) of a system exceeds its bound most, relative
+    to its scale; None if none does by more than `TOLERANCE`."""
+    box = system.state_box
+    if box is None or not box.outside(x).any():
+        return None
+    rows, size = x.reshape(-1, system.nx), np.asarray(system.scale, dtype=float)
+    over = np.stack([box.low - rows, rows - box.high]) / size
+    over = np.where(np.isfinite(rows), over, -np.inf)
+    side, row, i = np.unravel_index(np.argmax(over), over.shape)
+    if over[side, row, i] <= TOLERANCE:
+        return None
+    what = f"above state_high={box.high[i]:g}" if side else f"below state_low={box.low[i]:g}"
+    return f"{system.state_names[i]} comes to {rows[row, i]:.6g}, {what}"
+
+
+def absorbed(x: np.ndarray, box: StateBox | None) -> np.ndarray:
+    """Return the states x (..., nx) of a plant with process noise, of which those that the noise
+    moved beyond a bound are at that bound, where they stay until f or the noise moves them back.
+    States that are not finite remain, so that a plant that diverges is not hidden."""
+    if box is None or not box.outside(x).any():
+        return x
+    return np.where(np.isfinite(x), box.clipped(x), x)
 
 
 def box(low: Bounds | None, high: Bounds | None, nx: int) -> StateBox | None:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.at_bounds import faults_at_bounds
+from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.conformance import (
     Found,
     add_check,
@@ -20,11 +22,12 @@ from pinnobs_gym.simulation.conformance import (
 from pinnobs_gym.simulation.derivatives import central_differences, traced_jacobian
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.model import described, model_step
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.probe import ModelError, probe
 from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
-from pinnobs_gym.simulation.truth import truth
+from pinnobs_gym.simulation.truth import disturbed_truth, noise_shape, truth
 
 EXACT = 1e-12
 """Largest difference, relative to scale, between two evaluations of the same equations."""
@@ -46,8 +49,9 @@ def check_system(cls: type[System]) -> None:
     """Run all `SYSTEM_CHECKS` on a system.
 
     Warns:
-        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup, if the model
-            takes several Runge-Kutta steps per sample, or if it differs from the truth after one.
+        UserWarning: if an equation or its Jacobian is not finite at the x̂₀ of a setup, if one is
+            not finite within the bounds of states, or too steep at one, if the model takes several
+            Runge-Kutta steps per sample, or if it differs from the truth after one.
 
     Raises:
         CheckFailed: if any check fails; one line per failure with the check's name, what it found
@@ -93,6 +97,16 @@ def _trajectories(system: System, setup: Setup, x0: np.ndarray) -> tuple[np.ndar
     t = times[np.unique(np.linspace(0, len(times) - 1, 200).astype(int))]
     x, u = truth(system, x0, t, setup.truth_step), np.asarray(system.input(t))
     return x, np.asarray(system.h(t[:, None], x, u[:, None]))
+
+
+def _disturbed(system: System, setup: Setup, noise: Noise, x0: np.ndarray) -> np.ndarray:
+    """Return the truth with process noise (num_samples, batch, nx) at the first samples, no more
+    than 200 of them."""
+    times = setup.times[:200]
+    each = noise_shape(system, noise, setup.dt, longest_step(system))
+    shape = (len(times) - 1, *each[:2], len(x0), each[2])
+    draws = np.random.default_rng(3).standard_normal(shape)
+    return disturbed_truth(system, noise, x0, times, draws, setup.truth_step)
 
 
 @add_check(SYSTEM_CHECKS, "attributes")
@@ -292,25 +306,24 @@ def _system_initial_states(cls: type[System]) -> None:
 
 @add_check(SYSTEM_CHECKS, "bounds")
 def _system_bounds(cls: type[System]) -> None:
-    """The truth of every setup, without process noise, stays within the bounds of the states."""
+    """The truth of every setup stays within the bounds of the states, also with process noise. A
+    warning says where f or h is not finite or nearly infinitely steep at a bound."""
     for name, system, setup in _setups(cls):
-        box = system.state_box
-        if box is None:
+        if system.state_box is None:
             continue
+        for line in faults_at_bounds(system, setup):
+            warnings.warn(f"system {cls.__name__}, setup {name!r}: {line}", stacklevel=2)
         x0 = initial_states(system, setup, 1 if setup.fixed_x0 else 20)
         x, _ = _trajectories(system, setup, x0)
-        size = vector(system.scale, system.nx, "scale")
-        for what, bound, beyond in (
-            ("below state_low", box.low, box.low - x),
-            ("above state_high", box.high, x - box.high),
-        ):
-            k, row, i = np.unravel_index(np.argmax(beyond / size), x.shape)
-            require(
-                beyond[k, row, i] <= TRUTH_TOLERANCE * size[i],
-                f"{system.state_names[i]} of the truth of setup {name!r} comes to "
-                f"{x[k, row, i]:.6g}, {what}={bound[i]:g}; expected a plant that stays within its "
-                "bounds",
-            )
+        noise = system.noise(setup.noise_std, setup.process_noise)
+        if noise.stochastic:
+            x = np.concatenate([x, _disturbed(system, setup, noise, x0)])
+        found = beyond(system, x)
+        require(
+            found is None,
+            f"in the truth of setup {name!r}, {found}; expected a plant that stays within its "
+            "bounds",
+        )
 
 
 @add_check(SYSTEM_CHECKS, "prior")

@@ -5,14 +5,18 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping
+from dataclasses import fields
+from difflib import get_close_matches
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.bounds import box
+from pinnobs_gym.simulation.bounds import beyond, box
 from pinnobs_gym.simulation.residual import check_periods
-from pinnobs_gym.simulation.system import Setup, System, is_number
+from pinnobs_gym.simulation.start_law import Box
+from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number, vector
 
 _NAMES = ("state_names", "output_names", "input_names", "uncertain")
 """Attributes that are several names."""
@@ -25,6 +29,11 @@ _CALLS = {
     "breakpoints": "",
 }
 """Methods whose arguments are counted."""
+_NEAR = 0.85
+"""Likeness from which on an attribute's name counts as a misspelt one
+(`difflib.SequenceMatcher.ratio`)."""
+_STARTS = 20
+"""Number of initial states that are drawn to compare them with the bounds."""
 
 
 def check_declared(cls: type[System]) -> None:
@@ -39,6 +48,8 @@ def check_declared(cls: type[System]) -> None:
         _check_methods(cls)
         _check_numbers(cls)
         _check_others(cls)
+        _check_motion(cls)
+        _check_unknown(cls)
     except ValueError as error:
         raise TypeError(f"system {cls.__name__}: {error}") from None
 
@@ -93,16 +104,92 @@ def _check_numbers(cls: type[System]) -> None:
         if size is not None:
             check_periods(_own(cls, name), size, name)
     if nx is not None:
-        box(_own(cls, "state_low"), _own(cls, "state_high"), nx)
+        _check_bounds(cls, nx)
     step = _own(cls, "model_step")
     if step is not None and not (is_number(step) and 0 < step < math.inf):
         raise ValueError(f"model_step={step!r}; expected None or a positive number of seconds")
+
+
+def _check_bounds(cls: type[System], nx: int) -> None:
+    """Check the bounds for themselves, and that no state has both bounds and a period."""
+    bounds = box(_own(cls, "state_low"), _own(cls, "state_high"), nx)
+    for i, period in enumerate(_own(cls, "state_period") or ()):
+        if period is not None and bounds is not None and bounds.bounded[i]:
+            raise ValueError(
+                f"state_period={period:g} and bounds {bounds.low[i]:g} to {bounds.high[i]:g} of "
+                f"state {i + 1}; expected one of them, as a state that repeats goes on beyond them"
+            )
+
+
+def check_starts(cls: type[System]) -> None:
+    """Check that the initial states and the priors of all setups are within the bounds of the
+    states. Of a law other than a box, or one that `System.admissible` restricts, states are drawn.
+
+    Raises:
+        TypeError: in one line, naming the class, the setup, the state and its bound.
+    """
+    for name in cls.setups:
+        system, setup = cls.configured(name)
+        if system.state_box is None:
+            continue
+        law = setup.start(system.nx)
+        x0 = initial_states(system, setup, _STARTS)
+        if isinstance(law, Box) and cls.admissible is System.admissible:
+            x0 = np.stack(law.corners)
+        given = [("an initial state", x0)]
+        for what, prior in (("the prior's mean", setup), ("the poor prior's", setup.poor_prior)):
+            if prior is not None and prior.xhat0 is not None:
+                given.append((what, vector(prior.xhat0, system.nx, "xhat0")))
+        for what, x in given:
+            if (found := beyond(system, x)) is not None:
+                raise TypeError(
+                    f"system {cls.__name__}, setup {name!r}: {found}, in {what}; expected it "
+                    "within the bounds"
+                )
 
 
 def _size(cls: type[System], name: str) -> int | None:
     """Return the number of names; None if they are not those of the class."""
     names = _own(cls, name)
     return None if names is None else len(names)
+
+
+def _check_motion(cls: type[System]) -> None:
+    """Check that what the class says of its motion agrees."""
+    hold, own = _own(cls, "input_hold"), cls.flow is not System.flow
+    if hold not in ("previous", "linear", None):
+        raise ValueError(f"input_hold={hold!r}; expected 'previous' or 'linear'")
+    if own and hold == "linear":
+        raise ValueError(
+            "input_hold='linear', and a flow of its own, whose input is held; expected 'previous'"
+        )
+    discrete = bool(_own(cls, "discrete"))
+    if discrete and (own or _own(cls, "stiff")):
+        other = "its own flow" if own else "stiff=True"
+        raise ValueError(f"discrete=True, a map, and {other}; expected one of them")
+
+
+def _check_unknown(cls: type[System]) -> None:
+    """Check that no attribute has a name that is nearly one of `System`, and that units have names
+    of the class. Parameters, methods and properties may have any name."""
+    parameters = {f.name for f in fields(cls)}
+    known = {n for n in (*vars(System), *System.__annotations__) if not n.startswith("_")}
+    for base in cls.__mro__[: cls.__mro__.index(System)]:
+        for name, value in vars(base).items():
+            own = name.startswith("_") or name in known | parameters
+            if own or callable(value) or hasattr(value, "__get__"):
+                continue
+            near = get_close_matches(name, known, 1, _NEAR)
+            if near:
+                raise ValueError(f"unknown attribute {name}; did you mean {near[0]}?")
+    names = [_own(cls, name) for name in ("state_names", "output_names", "input_names")]
+    if "units" not in vars(cls) or None in names or isinstance(vars(cls)["units"], property):
+        return
+    everything = [*chain(*names), *(f.name for f in fields(cls) if not f.kw_only)]
+    for name in cls.units:
+        if name not in everything:
+            near = get_close_matches(str(name), everything, 1) or [", ".join(everything)]
+            raise ValueError(f"units of an unknown name {name!r}; did you mean {near[0]}?")
 
 
 def _check_others(cls: type[System]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
 from pinnobs_gym.simulation.motion import Interval, Motion, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
@@ -46,11 +47,12 @@ class Map(Motion):
         x: np.ndarray,
         normal: Callable[[int], np.ndarray],
     ) -> np.ndarray:
+        box = over.system.state_box
         for k, u, _ in _steps(over):
             L = noise.L(float(k))[..., 0]
             x = over.system.f(k, x, u)
             if L.shape[1]:
-                x = x + weighted(L, normal(L.shape[1]))
+                x = absorbed(x + weighted(L, normal(L.shape[1])), box)
         return x
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.kernels.asked import is_asked
 from pinnobs_gym.simulation.maps import Map
@@ -112,7 +113,8 @@ def noisy_model_step(
 
     Within a substep of length δ the white noise ẇ is replaced by its projection on linear functions
     of time, (z + √3(2s − 1)z')/√δ for s from 0 to 1. Both ∫ẇ dt and ∫∫ẇ dt² have their exact
-    covariances, and f is evaluated no more often than without noise.
+    covariances, and f is evaluated no more often than without noise. States that noise moves beyond
+    a bound are then at that bound (`pinnobs_gym.simulation.bounds.absorbed`).
 
     Args:
         system: the model.
@@ -135,6 +137,7 @@ def noisy_model_step(
     motion = _motion(system)
     if motion is not None:
         return motion.noisy(Interval(system, t0, t1, u0, u1), noise, x, normal)
+    box = system.state_box
     for t, step, u in substeps(system, t0, t1, x, u0, u1):
         roots = _roots(noise, t)
         rate = partial(_rate, system, t, u)
@@ -142,6 +145,8 @@ def noisy_model_step(
             forces = _forces(roots, float(step), normal(2 * size))
             rate = partial(_forced, rate, forces)
         x = runge_kutta(rate, x, step)
+        if size:
+            x = absorbed(x, box)
     return x
 
 

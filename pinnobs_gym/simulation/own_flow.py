@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.matrices import outer, product
 from pinnobs_gym.simulation.motion import Interval, Motion
 from pinnobs_gym.simulation.noise import Noise, weighted
@@ -58,7 +59,8 @@ class OwnFlow(Motion):
         for i, (M, w, kick) in enumerate(zip(L, _WEIGHTS, kicks, strict=True)):
             if i:
                 x = over.system.flow(times[i - 1], times[i], x, u)
-            x = x + np.sqrt(w * (over.t1 - over.t0)) * weighted(M, kick)
+            kicked = x + np.sqrt(w * (over.t1 - over.t0)) * weighted(M, kick)
+            x = absorbed(kicked, over.system.state_box)
         return x
 
 

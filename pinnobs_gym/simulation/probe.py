@@ -13,8 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.simulation.declared import check_declared
-from pinnobs_gym.simulation.system import System, initial_states, is_number
+from pinnobs_gym.simulation.at_bounds import faults_at_bounds
+from pinnobs_gym.simulation.declared import check_declared, check_starts
+from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number
 
 
 class ModelError(TypeError):
@@ -22,6 +25,8 @@ class ModelError(TypeError):
     function, the file and line of the mistake, and what was expected."""
 
 
+_TIMES = 5
+"""Number of times in an episode at which the noise of a class is tried."""
 _BATCHES = ((2,), (3,), (2, 3))
 """Leading axes of the arrays that are tried. Two sizes tell a batch from a fixed number."""
 _LIBRARIES = [Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")]
@@ -32,7 +37,8 @@ _ADVICE = "array functions of xp = array_namespace(x), on the last axis: x[..., 
 @functools.cache
 def probe(cls: type[System]) -> None:
     """Call the functions of a system on small batches in NumPy, once per class, with the
-    benchmark's parameters.
+    benchmark's parameters. A line in the log says where they are not finite within the bounds of
+    the states, or nearly infinitely steep at one.
 
     Raises:
         TypeError: in one line, if the class declares what it should not, see `check_declared`.
@@ -46,9 +52,12 @@ def probe(cls: type[System]) -> None:
     _check_breakpoints(system)
     if system.draws_input:
         _check_drawn(system, setup.times)
+    if cls.noise is not System.noise:
+        _check_noise(system, setup)
     inputs = _call(system, "input", (system.nu,), t=times)
     _call(system, "admissible", (), x=np.zeros((3, system.nx)) + setup.start(system.nx).mean)
     states = initial_states(system, setup, 6)
+    check_starts(cls)
     for batch in _BATCHES:
         count = int(np.prod(batch))
         x = states[:count].reshape(*batch, system.nx)
@@ -68,6 +77,8 @@ def probe(cls: type[System]) -> None:
             _call(system, "f_jacobian", (system.nx, system.nx), t=t, x=x, u=u)
         if cls.h_jacobian is not System.h_jacobian:
             _call(system, "h_jacobian", (system.ny, system.nx), t=t, x=x, u=u)
+    for line in faults_at_bounds(system, setup):
+        say_once(line)
 
 
 @functools.cache
@@ -109,6 +120,32 @@ def _check_breakpoints(system: System) -> None:
         is_number(t) and np.isfinite(t) for t in times
     ):
         raise where.found(f"returns {times!r}{what}")
+
+
+def _check_noise(system: System, setup: Setup) -> None:
+    """Raise ModelError unless the noise that a class defines has finite L, G and R of the right
+    shapes, at times over an episode."""
+    where, nx, ny = _Where(system, "noise"), system.nx, system.ny
+    try:
+        noise = system.noise(setup.noise_std, setup.process_noise)
+    except Exception as error:  # whatever the user's function raises
+        raise where.failed(error, "; expected a Noise") from error
+    if not isinstance(noise, Noise):
+        raise where.returned(noise, "; expected a Noise")
+    for t in np.linspace(0.0, setup.duration, _TIMES).tolist():
+        for name, rows, columns in (("L", nx, "m"), ("G", ny, "m"), ("R", ny, str(ny))):
+            what = f"whose {name}(t={t:g})"
+            expected = f"; expected finite numbers of shape ({rows}, {columns}, 1)"
+            try:
+                value = np.asarray(getattr(noise, name)(t))
+            except Exception as error:  # whatever the user's function raises
+                raise where.failed(error, f"returns noise {what} fails{expected}") from error
+            given = value.shape
+            wide = len(given) == 3 and columns in ("m", str(given[1]))
+            if not (wide and (given[0], given[2]) == (rows, 1)):
+                raise where.found(f"returns noise {what} has shape {given}{expected}")
+            if value.dtype.kind not in "biuf" or not np.isfinite(value).all():
+                raise where.found(f"returns noise {what} is {value[..., 0].tolist()}{expected}")
 
 
 def _check_drawn(system: System, times: np.ndarray) -> None:

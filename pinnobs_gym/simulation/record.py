@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.motion import check_steps
 from pinnobs_gym.simulation.runge_kutta import longest_step
@@ -70,6 +71,8 @@ class Prior:
             raise ValueError(f"xhat0 has shape {mean.shape}; expected ({system.nx},)")
         if not np.isfinite(mean).all():
             raise ValueError(f"xhat0={mean.tolist()} is not finite")
+        if (found := beyond(system, mean)) is not None:
+            raise ValueError(f"xhat0={mean.tolist()}: {found}; expected it within the bounds")
         mean = np.broadcast_to(mean, (batch, system.nx)).copy()
         return Prior(mean, np.broadcast_to(cov, (batch, system.nx, system.nx)).copy())
 

@@ -109,7 +109,7 @@ class Box(StartLaw):
 
     @property
     def sentence(self) -> str:
-        low, high = (corner.tolist() for corner in self.corners)
+        low, high = map(_rounded, self.corners)
         return f"x₀ = {low}" if self.fixed else f"x₀ uniform in {low} to {high}"
 
     @property
@@ -200,8 +200,9 @@ class Gaussian(StartLaw):
     @property
     def sentence(self) -> str:
         if self.fixed:
-            return f"x₀ = {self.mean.tolist()}"
-        return f"x₀ Gaussian with mean {self.mean.tolist()} and covariance {self.cov.tolist()}"
+            return f"x₀ = {_rounded(self.mean)}"
+        mean, cov = _rounded(self.mean), [_rounded(row) for row in self.cov]
+        return f"x₀ Gaussian with mean {mean} and covariance {cov}"
 
 
 @dataclass(frozen=True)
@@ -247,8 +248,8 @@ class Points(StartLaw):
     @property
     def sentence(self) -> str:
         if self.fixed:
-            return f"x₀ = {self._states[0].tolist()}"
-        return f"x₀ drawn with equal chance from {self._states.tolist()}"
+            return f"x₀ = {_rounded(self._states[0])}"
+        return f"x₀ drawn with equal chance from {[_rounded(state) for state in self._states]}"
 
     @property
     def fixed(self) -> bool:
@@ -318,3 +319,8 @@ def check_covariance(rows: Sequence[Sequence[float]], name: str) -> None:
         raise ValueError(f"{name}={rows}; expected a covariance, symmetric and finite")
     if (np.linalg.eigvalsh(P) < -1e-9 * size).any():
         raise ValueError(f"{name}={rows}; expected a covariance, without eigenvalues below 0")
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    """Return numbers (n,) with six digits, for a sentence."""
+    return [float(f"{value:.6g}") for value in values]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.matrices import (
     cholesky,
@@ -84,7 +85,7 @@ class Stiff(Motion):
         u0, u1 = (None if u is None else flat(u) for u in (over.u0, over.u1))
         end, _, Q = self.moments(replace(over, u0=u0, u1=u1), noise, flat(x))
         moved = mapped(cholesky(Q, semidefinite=True), flat(normal(nx)))
-        return (end + moved).reshape(x.shape)
+        return absorbed((end + moved).reshape(x.shape), over.system.state_box)
 
 
 def _carried(

@@ -98,6 +98,11 @@ class Setup:
             raise ValueError(
                 f"duration={self.duration} s is shorter than one sample, dt={self.dt} s"
             )
+        if self.transient is not None and self.transient > self.duration:
+            raise ValueError(
+                f"transient={self.transient} s is longer than the episode, "
+                f"duration={self.duration} s"
+            )
         for name in ("noise_std", "process_noise"):
             noise_root(getattr(self, name), None, name)
         for name, kind in (("x0_law", StartLaw), ("poor_prior", PoorPrior)):
@@ -200,10 +205,10 @@ class System(ABC):
     whole periods are the same state, for `f`, `h` and the scores."""
     state_low: ClassVar[Bounds | None] = None
     """Value below which each state cannot be, such as ``(0.0, None)``, in its unit; None for no
-    bound. Estimates are never below."""
+    bound. Neither estimates nor a truth with process noise are below."""
     state_high: ClassVar[Bounds | None] = None
-    """Value above which each state cannot be, in its unit; None for no bound. Estimates are never
-    above."""
+    """Value above which each state cannot be, in its unit; None for no bound. Neither
+    estimates nor a truth with process noise are above."""
     setups: ClassVar[Mapping[str, Setup]]
     """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
@@ -366,8 +371,8 @@ class System(ABC):
         return None
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times in s at which f or the input jumps; steps of the truth and of the model
-        end at each."""
+        """Return the times in s at which f, the input or the process noise jumps; steps of truth
+        and model end at each."""
         return ()
 
     @property
@@ -385,7 +390,8 @@ class System(ABC):
         noise_std: Level | None = None,
         parameters: Mapping[str, float] | None = None,
     ) -> tuple[Self, Setup]:
-        """Return the system and the setup of that name, with some values replaced.
+        """Return the system and the setup of that name, with some values replaced. If the duration
+        is shorter than the setup's transient window, that is a quarter of it.
 
         Raises:
             ValueError: naming the value, if the setup or a parameter is unknown, or a value is out
@@ -395,8 +401,12 @@ class System(ABC):
             raise ValueError(
                 f"unknown setup {setup!r} of {cls.__name__}; it has {', '.join(cls.setups)}"
             )
-        changes = {"dt": dt, "duration": duration, "noise_std": noise_std}
-        chosen = replace(cls.setups[setup], **{k: v for k, v in changes.items() if v is not None})
+        changes: dict[str, Any] = {"dt": dt, "duration": duration, "noise_std": noise_std}
+        changes = {name: value for name, value in changes.items() if value is not None}
+        own = cls.setups[setup].transient
+        if own is not None and duration is not None and 0 < duration < own:
+            changes["transient"] = None
+        chosen = replace(cls.setups[setup], **changes)
         system = cls()
         wanted = {**chosen.parameters, **(parameters or {})}
         for name in wanted:
@@ -451,27 +461,6 @@ class System(ABC):
         return type(self).flow is not System.flow
 
     @classmethod
-    def _validate_motion(cls) -> None:
-        """Raise TypeError in one line if what the class says of its motion does not agree."""
-        own = cls.flow is not System.flow
-        if cls.input_hold not in ("previous", "linear"):
-            raise TypeError(
-                f"system {cls.__name__}: input_hold={cls.input_hold!r}; expected 'previous' or "
-                "'linear'"
-            )
-        if own and cls.input_hold == "linear":
-            raise TypeError(
-                f"system {cls.__name__} has its own flow, whose input is held, and "
-                "input_hold='linear'; expected 'previous'"
-            )
-        if cls.discrete and (own or cls.stiff):
-            other = "its own flow" if own else "stiff=True"
-            raise TypeError(
-                f"system {cls.__name__} is a map (discrete=True) and has {other}; expected one of "
-                "them"
-            )
-
-    @classmethod
     def validate(cls) -> None:
         """Check the class attributes of a new system; see
         `pinnobs_gym.simulation.declared.check_declared`.
@@ -485,7 +474,6 @@ class System(ABC):
             if getattr(cls, name, None) is None:
                 raise TypeError(f"system {cls.__name__} has no class attribute {name!r}")
         check_declared(cls)
-        cls._validate_motion()
         try:
             for name in cls.setups:
                 system, setup = cls.configured(name)

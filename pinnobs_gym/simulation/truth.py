@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pinnobs_gym.simulation import dop853
+from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.driven import Driven, driven
 from pinnobs_gym.simulation.kernels.asked import asked_library
 from pinnobs_gym.simulation.maps import Map
@@ -160,6 +161,8 @@ def disturbed_truth(
     the intervals between samples, white noise is replaced by its projection on linear functions of
     time. The solver is that of `truth` with equal steps of at most ``max_step``. Its error is not
     controlled, as it is far below any relevant noise. Maps and stiff plants move as the model does.
+    After each part, states that noise moved beyond a bound are at that bound, as in the model's
+    ensembles (`pinnobs_gym.simulation.bounds.absorbed`).
 
     Args:
         system: as in `truth`.
@@ -190,6 +193,7 @@ def disturbed_truth(
         compiled.disturbed(system, noise.L(0.0)[..., 0], times, draws, longest, x, inputs)
         _check_finite(system, x0, x)
         return x
+    box = system.state_box
     with np.errstate(all="ignore"):
         for k in range(len(times) - 1):
             if system.discrete or system.stiff:
@@ -202,6 +206,7 @@ def disturbed_truth(
             for start, end, (even, odd) in zip(parts[:-1], parts[1:], draws[k], strict=True):
                 force = _Force(noise, float(start), float(end), even, odd)
                 _through_part(plant, float(start), float(end), longest, force, stages)
+                stages[0] = absorbed(stages[0], box)
             x[k + 1] = stages[0]
     _check_finite(system, x0, x)
     return x

@@ -68,6 +68,16 @@ def test_estimate_is_the_same_path_as_a_record_from_an_env(folder, capsys):
     assert "estimates: estimates.csv; picture: estimates.png" in capsys.readouterr().out
 
 
+def test_estimates_of_huge_outputs_are_told_in_one_line(folder, capsys, recwarn):
+    (folder / "log.csv").write_text("t,y1\n0,0.1\n0.1,1e308\n0.2,-1e308\n")
+    assert run("estimate", "--system", "HarmonicOscillator", "--log", "log.csv") == 0
+    told = capsys.readouterr()
+    assert not recwarn.list
+    assert (told.out + told.err).count("warning: ") == 1
+    with Image.open(folder / "estimates.png") as picture:
+        assert picture.size[0] > 500
+
+
 def test_estimate_with_settings_prior_and_another_estimator(folder):
     write_log(folder / "log.csv", EpisodeSource("ReverseDuffing", duration=1.0))
     common = ("estimate", "--system", "ReverseDuffing", "--log", "log.csv")

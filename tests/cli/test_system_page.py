@@ -90,3 +90,27 @@ def test_the_unit_of_time_of_a_map_is_the_step():
     assert seconds == ["1 s (of a map: as many steps), at most 20 % of the time "]
     assert "√s" not in text
     assert "10 actions, 1 s at 0.1 s in" in page(Jar, "pinnobs/Jar-v0")
+
+
+@dataclass(frozen=True)
+class Lidded(Jar):
+    state_low = (0.0, None)
+    state_high = (2.5, 1 / 3)
+    setups = {
+        "benchmark": replace(
+            Jar.setups["benchmark"], x0_high=(1, 1 / 3), noise_std=1 / 3, process_noise=(2 / 3, 0.0)
+        )
+    }
+
+
+def test_the_page_says_the_bounds_of_states_and_rounds_numbers():
+    text = page(Lidded, "pinnobs/Lidded-v0")
+    assert (
+        "`level` is at least 0 m and at most 2.5 m; `label` is at most 0.333333: the plant and all "
+        "estimates stay within these bounds." in text
+    )
+    assert "stay within these bounds" not in page(Jar, "pinnobs/Jar-v0")
+    assert "output noise [0.333333]; process noise [0.666667, 0.0]" in text
+    assert "x₀ uniform in [0.0, 0.0] to [1.0, 0.333333]" in text
+    assert "P₀ = [[0.0833333, 0.0], [0.0, 0.00925926]]" in text
+    assert not re.search(r"\d\.\d{9}", text)

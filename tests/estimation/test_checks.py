@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 from kinds import untrained
-from linear import Modulated
+from linear import Linear, Modulated
 
 from pinnobs_gym.estimation.adapters import PerEpisode
+from pinnobs_gym.estimation.check_records import short_record, tolerated
 from pinnobs_gym.estimation.checks import ESTIMATOR_CHECKS, check_estimator
 from pinnobs_gym.estimation.estimator import (
     BaseEstimator,
@@ -23,6 +24,7 @@ from pinnobs_gym.estimation.estimator import (
 )
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.high_gain import HighGain
 from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.simulation.checks import SYSTEM_CHECKS, check_system
 from pinnobs_gym.simulation.conformance import CheckFailed
@@ -792,3 +794,28 @@ def test_what_is_no_state_is_told_of_the_method_that_returned_it() -> None:
         NoState(system).run(record)
     with pytest.raises(TypeError, match="is not an instance of an Estimator"):
         check_estimator(NoState)  # pyright: ignore
+
+
+@dataclass(frozen=True)
+class Saddle(Linear):
+    """An unstable plant, on which errors grow by e¹² in a record."""
+
+    def f(self, t, x, u):
+        return 3.0 * x
+
+    def f_jacobian(self, t, x, u):
+        return 3.0 * np.eye(2) + np.zeros((*x.shape, 1))
+
+
+def test_observers_that_amplify_rounding_are_given_more_room():
+    """Where nothing corrects the model, a change of 1e-9 of scale grows by e^(3·3.9)."""
+    estimator = OpenLoop(Saddle())
+    record = short_record(estimator)
+    grown = 10 * 1e-9 * np.exp(3 * 3.9)
+    assert tolerated(estimator.run, Saddle(), record, 1e-6) == pytest.approx(grown, rel=1e-2)
+    assert tolerated(EKF(Linear()).run, Linear(), short_record(EKF(Linear())), 1e-6) == 1e-6
+
+
+@pytest.mark.parametrize("process_noise", [None, 0.3, ((0.0, 0.0), (0.2, 0.5))])
+def test_high_gain_forgets_the_same_with_blank_rows_and_without(process_noise):
+    ESTIMATOR_CHECKS["blank_rows"](HighGain(Linear(), process_noise=process_noise))

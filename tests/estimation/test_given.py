@@ -203,3 +203,16 @@ def test_other_real_types_are_taken_as_doubles(dtype):
     assert {array.dtype for array in arrays} == {np.dtype(float)}
     doubles = Record(*(array.astype(float) for array in arrays[:3]), given.prior)
     np.testing.assert_array_equal(EKF(Linear()).run(given).xhat, EKF(Linear()).run(doubles).xhat)
+
+
+@pytest.mark.parametrize("name", ONLINE)
+@pytest.mark.parametrize("dtype", ["list", np.float32, int])
+def test_samples_like_arrays_are_taken_as_doubles(name, dtype):
+    y = np.array([[1.0, -2.0], [0.0, 3.0]])
+    given = y.tolist() if dtype == "list" else y.astype(dtype)
+    estimator = ESTIMATORS.resolve(name)(Linear())
+    start = estimator.reset(Prior(np.zeros((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)).copy()))
+    u = np.zeros((2, 0))
+    found = estimator.update(start, 0.0, given, u.tolist() if dtype == "list" else u)
+    expected = estimator.update(start, 0.0, y, u)
+    np.testing.assert_array_equal(found.xhat, expected.xhat)

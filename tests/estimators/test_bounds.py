@@ -51,6 +51,7 @@ class Exceeding(Reactor):
     """Its truth exceeds the upper bound."""
 
     state_high = (None, 1.5)
+    setups = {"benchmark": replace(Reactor.setups["benchmark"], xhat0=(0.1, 1.4))}
 
 
 @pytest.mark.parametrize("name", untrained())
@@ -169,6 +170,9 @@ class BoundedLinear(Linear):
 
     state_low = (-0.2, None)
     state_high = (None, 0.3)
+    setups = {
+        "benchmark": replace(Linear.setups["benchmark"], x0_low=(-0.2, -1.0), x0_high=(1.0, 0.3))
+    }
 
 
 def test_the_nearest_point_is_that_of_all_filters_on_a_linear_system():
@@ -204,7 +208,9 @@ def test_bounds_of_a_wrong_size_or_order_are_told_in_one_line():
 def test_a_truth_that_leaves_the_bounds_is_told_in_one_line():
     with pytest.raises(CheckFailed) as caught:
         check_system(Exceeding)
-    assert str(caught.value).startswith("bounds: pB of the truth of setup 'benchmark' comes to 2.3")
+    assert str(caught.value).startswith(
+        "bounds: in the truth of setup 'benchmark', pB comes to 2.3"
+    )
     assert "above state_high=1.5; expected a plant that stays within its bounds" in str(
         caught.value
     )

@@ -517,9 +517,13 @@ def test_an_augmented_plant_keeps_its_own_flow():
 @pytest.mark.parametrize(
     ("base", "attributes", "message"),
     [
-        (Exact, {"input_hold": "linear"}, "its own flow.*expected 'previous'"),
-        (Exact, {"discrete": True}, "is a map .* and has its own flow"),
-        (Forced, {"discrete": True}, "is a map .* and has stiff=True"),
+        (
+            Exact,
+            {"input_hold": "linear"},
+            "input_hold='linear', and a flow of its own.*expected 'previous'",
+        ),
+        (Exact, {"discrete": True}, "discrete=True, a map, and its own flow"),
+        (Forced, {"discrete": True}, "discrete=True, a map, and stiff=True"),
         (Decay, {"input_hold": "next"}, "input_hold='next'; expected 'previous' or 'linear'"),
         (Decay, {"flow": lambda self, t, x: x}, r"flow\(self, t, x\); expected flow\(self, t0"),
     ],

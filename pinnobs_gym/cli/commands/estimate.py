@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.output import write_estimates, write_figure
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.estimation.plausible import doubts
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.simulation.noise import Level
@@ -72,8 +71,8 @@ class Estimate:
         check_writable(self.out.parent)
         estimator = kind.for_setup(system, setup, **settings_of(kind, self.set))
         estimates = estimator.run(record)
-        if not np.isfinite(estimates.xhat).all():
-            console.print("warning: the estimates leave the finite numbers", style="yellow")
+        for doubt in doubts(system, record, estimates):
+            console.print(f"warning: {doubt}", style="yellow", soft_wrap=True)
         write_estimates(self.out, system, record, estimates)
         P = None if estimates.P is None else estimates.P[0]
         title = f"{self.log.name}: {type(system).__name__}, {estimator.label}"

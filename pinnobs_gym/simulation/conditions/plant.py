@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.conditions.base import Condition, Unknowns
 from pinnobs_gym.simulation.residual import Periods
 from pinnobs_gym.simulation.runge_kutta import longest_step
@@ -90,6 +91,11 @@ class OtherRates(System):
     def state_period(self) -> Periods | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Periods of the original plant's states."""
         return self.plant.state_period
+
+    @property
+    def state_box(self) -> StateBox | None:
+        """Bounds of the original plant's states."""
+        return self.plant.state_box
 
     @property
     def model_step(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]

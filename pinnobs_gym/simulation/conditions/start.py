@@ -36,7 +36,7 @@ class GivenPoorPrior(Condition):
 class FarGuess(Condition):
     """An initial estimate further away: each component of x̂₀ is moved by a number of prior standard
     deviations away from the mean of the law of initial states, which is the middle of a box;
-    upwards if it is there. P₀ is unchanged."""
+    upwards if it is there, but no further than to a bound. P₀ is unchanged."""
 
     deviations: float = 2.0
     reference = False
@@ -50,6 +50,8 @@ class FarGuess(Condition):
         xhat0, P0 = prior_moments(system, setup)
         away = np.where(xhat0 >= setup.start(system.nx).mean, 1.0, -1.0)
         moved = xhat0 + self.deviations * away * np.sqrt(np.diag(P0))
+        if system.state_box is not None:
+            moved = system.state_box.clipped(moved)
         return replace(setup, xhat0=tuple(moved.tolist()))
 
 

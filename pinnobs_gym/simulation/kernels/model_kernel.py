@@ -44,7 +44,7 @@ class _Moved(ctypes.Structure):
         *(("end", _POINTER), ("end_point", _INT), ("end_row", _INT), ("end_state", _INT)),
         *(("L", _POINTER), ("m", _INT), ("draws", _POINTER)),
         *((name, _INT) for name in ("draws_step", "draws_point", "draws_row")),
-        *(("F", _POINTER), ("Q", _POINTER)),
+        *(("F", _POINTER), ("Q", _POINTER), ("low", _POINTER), ("high", _POINTER)),
     ]
 
 
@@ -86,7 +86,7 @@ class ModelKernel:
         self._rows = p.shape[1] if p.ndim > 1 else 0
         self._breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
         self._longest = longest_step(system)
-        self._discrete = bool(system.discrete)
+        self._discrete, self._box = bool(system.discrete), system.state_box
         measured = {"previous": 1, "linear": 2}[system.input_hold]
         self._input = measured if system.measured_input else 0
         self._model = _Model(
@@ -164,6 +164,8 @@ class ModelKernel:
                 steps = (8 * 0 if n == 1 else s for n, s in zip(draws.shape, steps, strict=False))
                 call.draws_step, call.draws_point, call.draws_row = (s // 8 for s in steps)
                 call.L, call.m, call.draws = _address(L), m, _address(draws)
+                if self._box is not None:
+                    call.low, call.high = address(self._box.low), address(self._box.high)
         end = np.empty_like(x)
         _set_end(call, end)
         self._move(ctypes.addressof(call))

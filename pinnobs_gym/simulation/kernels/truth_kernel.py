@@ -32,6 +32,7 @@ class Solution(ctypes.Structure):
         *(("scale", _POINTER), ("error", _POINTER), ("end", _POINTER)),
         *(("m", _INT), ("L", _POINTER), ("draws", _POINTER)),
         *(("part", _POINTER), ("part_start", _POINTER), ("part_length", _POINTER)),
+        *(("low", _POINTER), ("high", _POINTER)),
     ]
 
 
@@ -97,6 +98,8 @@ class TruthKernel:
             given |= _given(system, inputs, (steps.t - start) / (end - start), steps.interval)
         force = {"part": steps.part, "part_start": steps.start, "part_length": steps.length}
         fields = {"bounds": steps.bounds, "step": steps.step, "L": L, "draws": draws}
+        if (box := system.state_box) is not None:
+            fields |= {"low": box.low, "high": box.high}
         self._solved(system, x[0], x[1:], **fields, **force, **given)
 
     def _solved(

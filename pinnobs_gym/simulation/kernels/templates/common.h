@@ -21,6 +21,12 @@ static inline double heaviside(double a, double half)
     return a > 0 ? 1.0 : a < 0 ? 0.0 : a == 0 ? half : a;
 }
 
+/* Return a state within its bounds; one that is not finite remains. */
+static inline double absorbed(double x, double low, double high)
+{
+    return !isfinite(x) ? x : x < low ? low : x > high ? high : x;
+}
+
 /* Return a difference in [-period/2, period/2); one that is there already is unchanged. */
 static inline double wrapped(double difference, double period)
 {

@@ -29,6 +29,7 @@ struct moved {
     const double *draws;      /* standard normal numbers (steps, points, batch, m or 2 m), or NULL */
     int64_t draws_step, draws_point, draws_row;
     double *F, *Q;            /* (NX, NX, batch) */
+    const double *low, *high; /* bounds (NX,) of states with drawn noise, or NULL */
 };
 /* The parts of an interval between the times at which f jumps: ``count`` steps in each */
 struct parts {
@@ -243,6 +244,12 @@ static void AT_WIDTH(finish)(const struct group *g, const lanes *restrict x)
                 x[i][l];
 }
 
+/* Move states that noise moved beyond a bound to that bound. */
+static void AT_WIDTH(absorb)(const struct moved *c, lanes *restrict x)
+{
+    for (int i = 0; i < NX; i++) EACH_LANE x[i][l] = absorbed(x[i][l], c->low[i], c->high[i]);
+}
+
 /* Move the states of W rows. */
 static void AT_WIDTH(step_rows)(const struct moved *c, const struct parts *parts, int64_t row,
                                 int count)
@@ -260,6 +267,7 @@ static void AT_WIDTH(step_rows)(const struct moved *c, const struct parts *parts
                                               + g.episode[l] * c->draws_row + j];
                     for (int i = 0; i < NX; i++) next[i][l] += c->L[i * c->m + j] * w;
                 }
+            if (c->low) AT_WIDTH(absorb)(c, next);
             for (int i = 0; i < NX; i++) EACH_LANE x[i][l] = going[l] ? next[i][l] : x[i][l];
         }
     } else {
@@ -268,6 +276,7 @@ static void AT_WIDTH(step_rows)(const struct moved *c, const struct parts *parts
                 AT_WIDTH(set_step)(&g, parts, part, k);
                 if (c->draws) AT_WIDTH(forces)(&g, number, force);
                 AT_WIDTH(runge_kutta)(&g, c->draws ? force : NULL, x);
+                if (c->low) AT_WIDTH(absorb)(c, x);
             }
     }
     AT_WIDTH(finish)(&g, x);

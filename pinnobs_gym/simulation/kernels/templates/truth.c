@@ -37,6 +37,7 @@ struct solution {
     const double *draws;       /* (parts, 2, batch, m) */
     const int64_t *part;       /* (steps,) */
     const double *part_start, *part_length; /* (parts,) in s */
+    const double *low, *high;  /* (NX,) bounds of the states after each part, or NULL */
 };
 #endif
 
@@ -168,6 +169,8 @@ static void AT_WIDTH(solve_rows)(const struct solution *s, int64_t row, int coun
         }
         AT_WIDTH(state_of_stage)(STAGES, w, x, k, point);
         memcpy(x, point, sizeof x);
+        if (s->low && (j + 1 == s->steps || s->part[j + 1] != s->part[j]))
+            for (int n = 0; n < NX; n++) EACH_LANE x[n][l] = absorbed(x[n][l], s->low[n], s->high[n]);
         if (!s->weights) {
             for (int64_t i = s->bounds[j]; i < s->bounds[j + 1]; i++)
                 for (int l = 0; l < count; l++)
