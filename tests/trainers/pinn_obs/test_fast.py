@@ -190,7 +190,8 @@ def test_patience_and_budget_end_training(ticking):
     assert 0.2 <= brief.seconds < 0.3
 
 
-def test_a_loss_that_is_not_finite_begins_again():
+def test_a_loss_that_is_not_finite_begins_again(monkeypatch):
+    monkeypatch.setenv("PINNOBS_KERNELS", "0")  # which would call f, too
     Failing.calls.clear()
     config = replace(SMALL, seed=5, guide=0.0)
     trained = train_pinn_obs(Failing(bad=1), config, record=random_record(Failing()))

@@ -482,7 +482,8 @@ def test_another_trainings_checkpoint_is_refused(tmp_path):
 # What cannot be trained on
 
 
-def test_a_loss_that_is_not_finite_begins_again_three_times():
+def test_a_loss_that_is_not_finite_begins_again_three_times(monkeypatch):
+    monkeypatch.setenv("PINNOBS_KERNELS", "0")  # which would call f, too
     Failing.calls.clear()
     trained = train_pinn_obs(
         Failing(bad=3), replace(SMALL, seed=5), record=random_record(Failing())
@@ -495,7 +496,8 @@ def test_a_loss_that_is_not_finite_begins_again_three_times():
     assert "\n" not in str(caught.value)
 
 
-def test_a_loss_that_is_not_finite_may_be_kept_in_a_checkpoint(tmp_path):
+def test_a_loss_that_is_not_finite_may_be_kept_in_a_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setenv("PINNOBS_KERNELS", "0")
     path = tmp_path / "checkpoint.pt"
     record, config = random_record(Failing()), replace(SMALL, seed=5, checkpoint_every=1)
     Failing.calls.clear()
