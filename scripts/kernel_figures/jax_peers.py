@@ -86,7 +86,8 @@ def dynamax_ekf(ekf: EKF, record: Record) -> Callable[[], np.ndarray]:
         parameters = ParamsNLGSSM(
             initial_mean=mean,
             initial_covariance=cov,
-            dynamics_function=lambda x, u: moved(x, u[0], dt),
+            # The step to a sample is given the inputs of that sample: here its time.
+            dynamics_function=lambda x, u: moved(x, u[0] - dt, dt),
             dynamics_covariance=jnp.asarray(Q),
             emission_function=lambda x, u: h(x, u[0]),
             emission_covariance=jnp.asarray(R),
