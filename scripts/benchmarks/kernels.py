@@ -37,7 +37,7 @@ TEMPLATES = ("ekf", "sigma_points", "truth", "model")
 PEERS = ("dynamax", "cuthbert", "filterpy")
 AGREEMENT = {"filterpy": 1e-9, "cuthbert": 1e-9, "dynamax": 1e-4}
 """Largest difference of estimates over the states' scale."""
-LORENZ = ((40, 1, 40), (40, 64, 20), (200, 1, 20), (200, 64, 2))
+LORENZ = ((40, 1, 40), (40, 64, 4), (200, 1, 4), (200, 64, 2))
 """Numbers of states, of episodes and of samples."""
 
 
