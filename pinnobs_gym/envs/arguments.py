@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -25,6 +25,14 @@ def reward_of(system: System, estimates: np.ndarray, x: np.ndarray, weights: np.
     """Return the rewards (...) of estimates (..., nx) of the states x (..., nx)."""
     error = system.state_residual(estimates, x)
     return -(error * error).dot(weights)
+
+
+def errors_of(system: System) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the function of an estimate (nx,) and the state (nx,) whose result is the error."""
+    if system.state_period is None:
+        return system.state_residual
+    # Half a turn about zero is not defined for an estimate that is not finite.
+    return np.errstate(over="ignore", invalid="ignore")(system.state_residual)
 
 
 def seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:

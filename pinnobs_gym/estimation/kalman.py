@@ -7,8 +7,8 @@ Functions annotated with `Array` take NumPy arrays and torch tensors, and preser
 from __future__ import annotations
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.matrices import divide, identity, mapped, outer, product, sandwich
 from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.noise import Noise

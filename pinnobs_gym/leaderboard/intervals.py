@@ -45,7 +45,9 @@ def median(values: np.ndarray) -> Interval:
 @lru_cache(maxsize=1024)
 def _lowest_rank(count: int) -> int:
     """Return the index, from either end of the ordered values, of the bounds of their median."""
-    from scipy.special import bdtr  # scipy.stats takes long to import
+    if 0.5**count > (1 - CONFIDENCE) / 2:
+        return 0
+    from scipy.special import bdtr  # it takes long to import, and scipy.stats longer
 
     cumulative = bdtr(np.arange(count + 1), count, 0.5)
     return max(int(np.searchsorted(cumulative, (1 - CONFIDENCE) / 2)) - 1, 0)

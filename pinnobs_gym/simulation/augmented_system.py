@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.residual import Periods
 from pinnobs_gym.simulation.system import Array, System, is_number, stack

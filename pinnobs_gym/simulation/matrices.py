@@ -18,7 +18,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from array_api_compat import array_namespace
+
+from pinnobs_gym.simulation.arrays import array_namespace
 
 if TYPE_CHECKING:
     from pinnobs_gym.simulation.system import Array

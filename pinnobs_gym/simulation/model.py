@@ -9,8 +9,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.kernels.asked import is_asked
@@ -359,7 +359,7 @@ def substeps(
         ValueError: in one line, if they would be too many, see
             `pinnobs_gym.simulation.motion.check_steps`.
     """
-    xp = np if isinstance(x, np.ndarray) else array_namespace(x)
+    xp = array_namespace(x)
     longest = min(longest, longest_step(system))
     by_row = getattr(t0, "ndim", 0) > 0
     breaks = system.breakpoints()

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import Array, System
 
@@ -99,7 +99,7 @@ def inputs_at(system: System, t: Array, part: Array, u0: Array | None, u1: Array
         return system.input(t)
     before = required(system, u0)
     if system.input_hold == "previous":
-        xp: Any = np if isinstance(before, np.ndarray) else array_namespace(before)
+        xp: Any = array_namespace(before)
         return xp.broadcast_to(before, (len(part), *before.shape))
     weight = part[..., None] if part.ndim == 2 else part.reshape(len(part), *([1] * before.ndim))
     return (1 - weight) * before + weight * required(system, u1)

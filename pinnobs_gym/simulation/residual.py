@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from array_api_compat import array_namespace
+
+from pinnobs_gym.simulation.arrays import array_namespace
 
 Periods: TypeAlias = Sequence[float | None]
 """The period of each component, in its unit; None for a component that does not repeat."""

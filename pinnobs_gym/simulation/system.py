@@ -8,8 +8,8 @@ from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, residual
@@ -275,7 +275,7 @@ class System(ABC):
 
     def input(self, t: Array) -> Array:
         """Return the known input u(t), (..., nu), at times t (...) in s. Zero unless overridden."""
-        xp = np if isinstance(t, np.ndarray) else array_namespace(t)
+        xp = array_namespace(t)
         return xp.zeros((*t.shape, self.nu), dtype=t.dtype)
 
     def draw_input(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:

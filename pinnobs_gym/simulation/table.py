@@ -7,8 +7,8 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from array_api_compat import array_namespace
 
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import Array
 
 METHODS = ("linear", "monotone")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from array_api_compat import array_namespace
-
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import (
     Array,
     PoorPrior,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from array_api_compat import array_namespace
-
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import (
     Array,
     PoorPrior,

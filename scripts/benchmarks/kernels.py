@@ -1,26 +1,23 @@
-"""Filters in compiled code against the same in NumPy, and against JAX's, on the built-in systems.
+"""Compiled code against the same in NumPy, and against other libraries, on the built-in systems.
 
-Times are of one thread, in CPU time, of whole calls of ``run``. Compilation is told apart.
+Times are of one thread, in CPU time. Compilation is told apart. Peers that are not installed (extra
+``peers``) are named and left out.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
+from kernel_figures import env_speed
+from kernel_figures.timing import in_process, medians, pair, repeated
 
 from benchmarks import Figure, at_least, at_most, cpu_seconds
-from benchmarks.classical import played
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
@@ -34,96 +31,50 @@ ASKED = {1: 150.0, 256: 10.0}
 ASKED_OF_JAX = {1: 5.0, 256: 8.0}
 ASKED_OF_MOTOR = {1: 5.0, 256: 5.0}
 """The same of dynamax."""
-T = TypeVar("T", bound=RecursiveEstimator)
-
-PLAYED = 64
-"""Number of different episodes; a larger batch repeats them."""
-_COMPILATION = """
-import json, resource, sys
-from pathlib import Path
-from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.systems import SYSTEMS
-assert EKF(SYSTEMS.resolve(sys.argv[1])()).compiled is not None
-used = resource.getrusage(resource.RUSAGE_CHILDREN)
-print(json.dumps(used.ru_utime + used.ru_stime))
-"""
+ASKED_OF_UPDATE = {"ekf": 8.0, "mhe, window 20": 60.0}
+"""Time of a single update in µs."""
+TEMPLATES = ("ekf", "sigma_points", "truth", "model")
+PEERS = ("dynamax", "cuthbert", "filterpy")
+AGREEMENT = {"filterpy": 1e-9, "cuthbert": 1e-9, "dynamax": 1e-4}
+"""Largest difference of estimates over the states' scale."""
+LORENZ = ((40, 1, 40), (40, 64, 4), (200, 1, 4), (200, 64, 2))
+"""Numbers of states, of episodes and of samples."""
 
 
 def figures(repeats: int) -> Iterator[Figure]:
-    """Measure compiled filters."""
+    """Measure compiled code."""
+    missing = [name for name in PEERS if not find_spec(name)]
+    if missing:
+        print(f"not installed: {', '.join(missing)}; left out", file=sys.stderr)
+    yield Figure("peers that are not installed", len(missing), "", "", None)
     yield from compilation()
     for name in SYSTEMS.classes():
         for cls in (EKF, UKF):
-            if cls.template:
-                yield from against_numpy(name, cls, repeats)
-                yield update(name, cls, repeats)
-        if find_spec("dynamax"):
-            yield from against_dynamax(name, repeats)
+            yield from against_numpy(name, cls, repeats)
+        yield from alone(name, repeats)
+        if "filterpy" not in missing:
+            yield from against_filterpy(name, repeats)
+        if not {"dynamax", "cuthbert"} <= set(missing):
+            yield from against_jax(name, repeats)
+    yield from env_speed.figures(repeats)
+    yield from large(repeats, peer="dynamax" not in missing)
 
 
 def compilation() -> Iterator[Figure]:
-    """Measure the compiler's time for the EKF of each system, and what is kept of it."""
+    """Measure the compiler's time for each algorithm and system, and what is kept of it."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"XDG_CACHE_HOME": folder, "PINNOBS_CACHE": folder}
-        environment |= {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        kept = {"XDG_CACHE_HOME": folder, "PINNOBS_CACHE": folder}
         for name in SYSTEMS.classes():
-            command = [sys.executable, "-c", _COMPILATION, name]
-            done = subprocess.run(command, env=environment, check=True, capture_output=True)
-            asked = 1.0 if name == "InductionMotor" else 0.7
-            yield at_most(f"compilation, EKF, {name}", json.loads(done.stdout), "CPU-s", asked)
+            for template in TEMPLATES:
+                seconds = in_process("compilation", name, template, **kept)
+                asked = 1.0 if name == "InductionMotor" else 0.7
+                yield at_most(f"compilation, {template}, {name}", seconds, "CPU-s", asked)
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
-    yield Figure("libraries of the EKF of all systems", size / 1024, "KiB", "", None)
-
-
-def repeated(name: str, batch: int, samples: int) -> Record:
-    """Return the first samples of a batch of benchmark episodes."""
-    _, _, record = played(name, min(batch, PLAYED))
-    record = record.rows(np.arange(batch) % PLAYED)
-    n = min(samples, record.num_samples)
-    return replace(record, t=record.t[:n], y=record.y[:, :n].copy(), u=record.u[:, :n].copy())
-
-
-def pair(name: str, cls: type[T]) -> list[T]:
-    """Return an estimator in NumPy, and the same in compiled code."""
-    made = []
-    for kernels in ("0", "1"):
-        with environment(PINNOBS_KERNELS=kernels):
-            made.append(cls(SYSTEMS.resolve(name)()))
-            assert (made[-1].compiled is None) == (kernels == "0"), name
-    return made
-
-
-@contextmanager
-def environment(**values: str) -> Iterator[None]:
-    """Set environment variables for a while."""
-    before = dict(os.environ)
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-
-
-def medians(calls: list[Callable[[], object]], repeats: int) -> np.ndarray:
-    """Return the times of some calls in s, measured alternately, each a few times at once."""
-    for call in calls:
-        call()  # the first calls fill caches
-    times = [cpu_seconds(call) for call in calls]
-    counts = [max(1, int(0.02 / max(t, 1e-6))) for t in times]
-
-    def many(call: Callable[[], object], count: int) -> float:
-        return cpu_seconds(lambda: [call() for _ in range(count)]) / count
-
-    measured = [
-        [many(call, count) for call, count in zip(calls, counts, strict=True)]
-        for _ in range(repeats)
-    ]
-    return np.median(measured, axis=0)
+    yield Figure("libraries of all algorithms and systems", size, "bytes", "", None)
 
 
 def against_numpy(name: str, cls: type[RecursiveEstimator], repeats: int) -> Iterator[Figure]:
-    """Compare compiled code with NumPy."""
+    """Compare records in compiled code with NumPy."""
     slow, fast = pair(name, cls)
     for batch, samples in SHAPES:
         record = repeated(name, batch, samples)
@@ -136,41 +87,89 @@ def compared(
 ) -> Iterator[Figure]:
     """Return the figures of a peer's time and ours, in s."""
     each = times / (record.batch * record.num_samples) * 1e9
-    what = f"{what}, {record.batch} episodes"
-    yield Figure(f"{what}: {peer}, per step and episode", float(each[0]), "ns", "", None)
-    yield Figure(f"{what}: compiled, per step and episode", float(each[1]), "ns", "", None)
+    what = f"{what}, batch {record.batch}"
+    yield Figure(f"{what}: {peer}, per sample and episode", float(each[0]), "ns", "", None)
+    yield Figure(f"{what}: compiled, per sample and episode", float(each[1]), "ns", "", None)
     yield at_least(f"{what}: {peer} / compiled", float(each[0] / each[1]), "x", asked)
 
 
-def update(name: str, cls: type[RecursiveEstimator], repeats: int) -> Figure:
-    """Measure single updates of one episode."""
-    record, fast = repeated(name, 1, 201), pair(name, cls)[1]
+def alone(name: str, repeats: int) -> Iterator[Figure]:
+    """Measure single updates of all estimators, and the truth, in a process with kernels and in one
+    without."""
+    slow, fast = (in_process("alone", name, repeats, PINNOBS_KERNELS=k) for k in ("0", "1"))
+    for what, value in fast.items():
+        unit, one = ("ns", "per sample and episode") if "truth" in what else ("us", "one update")
+        about = f"{what}, {name}: {one}"
+        asked = ASKED_OF_UPDATE.get(what)
+        yield Figure(f"{about}, NumPy", slow[what], unit, "", None)
+        if asked is None:
+            yield Figure(f"{about}, with kernels", value, unit, "", None)
+        else:
+            yield at_most(f"{about}, with kernels", value, unit, asked)
+        yield Figure(f"{about}, NumPy / with kernels", slow[what] / value, "x", "", None)
+
+
+def against_filterpy(name: str, repeats: int) -> Iterator[Figure]:
+    """Compare updates of the EKF with those of filterpy's, whose model is compiled."""
+    from kernel_figures.filterpy_peer import filterpy_ekf
+
+    fast, record = pair(name, EKF)[1], repeated(name, 1, 121)
+    exact = replace(fast, assumed_noise=0.0)
+    yield from difference("filterpy", name, exact, filterpy_ekf(exact, record)[None], record)
 
     def play() -> None:
         state = fast.reset(record.prior)
         for k, t in enumerate(record.t.tolist()):
             state = fast.update(state, t, record.y[:, k], record.u[:, k])
 
-    seconds = medians([play, lambda: fast.reset(record.prior)], repeats)
-    value = float(seconds[0] - seconds[1]) / record.num_samples * 1e6
-    return at_most(f"{fast.label}, {name}: one update", value, "us", 8.0)
+    times = medians([lambda: filterpy_ekf(fast, record), play], repeats) / record.num_samples * 1e6
+    yield Figure(
+        f"filterpy's ekf, compiled model, {name}: one update", float(times[0]), "us", "", None
+    )
+    ratio = float(times[0] / times[1])
+    yield at_least(f"filterpy's ekf, compiled model / one update, {name}", ratio, "x", 1.0)
 
 
-def against_dynamax(name: str, repeats: int) -> Iterator[Figure]:
-    """Compare the EKF with dynamax's, with the same model and Runge-Kutta steps."""
-    from jax_peers import dynamax_ekf
+def difference(
+    peer: str, name: str, exact: EKF, xhat: np.ndarray, record: Record
+) -> Iterator[Figure]:
+    """Return the largest difference between estimates of an EKF without process noise."""
+    scale = np.asarray(exact.system.scale)
+    worst = float(abs((xhat - exact.run(record).xhat) / scale).max())
+    # dynamax adds a small number to the covariance of outputs.
+    yield at_most(f"ekf - {peer}'s over scale, {name}", worst, "", AGREEMENT[peer])
+
+
+def against_jax(name: str, repeats: int) -> Iterator[Figure]:
+    """Compare the EKF with those of JAX's libraries, with the same model and Runge-Kutta steps."""
+    from kernel_figures.jax_peers import EKFS
 
     fast = pair(name, EKF)[1]
     asked = ASKED_OF_MOTOR if name == "InductionMotor" else ASKED_OF_JAX
-    for batch, samples in SHAPES[:3]:
-        record = repeated(name, batch, samples)
-        peer = dynamax_ekf(fast, record)
-        started = cpu_seconds(peer)
-        if batch == 1:
-            yield Figure(f"dynamax's EKF, {name}: compilation", started, "CPU-s", "", None)
-            exact = replace(fast, assumed_noise=0.0)
-            difference = dynamax_ekf(exact, record)() - exact.run(record).xhat
-            worst = float(abs(difference / np.asarray(fast.system.scale)).max())
-            yield at_most(f"EKF - dynamax's over scale, {name}", worst, "", 1e-4)
-        times = medians([peer, lambda r=record: fast.run(r)], repeats)
-        yield from compared("dynamax", f"ekf, {name}", record, times, asked.get(batch))
+    for peer, make in EKFS.items():
+        for batch, samples in SHAPES[:3]:
+            record = repeated(name, batch, samples)
+            call = make(fast, record)
+            started = cpu_seconds(call)
+            if batch == 1:
+                yield Figure(f"{peer}'s ekf, {name}: compilation", started, "CPU-s", "", None)
+                exact = replace(fast, assumed_noise=0.0)
+                yield from difference(peer, name, exact, make(exact, record)(), record)
+            times = medians([call, lambda r=record: fast.run(r)], repeats)
+            bound = asked.get(batch) if peer == "dynamax" else None
+            yield from compared(peer, f"ekf, {name}", record, times, bound)
+
+
+def large(repeats: int, *, peer: bool) -> Iterator[Figure]:
+    """Compare the EKF on Lorenz-96 with dynamax's."""
+    for nx, batch, samples in LORENZ:
+        what = f"ekf, Lorenz-96 of {nx} states, batch {batch}"
+        own = in_process("lorenz", "own", nx, batch, samples, repeats)
+        for value, unit in zip(own, ("ms per sample", "MB at most"), strict=True):
+            yield Figure(what, value, unit, "", None)
+        if peer:
+            other = in_process("lorenz", "dynamax", nx, batch, samples, repeats)
+            for value, unit in zip(other, ("ms per sample", "MB at most"), strict=True):
+                yield Figure(f"dynamax's {what}", value, unit, "", None)
+            yield at_most(f"{what}: time / dynamax's", own[0] / other[0], "x", 0.5)
+            yield at_most(f"{what}: memory / dynamax's", own[1] / other[1], "x", 1.0)

@@ -1,4 +1,4 @@
-"""What a user waits for: the start of commands, the first episodes of envs, their memory."""
+"""What a user waits for: the start of commands; and the memory of envs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from benchmarks import Figure, at_most, median_ratio
+from benchmarks import Figure, at_most
 from pinnobs_gym.envs.registration import env_id
-from pinnobs_gym.systems import SYSTEMS
 
 EVALUATE = ("evaluate", "--system", "ReverseDuffing", "--estimator", "ekf", "--episodes", "1")
-EPISODES = 5
-"""Number of episodes that an env plays from its first reset on."""
 ENVS = 1000
 """Number of envs whose memory is told."""
 MEASURED = 20
@@ -33,9 +30,6 @@ def figures(repeats: int) -> Iterator[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         fresh = (*EVALUATE, "--fresh", "--out", str(Path(folder) / "out"))
         yield at_most("pinnobs evaluate, one episode", seconds(repeats, *fresh), "CPU s", 1.0)
-    for name in SYSTEMS.classes():
-        what = f"single env / CartPole-v1, first {EPISODES} episodes, steps per CPU-second, {name}"
-        yield Figure(what, first_episodes(name, repeats), "x", "", None)
     what = f"arrays of {ENVS} single envs of ReverseDuffing after an episode"
     yield at_most(what, megabytes("ReverseDuffing"), "MB", 300.0)
 
@@ -52,24 +46,6 @@ def seconds(repeats: int, *arguments: str) -> float:
 
     spent()
     return float(np.median([spent() for _ in range(repeats)]))
-
-
-def first_episodes(name: str, repeats: int) -> float:
-    """Return the speed of a new env over whole episodes, the first reset included, over that of
-    CartPole-v1 for as many steps."""
-    steps = EPISODES * SYSTEMS.resolve(name).setups["benchmark"].num_steps
-
-    def play(made: str) -> None:
-        env = gym.make(made)
-        env.action_space.seed(0)
-        action = env.action_space.sample()
-        env.reset(seed=0)
-        for _ in range(steps):
-            _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                env.reset()
-
-    return median_ratio(lambda: play("CartPole-v1"), lambda: play(env_id(name)), repeats)
 
 
 def megabytes(name: str) -> float:

@@ -13,6 +13,8 @@ assert main(sys.argv[1:]) == 0
 print("loaded:", *sys.modules, file=sys.stderr)
 """
 EVALUATE = ("evaluate", "--system", "ReverseDuffing", "--episodes", "1", "--estimator")
+COMPATIBLE = "array_api_compat.numpy"
+"""A copy of all of NumPy's modules."""
 
 
 def loaded(folder, *arguments):
@@ -29,13 +31,16 @@ def test_help_loads_nothing_slow(tmp_path):
 def test_a_filter_with_written_jacobians_needs_no_network_no_symbols_and_no_tests(
     tmp_path, estimator
 ):
-    found = loaded(tmp_path, *EVALUATE, estimator)
-    assert found.isdisjoint({"torch", "scipy.stats", "sympy", "stable_baselines3"})
+    loaded(tmp_path, *EVALUATE, estimator)  # it may compile the filter, of symbols
+    found = loaded(tmp_path, *EVALUATE, estimator, "--fresh")
+    assert found.isdisjoint({"torch", "scipy.stats", "sympy", "stable_baselines3", COMPATIBLE})
     assert f"pinnobs_gym.estimators.{estimator}" in found
     others = {name for name in found if name.startswith("pinnobs_gym.estimators.")}
     assert others == {f"pinnobs_gym.estimators.{estimator}"}
 
 
-def test_scores_that_are_stored_are_shown_without_a_picture(tmp_path):
-    loaded(tmp_path, *EVALUATE, "ekf")
+def test_a_picture_is_drawn_of_several_episodes_unless_their_scores_are_stored(tmp_path):
+    several = (*(part.replace("1", "2") for part in EVALUATE), "ekf")
     assert "matplotlib" not in loaded(tmp_path, *EVALUATE, "ekf")
+    assert "matplotlib" in loaded(tmp_path, *several, "--fresh")
+    assert "matplotlib" not in loaded(tmp_path, *several)

@@ -5,7 +5,7 @@ import importlib
 import benchmark
 import pytest
 import three_recipes
-from benchmarks import pinn
+from benchmarks import kernels, pinn
 
 
 @pytest.mark.parametrize("name", benchmark.GROUPS)
@@ -16,6 +16,12 @@ def test_a_group_gives_figures(name):
 def test_an_unknown_group_is_refused(capsys):
     assert benchmark.main(("nothing",)) == 2
     assert "unknown group 'nothing'; known are" in capsys.readouterr().err
+
+
+def test_missing_peers_are_named(monkeypatch, capsys):
+    monkeypatch.setattr(kernels, "find_spec", lambda name: name == "filterpy" or None)
+    assert next(kernels.figures(1)).value == 2
+    assert capsys.readouterr().err == "not installed: dynamax, cuthbert; left out\n"
 
 
 def test_the_table_of_pinn_obs_has_a_line_for_each_recipe(monkeypatch):

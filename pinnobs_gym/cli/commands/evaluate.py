@@ -47,7 +47,7 @@ class Evaluate:
     condition: str = "nominal"
     """Condition, such as load_step, or noise5+dropout10."""
     episodes: int = 100
-    """Number of episodes."""
+    """Number of episodes; of a single one TensorBoard has no picture."""
     seed: int = 0
     """Seed of the first episode."""
     fresh: bool = False
@@ -75,8 +75,10 @@ class Evaluate:
             hint = f"pinnobs tables {self._rows} -o FILE writes all"
             print_table(standings_table.layouts(table), hint)
         print_table([[by_state(game.source.system, evaluated.rows)]])
-        with Log(log_folder(self.out, evaluated.rows[0])) as log:  # drawing takes longer
-            log_episodes(log, evaluated.rows, evaluated.first_played)
+        # To draw takes as long as all else of one episode.
+        drawn = evaluated.first_played if self.episodes > 1 else None
+        with Log(log_folder(self.out, evaluated.rows[0])) as log:
+            log_episodes(log, evaluated.rows, drawn)
             log_summary(log, evaluated.rows)
         console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
         if self.video is not None:

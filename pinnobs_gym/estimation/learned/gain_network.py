@@ -6,10 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
-from array_api_compat import array_namespace
-
 from pinnobs_gym.estimation.kalman import kalman_gain, update_with
 from pinnobs_gym.estimation.learned.perceptron import perceptron
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import Array
 
 Variant: TypeAlias = Literal["kalman", "gru"]

@@ -8,9 +8,9 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 import torch
-from array_api_compat import array_namespace
 
 from pinnobs_gym.estimation.learned.perceptron import Layers, perceptron
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import Array
 
 Activation: TypeAlias = Literal["tanh", "sine", "sigmoid", "relu"]

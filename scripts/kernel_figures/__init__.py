@@ -1,0 +1,1 @@
+"""Parts of the group ``kernels`` of `scripts/benchmark.py`."""
