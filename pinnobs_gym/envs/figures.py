@@ -146,6 +146,7 @@ def measured_states(system: System) -> dict[int, int]:
 
 def _drawable(values: np.ndarray) -> np.ndarray:
     """Return the values, with NaN in place of those that are too large to be drawn."""
+    values = np.asarray(values, dtype=float)  # the bound is above all numbers of single precision
     return np.where(abs(values) <= _LARGEST, values, np.nan)
 
 

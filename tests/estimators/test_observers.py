@@ -235,7 +235,8 @@ def test_designs_do_not_depend_on_the_prior(name):
 
     rate = default_rate(cls())
     for design in (placed_gain, settling_gain):
-        np.testing.assert_array_equal(design(Elsewhere(), rate), design(cls(), rate))
+        # To rounding: only one of the two may have its model's steps compiled.
+        np.testing.assert_allclose(design(Elsewhere(), rate), design(cls(), rate), rtol=1e-9)
     np.testing.assert_array_equal(output_scale(Elsewhere()), output_scale(cls()))
 
 

@@ -158,7 +158,7 @@ def random_plant(seed: int, largest: int = 6) -> type[Drawn]:
     if rng.uniform() < 0.3:
         attributes["state_period"] = (TURN, *(None,) * (nx - 1))
     elif rng.uniform() < 0.3:
-        attributes["state_low"] = (-0.9, *(-np.inf,) * (nx - 1))
+        attributes["state_low"] = (-1.0, *(-np.inf,) * (nx - 1))
     if rng.uniform() < 0.3:
         attributes["output_period"] = (*(None,) * (ny - 1), TURN)
     attributes["__module__"] = __name__

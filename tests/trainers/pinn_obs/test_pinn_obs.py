@@ -367,7 +367,8 @@ def test_training_finds_the_output_and_the_initial_estimate():
 def test_every_known_system_can_be_trained_on():
     for name, cls in SYSTEMS.classes().items():
         system, setup = cls.configured()
-        setup = replace(setup, x0_low=setup.x0_high, duration=setup.dt * 30)
+        duration = setup.dt * 30
+        setup = replace(setup, x0_low=setup.x0_high, duration=duration, transient=duration / 4)
         config = replace(SMALL, iterations=30, dtype="float64")
         record = played(system, setup, 0.01)
         start = train_pinn_obs(system, replace(config, iterations=1), record=record)
