@@ -25,7 +25,7 @@ from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.particle import ParticleFilter
 from pinnobs_gym.estimators.sliding_mode import SlidingMode
 from pinnobs_gym.estimators.strong_tracking_ekf import StrongTrackingEKF
-from pinnobs_gym.scoring.cramer_rao import exact_bayes
+from pinnobs_gym.scoring.exact_bayes import exact_bayes
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent, output_scale, stack
 from pinnobs_gym.simulation.truth import truth

@@ -19,7 +19,8 @@ from scipy.linalg import expm
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.scoring.cramer_rao import cramer_rao, exact_bayes, expected_nrmse, step_error
+from pinnobs_gym.scoring.cramer_rao import cramer_rao, expected_nrmse, step_error
+from pinnobs_gym.scoring.exact_bayes import exact_bayes
 from pinnobs_gym.scoring.metrics import error_scores, windows
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.system import Setup

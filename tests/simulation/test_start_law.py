@@ -9,7 +9,7 @@ from linear import H, Linear, record_of, runge_kutta_matrix
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.scoring.cramer_rao import exact_bayes
+from pinnobs_gym.scoring.exact_bayes import exact_bayes
 from pinnobs_gym.simulation.augmented import Unknown, augmented
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.start_law import Box, Gaussian, Joint, Points

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -53,10 +54,34 @@ class Combined(Condition):
             x0 = part.starts(x0, inside)
         return x0
 
+    def start_log_density(
+        self,
+        x0: np.ndarray,
+        log_density: Callable[[np.ndarray], np.ndarray],
+        inside: Callable[[np.ndarray], np.ndarray],
+    ) -> np.ndarray:
+        for part in self.parts:
+            log_density = partial(part.start_log_density, log_density=log_density, inside=inside)
+        return log_density(x0)
+
     def plant(self, system: System, rngs: Sequence[np.random.Generator]) -> System:
         for part in self.parts:
             system = part.plant(system, rngs)
         return system
+
+    def plants(self, system: System) -> tuple[System, ...]:
+        found = (system,)
+        for part in self.parts:
+            found = tuple(plant for each in found for plant in part.plants(each))
+        return found
+
+    def arrival(self, y: np.ndarray) -> np.ndarray:
+        for part in self.parts:
+            y = part.arrival(y)
+        return y
+
+    def output_errors(self, scale: np.ndarray) -> tuple[tuple[float, np.ndarray], ...]:
+        return tuple(law for part in self.parts for law in part.output_errors(scale))
 
     def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
         return tuple(each for part in self.parts for each in part.unknowns(system, setup))

@@ -108,6 +108,39 @@ class Condition:
         """
         return ()
 
+    def start_log_density(
+        self,
+        x0: np.ndarray,
+        log_density: Callable[[np.ndarray], np.ndarray],
+        inside: Callable[[np.ndarray], np.ndarray],
+    ) -> np.ndarray:
+        """Return the logarithm of the density of the changed initial states x0 (..., nx), up to a
+        constant, (...). ``log_density`` is that of the setup's set, ``inside`` as in `starts`."""
+        return log_density(x0)
+
+    def plants(self, system: System) -> tuple[System, ...]:
+        """Return the equally probable plants of which `plant` draws one.
+
+        Raises:
+            ValueError: in one line, if they cannot be listed.
+        """
+        return (system,)
+
+    def arrival(self, y: np.ndarray) -> np.ndarray:
+        """Return noiseless outputs (num_samples, ...) in the order in which they are received; NaN
+        where there is none."""
+        return y
+
+    def output_errors(self, scale: np.ndarray) -> tuple[tuple[float, np.ndarray], ...]:
+        """Return the law of errors that outputs have beyond their noise, each independently of the
+        others: pairs of a probability and of standard deviations (ny,) of a Gaussian error. The
+        remaining probability is that of no error.
+
+        Args:
+            scale: noise standard deviations from `noise_scale`, shape (ny,).
+        """
+        return ()
+
     def process_noise(self, system: System, setup: Setup) -> np.ndarray:
         """Return L (nx, m), in state units per √s, of process noise of the plant beyond that of
         the setup which is played; m is zero for none."""

@@ -72,6 +72,9 @@ class Outliers(Condition):
         ]
         return sent.y + np.stack(errors, axis=1) * (self.strength * sent.noise_std)
 
+    def output_errors(self, scale: np.ndarray) -> tuple[tuple[float, np.ndarray], ...]:
+        return ((self.probability, self.strength * scale),)
+
 
 @dataclass(frozen=True)
 class Delay(Condition):
@@ -93,8 +96,11 @@ class Delay(Condition):
         return setup
 
     def outputs(self, sent: Outputs, rngs: Sequence[np.random.Generator]) -> np.ndarray:
-        late = np.full_like(sent.y, np.nan)
-        late[self.samples :] = sent.y[: -self.samples]
+        return self.arrival(sent.y)
+
+    def arrival(self, y: np.ndarray) -> np.ndarray:
+        late = np.full_like(y, np.nan)
+        late[self.samples :] = y[: -self.samples]
         return late
 
     def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import product
 
 import numpy as np
 
@@ -35,6 +36,11 @@ class Mismatch(Condition):
         count = len(off.std)
         signs = np.array([2.0 * rng.integers(0, 2, count) - 1 for rng in rngs]).reshape(-1, count)
         return off.plant(system, self.part * signs)
+
+    def plants(self, system: System) -> tuple[System, ...]:
+        off = self._off(system)
+        signs = product((-1.0, 1.0), repeat=len(off.std))
+        return tuple(off.plant(system, self.part * np.array(each)) for each in signs)
 
     def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
         """The relative deviation of each parameter, or of each rate of change."""
@@ -154,6 +160,9 @@ class LoadStep(Condition):
         torque = np.array([rng.uniform(0.0, self.highest) for rng in rngs])
         changes = {"load_step_time": self.time, "load_step_torque": torque}
         return replace(system, **changes)
+
+    def plants(self, system: System) -> tuple[System, ...]:
+        raise ValueError("condition 'load_step' draws a torque from an interval; it has no list")
 
     def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
         """The torque after the step, relative to the model's torque T_L, which has none."""

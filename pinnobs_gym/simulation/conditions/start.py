@@ -70,3 +70,11 @@ class OutsideSet(Condition):
     def starts(self, x0: np.ndarray, inside: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         x0 = self.factor * x0
         return x0[~inside(x0)]
+
+    def start_log_density(
+        self,
+        x0: np.ndarray,
+        log_density: Callable[[np.ndarray], np.ndarray],
+        inside: Callable[[np.ndarray], np.ndarray],
+    ) -> np.ndarray:
+        return np.where(inside(x0), -np.inf, log_density(x0 / self.factor))
