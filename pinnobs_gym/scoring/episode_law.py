@@ -29,8 +29,13 @@ class EpisodeLaw:
     """The equally probable plants."""
 
     @classmethod
-    def of(cls, source: EpisodeSource) -> Self:
+    def of(cls, source: EpisodeSource, process_noise: bool = False) -> Self:
         """Return the law of a source of episodes.
+
+        Args:
+            source: of the episodes.
+            process_noise: whether the plant may have process noise; its trajectories are not those
+                of `trajectories` then.
 
         Raises:
             ValueError: in one line, if its likelihood is not known: with process noise, without
@@ -38,7 +43,7 @@ class EpisodeLaw:
                 states, or under a condition whose plants cannot be listed.
         """
         name, system = type(source.system).__name__, source.system
-        if source.noise.stochastic:
+        if source.noise.stochastic and not process_noise:
             raise ValueError(f"{name} has process noise, with which a state has no single past")
         if source.fixed_x0:
             raise ValueError(f"{name} starts from a known state; nothing is to be estimated")
@@ -49,7 +54,7 @@ class EpisodeLaw:
         R = law._R
         if not (np.diagonal(R, axis1=1, axis2=2) > 0).all():
             raise ValueError(f"{name} has an output without noise, which has no likelihood")
-        if law._errors and (R != R * np.eye(system.ny)).any():
+        if law._errors and (R * np.eye(system.ny) != R).any():
             raise ValueError(f"{name} has correlated output noise and outliers; expected one")
         return law
 
@@ -111,7 +116,7 @@ class EpisodeLaw:
         return truth(plant, x0, times, source.setup.truth_step, inputs=inputs)
 
     def log_likelihood(
-        self, plant: System, x: np.ndarray, y: np.ndarray, u: np.ndarray
+        self, plant: System, x: np.ndarray, y: np.ndarray, u: np.ndarray, first: int = 0
     ) -> np.ndarray:
         """Return the log-likelihood of each sample's outputs given trajectories, up to a constant
         of the sample, shape (num_samples, count).
@@ -121,9 +126,11 @@ class EpisodeLaw:
             x: states, shape (num_samples, count, nx).
             y: received outputs of the episode, NaN where missing, shape (at least num_samples, ny).
             u: inputs, shape (at least num_samples, nu).
+            first: index of the first sample; above 0 only where outputs arrive at once.
         """
         num_samples = len(x)
-        times, u = self.source.times[:num_samples, None], u[:num_samples, None]
+        part = slice(first, first + num_samples)
+        times, u = self.source.times[part, None], u[:num_samples, None]
         sent = plant.h(times, x, np.broadcast_to(u, (*x.shape[:2], u.shape[-1])))
         received = self.source.condition.arrival(sent)
         off = residual(y[:num_samples, None], received, plant.output_period)
@@ -131,7 +138,7 @@ class EpisodeLaw:
             return self._with_errors(off)
         result = np.zeros(off.shape[:2])
         present = ~np.isnan(y[:num_samples]) & ~np.isnan(received[:, 0])
-        R = self._R[:num_samples]
+        R = self._R[part]
         if (np.eye(R.shape[-1]) * R == R).all():
             # Independent outputs: the squares add.
             variances = np.diagonal(R, axis1=1, axis2=2)[:, None]

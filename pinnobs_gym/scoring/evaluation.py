@@ -176,6 +176,7 @@ def run_episodes(
     results: Results | None = None,
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
+    more: Callable[[Played], list[Row]] | None = None,
 ) -> Evaluated:
     """Run and score the episodes that are not stored yet, batch by batch.
 
@@ -186,6 +187,7 @@ def run_episodes(
         results: the stored rows, and the file to which new rows are appended.
         progress: called after each batch with its number of episodes.
         label: name of the estimator in rows; its own if None.
+        more: returns further fields of the rows of a batch.
     """
     common = _common(estimator, game)
     if label is not None:
@@ -200,6 +202,8 @@ def run_episodes(
         played = play(game, estimator, [rows_module.seed_of(row) for row in batch])
         first_played = first_played or played
         done = [{**row, **scores} for row, scores in zip(batch, _scored(played), strict=True)]
+        if more is not None:
+            done = [{**row, **further} for row, further in zip(done, more(played), strict=True)]
         if results is not None:
             # Curves first: if a crash follows, episodes without rows are run again.
             save(folder_of(results.path), done[0], curves_of(played))

@@ -88,9 +88,7 @@ class Mixture:
         of all mixtures of n dimensions, (count,)."""
         n = x.shape[1]
         parts = []
-        for probability, mean, root in zip(
-            self.probabilities, self.means, self.roots, strict=True
-        ):
+        for probability, mean, root in zip(self.probabilities, self.means, self.roots, strict=True):
             white = np.linalg.solve(root, (x - mean).T)
             square = (white**2).sum(axis=0)
             log_size = np.log(np.diag(root)).sum()

@@ -1,0 +1,86 @@
+"""`floor ...`: compute the floor of estimation errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pinnobs_gym.cli.console import RunView, console
+from pinnobs_gym.cli.options import parse
+from pinnobs_gym.envs.game import Game
+from pinnobs_gym.files import check_writable
+from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
+from pinnobs_gym.leaderboard.jobs.floor_job import floor_jobs
+from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.evaluation import seeds_of
+from pinnobs_gym.scoring.exact_bayes import LEAST_ESS
+from pinnobs_gym.scoring.floor import LARGEST, floors_of, too_few
+from pinnobs_gym.systems import SYSTEMS
+
+
+@dataclass(frozen=True)
+class FloorCommand:
+    """Compute the floor of estimation errors: the posterior mean under the law of the episodes, of
+    systems of up to three states; with process noise, a large particle filter. What is stored is
+    kept."""
+
+    system: tuple[str, ...] = ()
+    """Names or module:Class of systems; all built-in ones of up to three states if none is
+    given."""
+    condition: tuple[str, ...] = ("nominal",)
+    """Conditions, such as nominal or noise5+dropout10."""
+    setup: str = "benchmark"
+    """Setup to play."""
+    episodes: int = 100
+    """Number of episodes."""
+    seed: int = 0
+    """Seed of the first episode."""
+    jobs: int = 2
+    """Number of processes, one thread each."""
+    fresh: bool = False
+    """Compute all episodes, also those that are stored; the new rows replace them."""
+    out: Path = Path("runs/floor")
+    """Folder of the rows file and of the curves; that of a leaderboard, to have the floor in its
+    tables."""
+
+    def run(self) -> int:
+        """Compute what is missing."""
+        if self.jobs < 1:
+            raise ValueError(f"jobs={self.jobs}; expected at least 1")
+        seeds = seeds_of(self.seed, self.episodes)
+        games = [
+            Game.of(name, self.setup, each) for name in self._systems for each in self.condition
+        ]
+        for game in games:
+            floors_of(game)  # raises for a game without a floor, before anything is computed
+        check_writable(self.out)
+        path = self.out / "rows.jsonl"
+        rows.load(path)  # reject a damaged file before anything is computed
+        jobs = list(floor_jobs(games, seeds, self.out.absolute(), self.fresh))
+        engine = Engine(Workers(self.jobs))
+        with RunView(len(jobs), lambda: [job.name for job in engine.running]) as view:
+            for job, error in engine.run(jobs):
+                view.ended(job.name, error)
+        wanted = {game.name for game in games}
+        few = too_few([row for row in rows.read(path) if rows.game_of(row) in wanted])
+        if few:
+            console.print(
+                f"{len(few)} episodes have an effective sample size below {LEAST_ESS:.0f}; "
+                "their posterior is not exact",
+                style="yellow",
+                soft_wrap=True,
+            )
+        console.print(f"rows: {path}", soft_wrap=True)
+        return 1 if view.failed else 0
+
+    @property
+    def _systems(self) -> Sequence[str]:
+        if self.system:
+            return self.system
+        return [name for name, cls in SYSTEMS.classes().items() if len(cls.state_names) <= LARGEST]
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command and return its exit status."""
+    return parse(FloorCommand, "floor", arguments).run()
