@@ -63,7 +63,13 @@ def exact_bayes(law: EpisodeLaw, record: Record, draws: int = 4096, seed: int = 
 
     Returns:
         The posteriors; ``ess`` is below `LEAST_ESS` where no proposal reached it.
+
+    Raises:
+        ValueError: in one line, if the record is not of these episodes' sample times.
     """
+    times = law.source.times[: record.num_samples]
+    if not np.array_equal(record.t, times):
+        raise ValueError("the record has other sample times than the episodes of this law")
     each = [_Sampler.of(law, record, i, draws, seed).run() for i in range(record.batch)]
     batches = [
         Posterior(*(np.stack([getattr(part, name) for part in parts]) for name in _MOMENTS))

@@ -25,6 +25,7 @@ from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.particle import ParticleFilter
 from pinnobs_gym.estimators.sliding_mode import SlidingMode
 from pinnobs_gym.estimators.strong_tracking_ekf import StrongTrackingEKF
+from pinnobs_gym.scoring.episode_law import EpisodeLaw
 from pinnobs_gym.scoring.exact_bayes import exact_bayes
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, independent, output_scale, stack
@@ -130,18 +131,14 @@ def test_particles_find_a_posterior_that_is_not_gaussian():
 
 
 def test_exact_bayes_of_the_same():
-    record = Record(
-        np.arange(1) * 0.1,
-        np.array([[[0.4]]]),
-        np.zeros((1, 1, 0)),
-        Prior(np.zeros((1, 1)), np.full((1, 1, 1), 0.36)),
-    )
-    posterior = exact_bayes(
-        Cubed(), Cubed.setups["benchmark"], record, np.array([0.09]), draws=50_000
-    )
+    source = EpisodeSource(Cubed)
+    record = source.record(source.play(source.draw(source.streams([0]))))
+    posterior = exact_bayes(EpisodeLaw.of(source), record).filtered
     x = np.linspace(-1, 1, 20_001)
-    density = np.exp(-((0.4 - x**3) ** 2) / 0.18)
-    assert posterior.mean[0, 0, 0] == pytest.approx((density * x).sum() / density.sum(), abs=0.01)
+    misfit = np.cumsum((record.y[0] - x**3) ** 2, axis=0)
+    density = np.exp(-misfit / (2 * 0.3**2))
+    mean = (density * x).sum(axis=1) / density.sum(axis=1)
+    np.testing.assert_allclose(posterior.mean[0, :, 0], mean, atol=0.05)
 
 
 @pytest.mark.parametrize("kind", [EnKF, ParticleFilter])

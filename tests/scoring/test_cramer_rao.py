@@ -1,6 +1,4 @@
-"""The Cramér–Rao reference against its closed form, and exact Bayes against least squares."""
-
-from dataclasses import dataclass, replace
+"""The Cramér–Rao reference against its closed form."""
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from linear import (
     jacobians,
     linear_record,
     process_covariance,
-    record_of,
     runge_kutta_matrix,
 )
 from scipy.linalg import expm
@@ -20,11 +17,8 @@ from scipy.linalg import expm
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring.cramer_rao import cramer_rao, expected_nrmse, step_error
-from pinnobs_gym.scoring.exact_bayes import exact_bayes
 from pinnobs_gym.scoring.metrics import error_scores, windows
 from pinnobs_gym.simulation.model import model_step_jacobian
-from pinnobs_gym.simulation.system import Setup
-from pinnobs_gym.systems import SYSTEMS
 
 
 def played(name, batch, **changes):
@@ -117,11 +111,6 @@ def test_expected_errors_are_those_of_errors_of_these_covariances():
         assert rms == pytest.approx(expected[0], rel=0.01), name
 
 
-@dataclass(frozen=True)
-class WideLinear(Linear):
-    setups = {"benchmark": replace(Linear.setups["benchmark"], x0_low=(-5, -5), x0_high=(5, 5))}
-
-
 def test_the_error_of_a_step_is_the_runge_kutta_methods():
     x = np.random.default_rng(0).standard_normal((3, 5, 2))
     dt = 0.1
@@ -132,55 +121,3 @@ def test_the_error_of_a_step_is_the_runge_kutta_methods():
     np.testing.assert_allclose(found[:, 1:], expected, atol=1e-14)
     assert abs(found[:, 1:]).max() > 1e-8
     assert not found[:, 0].any()
-
-
-@dataclass(frozen=True)
-class WideModulated(Modulated):
-    setups = WideLinear.setups
-
-
-def plain(record):
-    """C, and the outputs, of `WideLinear`."""
-    return np.repeat(H[None], record.num_samples, axis=0), record.y
-
-
-def demodulated(record):
-    """C, and the outputs less what is known of them, of `WideModulated`."""
-    sine = 0.5 * np.stack([np.sin(3 * record.t), 0 * record.t], axis=-1)
-    C = jacobians(WideModulated(), record.t, record.u[0])
-    return C, record.y - record.u * (0.7, -1.1) - sine
-
-
-@pytest.mark.parametrize(("cls", "outputs"), [(WideLinear, plain), (WideModulated, demodulated)])
-def test_on_a_linear_system_exact_bayes_is_least_squares(cls, outputs):
-    """With a uniform prior much wider than what one output leaves open."""
-    record = record_of(EpisodeSource(cls), 3)
-    setup: Setup = cls.setups["benchmark"]
-    posterior = exact_bayes(cls(), setup, record, np.full(2, 0.01), draws=4000)
-    C, y = outputs(record)
-    assert posterior.ess[:, 2:].min() > 400
-    F, Phi = runge_kutta_matrix(0.1), np.eye(2)
-    information, right = np.zeros((2, 2)), np.zeros((2, 3))
-    for k in range(record.num_samples):
-        G = C[k] @ Phi
-        information += G.T @ G / 0.01
-        right += G.T @ y[:, k].T / 0.01
-        if k >= 2:
-            cov = Phi @ np.linalg.inv(information) @ Phi.T
-            off = posterior.mean[:, k] - (Phi @ np.linalg.solve(information, right)).T
-            assert (abs(off) < 0.25 * np.sqrt(np.diag(cov))).all()
-            np.testing.assert_allclose(
-                posterior.cov[:, k], np.repeat(cov[None], 3, axis=0), atol=0.25 * abs(cov).max()
-            )
-        Phi = F @ Phi
-
-
-def test_no_filter_is_better_than_exact_bayes():
-    source, x, record = played("ReverseDuffing", 12, duration=4.0)
-    duffing = SYSTEMS.resolve("ReverseDuffing")()
-    posterior = exact_bayes(duffing, source.setup, record, np.array([0.02**2]), draws=1500)
-    assert np.median(posterior.ess) > 300
-    errors = {}
-    for name, xhat in (("bayes", posterior.mean), ("ekf", EKF(duffing).run(record).xhat)):
-        errors[name] = np.sqrt(np.mean(((xhat - x) / duffing.scale) ** 2, axis=(1, 2)))
-    assert np.mean(errors["bayes"]) < np.mean(errors["ekf"])

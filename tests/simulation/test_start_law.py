@@ -4,12 +4,12 @@ import pickle
 
 import numpy as np
 import pytest
-from linear import H, Linear, record_of, runge_kutta_matrix
+from linear import Linear
 
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.scoring.exact_bayes import exact_bayes
+from pinnobs_gym.scoring.episode_law import EpisodeLaw
 from pinnobs_gym.simulation.augmented import Unknown, augmented
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.start_law import Box, Gaussian, Joint, Points
@@ -129,28 +129,10 @@ def test_conditions_of_the_start_follow_the_law(law):
     assert source.setup.x0_law is law
 
 
-def test_the_exact_posterior_from_a_gaussian_start_is_the_kalman_filters():
-    """Within five standard errors of as many independent draws as the effective sample size."""
-    source = EpisodeSource(system_with(Gaussian(MEAN, COV)), duration=1.0)
-    record, R, F = record_of(source, 4), np.full(2, 0.1**2), runge_kutta_matrix(0.1)
-    found = exact_bayes(source.system, source.setup, record, R, draws=2000)
-    assert found.ess[:, 1:].min() > 200
-    xhat, P = np.tile(MEAN, (4, 1)), np.array(COV)
-    for k in range(record.num_samples):
-        if k:
-            xhat, P = xhat @ F.T, F @ P @ F.T
-        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(R))
-        xhat, P = xhat + (record.y[:, k] - xhat @ H.T) @ K.T, P - K @ H @ P
-        std, error = np.sqrt(np.diag(P)), 5 / np.sqrt(found.ess[:, k, None])
-        assert (abs(found.mean[:, k] - xhat) < error * std).all()
-        assert (abs(found.cov[:, k] - P) < 1.5 * error[..., None] * np.outer(std, std)).all()
-
-
 def test_a_list_has_no_density():
     source = EpisodeSource(system_with(Points(STATES)), duration=0.5)
-    record = record_of(source, 1)
     with pytest.raises(ValueError, match="a list of 4 states and has no density"):
-        exact_bayes(source.system, source.setup, record, np.full(2, 0.01))
+        EpisodeLaw.of(source)
 
 
 def test_the_kalman_filter_is_consistent_from_a_gaussian_start():
