@@ -103,7 +103,7 @@ class _Draws:
     def moments(self, weight: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
         """Return means (k, nx) and covariances (k, nx, nx) of the states at some samples, given
         weights (k, count) or (1, count)."""
-        used = (weight > 0).any(axis=0)
+        used = np.any(weight > 0, axis=0)
         x = np.where(used[:, None], self.x[part], 0.0)
         mean = np.matmul(weight[:, None], x)[:, 0]
         off = x - mean[:, None]
