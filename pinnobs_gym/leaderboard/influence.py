@@ -9,6 +9,8 @@ import numpy as np
 
 TRIMMED = 0.25
 """Part of the values trimmed at either end."""
+SMALLEST = 1e-12
+"""Smallest NRMSE that counts, of an estimate that is exact."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,22 @@ def divergence(results: Results) -> Influence:
     """Return the rate of divergence."""
     values = np.asarray(results.diverged, dtype=float)
     return _influence(float(values.mean()), values, values - values.mean(), values.shape[1])
+
+
+def log_rms_ratio(error: np.ndarray, floor: np.ndarray) -> Influence:
+    """Return the log of the root mean square of errors over that of their floor.
+
+    Influence values are those of a ratio of means, linearised: (e²/mean e² - f²/mean f²)/2.
+
+    Args:
+        error: shape (training seeds, episodes), finite and not all zero.
+        floor: of the same episodes, shape (episodes,), finite and not all zero.
+    """
+    own, least = np.square(error), np.square(floor)
+    value = float(np.log(own.mean()) - np.log(least.mean())) / 2
+    scaled = (own / own.mean() - least / least.mean()) / 2
+    excess = (own - least) / least.mean()  # zero on episodes without a difference
+    return _influence(value, excess, scaled, own.shape[1])
 
 
 def _influence(value: float, values: np.ndarray, scaled: np.ndarray, kept: int) -> Influence:
