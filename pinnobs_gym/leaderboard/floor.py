@@ -129,6 +129,12 @@ def is_particles(row: Row) -> bool:
     return row["estimator"].partition(" (")[0] == PARTICLES
 
 
+def label(row: Row) -> str:
+    """Return what a floor is called in charts."""
+    name = "particle reference" if is_particles(row) else "exact Bayes"
+    return name if row["track"] == FLOOR else f"{name}, whole record"
+
+
 def over_floor(parts: Mapping[str, tuple[Sequence[Row], Floor]], window: str) -> Interval | None:
     """Return an estimator's errors over their floor: in a system the root mean square of the NRMSE
     over episodes, over that of the floor on the same episodes; the geometric mean over systems.

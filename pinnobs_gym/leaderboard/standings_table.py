@@ -57,7 +57,7 @@ def grid(table: Table, intervals: bool = True) -> Grid:
         column if any(line[i] for line in lines) or not column.priority else _emptied(column)
         for i, (column, _) in enumerate(COLUMNS)
     )
-    tracks = [entry.standing.track for entry in table.lines]
+    tracks = [*(entry.standing.track for entry in table.entries), *("floor" for _ in table.floor)]
     return Grid(table.title, columns, lines, track_blocks(tracks), table.note)
 
 

@@ -118,10 +118,12 @@ def _floor_note(rows: Sequence[Row]) -> str:
     exact = [row for row in rows if not is_particles(row)]
     sizes = [row["effective_sample_size"] for row in exact if row.get("effective_sample_size")]
     if exact:
-        least = f"{number(min(sizes))}" if sizes else "an unknown number of"
-        few = sizes and min(sizes) < FEWEST_EFFECTIVE
-        needed = f", fewer than the {FEWEST_EFFECTIVE} that make it exact" if few else ""
-        parts.append(f"Floor: exact Bayes, with at least {least} effective draws{needed}.")
+        least = min(sizes, default=0.0)
+        few = f", fewer than the {FEWEST_EFFECTIVE} that make it exact"
+        counted = (
+            f"at least {number(least)} effective draws{few if least < FEWEST_EFFECTIVE else ''}"
+        )
+        parts.append(f"Floor: exact Bayes, with {counted if sizes else 'unknown precision'}.")
     particles = [row for row in rows if is_particles(row)]
     errors = [row["monte_carlo"] for row in particles if row.get("monte_carlo") is not None]
     if particles:

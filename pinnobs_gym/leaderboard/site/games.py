@@ -9,9 +9,10 @@ from pathlib import Path
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import Contender
-from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
+from pinnobs_gym.leaderboard.floor import NO_FLOORS, Floors, label
+from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.site.columns import Columns
-from pinnobs_gym.leaderboard.site.over_episodes import ratios, settling
+from pinnobs_gym.leaderboard.site.over_episodes import over_floor, ratios, settling
 from pinnobs_gym.leaderboard.site.over_samples import States, errors, reference, states
 from pinnobs_gym.leaderboard.standings_table import Table
 from pinnobs_gym.scoring import curves
@@ -38,12 +39,21 @@ class GameResults:
     """``estimator``, ``t``, and ``median``, ``q10``, ``q90`` over episodes of a sample's NRMSE."""
     reference: Columns
     """``t`` and the ``median`` over episodes of the error expected at the Cramér-Rao reference."""
+    over_floor: Columns
+    """Each estimator's errors over the floor; see `over_episodes.over_floor`."""
+    floor_errors: Columns
+    """Those of the floor, as `errors`."""
+    floor_settling: Columns
+    """That of the floor, as `settling`."""
     states: States | None
     """The example episode; None without curves."""
 
 
 def games_of(
-    contenders: Iterable[Contender], tables: Iterable[Table], folders: Sequence[Path]
+    contenders: Iterable[Contender],
+    tables: Iterable[Table],
+    folders: Sequence[Path],
+    floors: Floors = NO_FLOORS,
 ) -> list[GameResults]:
     """Return the results of the games in a system's ranked condition, and of nominal games after
     them.
@@ -52,6 +62,7 @@ def games_of(
         contenders: in the order of the charts.
         tables: of all games.
         folders: folders with their curves.
+        floors: the floors of all games.
 
     Raises:
         ValueError: in one line, if a file of curves is damaged.
@@ -67,11 +78,24 @@ def games_of(
         played, key=lambda game: (game.env_id, game.setup, not ranked[game], game.condition)
     )
     return [
-        _results(number, known[game], played[game], folders) for number, game in enumerate(order)
+        _results(number, known[game], played[game], _floors(floors, game, played[game]), folders)
+        for number, game in enumerate(order)
     ]
 
 
-def _results(number: int, table: Table, players: Players, folders: Sequence[Path]) -> GameResults:
+def _floors(floors: Floors, game: GameName, players: Players) -> Players:
+    """Return the floors of a game by their names, on the episodes that were played."""
+    episodes = {row["episode"] for runs in players.values() for row in rows_of(runs)}
+    found: dict[str, list[ScoredRun]] = defaultdict(list)
+    for floor in floors.among([game]).by_game.values():
+        for run in runs_of(floor.among(episodes)):
+            found[label(run.rows[0])].append(run)
+    return found
+
+
+def _results(
+    number: int, table: Table, players: Players, floors: Players, folders: Sequence[Path]
+) -> GameResults:
     game = table.game
     own = _curves(game, players, folders)
     rows = {name: rows_of(runs) for name, runs in players.items()}
@@ -83,6 +107,9 @@ def _results(number: int, table: Table, players: Players, folders: Sequence[Path
         ratios=ratios(rows),
         errors=errors(own),
         reference=reference(own.values()),
+        over_floor=over_floor({e.name: e.standing for e in table.entries if e.name in players}),
+        floor_errors=errors(_curves(game, floors, folders)),
+        floor_settling=settling({name: rows_of(runs) for name, runs in floors.items()}),
         states=states(own),
     )
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pinnobs_gym.leaderboard.site.columns import QUANTILES, Columns, extend, number, quantiles
-from pinnobs_gym.leaderboard.standings import over_reference
+from pinnobs_gym.leaderboard.standings import Standing, over_reference
 from pinnobs_gym.scoring.rows import Row
 
 STEPS = 100
@@ -78,4 +78,28 @@ def ratios(players: Players) -> Columns:
     table["rms"] = [number(each.rms) for each in spreads]
     for i, q in enumerate(QUANTILES):
         table[f"q{100 * q:.0f}"] = [number(each.quantiles[i]) for each in spreads]
+    return table
+
+
+def over_floor(standings: Mapping[str, Standing]) -> Columns:
+    """Return the ``ratio`` of each estimator's error to the floor in each ``window``, with its
+    interval ``low`` to ``high``; the smallest in the steady window first."""
+    found = {
+        name: {"steady": own.over_floor_steady, "transient": own.over_floor_transient}
+        for name, own in standings.items()
+    }
+    first = {name: next(filter(None, own.values()), None) for name, own in found.items()}
+    order = sorted((ratio.value, name) for name, ratio in first.items() if ratio is not None)
+    table: Columns = {"estimator": [], "window": [], "ratio": [], "low": [], "high": []}
+    for _, name in order:
+        for window, ratio in found[name].items():
+            if ratio is not None:
+                extend(
+                    table,
+                    estimator=[name],
+                    window=[window],
+                    ratio=[number(ratio.value)],
+                    low=[number(ratio.low)],
+                    high=[number(ratio.high)],
+                )
     return table
