@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,10 +30,10 @@ class Line:
     """Summary of each game that it played."""
     us_per_step: float
     """Median over games."""
-    over_floor: Mapping[str, Interval]
+    over_floor: Mapping[str, Interval] = field(default_factory=dict)
     """Its error over the floor in each window, the geometric mean over `floor_games` of its track
     (`pinnobs_gym.leaderboard.floor.over_floor`); absent if it lacks one of them."""
-    floor_games: Mapping[GameName, bool]
+    floor_games: Mapping[GameName, bool] = field(default_factory=dict)
     """The games with a floor for its track, and whether this is a particle reference."""
 
     @property

@@ -86,7 +86,7 @@ def _across(styled: Styled, costs: Columns) -> Charts:
 def _game(styled: Styled, game: GameResults) -> Charts:
     """Return the charts of one game."""
     tables = {name: getattr(game, name) for name in TABLES}
-    end = max([*game.errors["t"], *game.settling["t"], 1e-9])
+    end = max([*game.errors["t"], *game.settling["t"], *game.floor_settling["t"], 1e-9])
     specs = {}
     if game.errors["t"]:
         lines = (game.errors, game.reference, game.floor_errors)

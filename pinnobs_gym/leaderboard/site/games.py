@@ -99,17 +99,19 @@ def _results(
     game = table.game
     own = _curves(game, players, folders)
     rows = {name: rows_of(runs) for name, runs in players.items()}
+    floor_rows = {name: rows_of(runs) for name, runs in floors.items()}
+    settled = settling(rows)
     return GameResults(
         number=number,
         game=game,
         table=table,
-        settling=settling(rows),
+        settling=settled,
         ratios=ratios(rows),
         errors=errors(own),
         reference=reference(own.values()),
         over_floor=over_floor({e.name: e.standing for e in table.entries if e.name in players}),
         floor_errors=errors(_curves(game, floors, folders)),
-        floor_settling=settling({name: rows_of(runs) for name, runs in floors.items()}),
+        floor_settling=settling(floor_rows, until=max(settled["t"])),
         states=states(own),
     )
 

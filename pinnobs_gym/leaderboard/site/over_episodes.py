@@ -26,11 +26,12 @@ class _Ratios(NamedTuple):
     quantiles: np.ndarray
 
 
-def settling(players: Players) -> Columns:
+def settling(players: Players, until: float = 0.0) -> Columns:
     """Return, for every estimator, the ``share`` of its episodes that have settled by the time
-    ``t`` in s; diverged episodes never settle. Values hold until the next time."""
+    ``t`` in s; diverged episodes never settle. Values hold until the next time, the last ones until
+    the last time of all or ``until``, in s, if that is later."""
     times = {name: _settled(rows) for name, rows in players.items()}
-    last = max([0.0, *(float(t[-1]) for t in times.values() if len(t))])
+    last = max([until, *(float(t[-1]) for t in times.values() if len(t))])
     table: Columns = {"estimator": [], "t": [], "share": []}
     for name, settled in times.items():
         t, shares = _steps(settled, len(players[name]))
