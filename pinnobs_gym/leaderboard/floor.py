@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.comparison import estimate, interval
+from pinnobs_gym.leaderboard.comparison import ROUNDING, estimate, interval
 from pinnobs_gym.leaderboard.influence import SMALLEST, log_rms_ratio
 from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.scoring.row_format import FLOOR, FLOOR_WHOLE
@@ -159,7 +159,10 @@ def over_floor(parts: Mapping[str, tuple[Sequence[Row], Floor]], window: str) ->
         finite = all(np.isfinite(np.square(error).sum()) for error, _ in found.values())
     if not finite:
         return Interval(np.inf, np.inf, np.inf)
-    return interval(estimate({name: log_rms_ratio(*pair) for name, pair in found.items()})).exp
+    ratio = estimate({name: log_rms_ratio(*pair) for name, pair in found.items()})
+    if ratio.standard_error <= ROUNDING and abs(ratio.value) <= ROUNDING:
+        return Interval(1.0, 1.0, 1.0)
+    return interval(ratio).exp
 
 
 def _paired(rows: Sequence[Row], floor: Floor, window: str) -> tuple[np.ndarray, np.ndarray] | None:
