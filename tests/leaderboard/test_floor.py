@@ -36,9 +36,9 @@ def ratio_of(errors, floors, **changes):
 
 
 def test_the_ratio_is_that_of_root_mean_squares_with_its_interval():
-    """Of e² = 9, 16, ... over f² = 1, 4, ..., each of five episodes: √5. The interval is that of the
-    jackknife, by leaving out each episode, with as many degrees of freedom as there are episodes of
-    equal weight: parts of 0.056 and 0.144 weigh as 1/(5·0.056² + 5·0.144²) = 8.4 of them."""
+    """Of e² = 9, 16, ... over f² = 1, 4, ..., each of five episodes: √5. The interval is that of
+    the jackknife, by leaving out each episode, with the degrees of freedom of as many episodes as
+    weigh equally: parts of 0.056 and 0.144 weigh as 1/(5·0.056² + 5·0.144²) = 8.4 of them."""
     found = ratio_of([3.0, 4.0] * 5, [1.0, 2.0] * 5)
     e, f = np.array([9.0, 16.0] * 5), np.array([1.0, 4.0] * 5)
     without = [np.log(np.delete(e, i).mean() / np.delete(f, i).mean()) / 2 for i in range(10)]

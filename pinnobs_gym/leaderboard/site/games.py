@@ -7,7 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.envs.game import GameName
+import numpy as np
+
+from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.leaderboard.contenders import Contender
 from pinnobs_gym.leaderboard.floor import NO_FLOORS, Floors, label
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
@@ -38,7 +40,8 @@ class GameResults:
     errors: Columns
     """``estimator``, ``t``, and ``median``, ``q10``, ``q90`` over episodes of a sample's NRMSE."""
     reference: Columns
-    """``t`` and the ``median`` over episodes of the error expected at the Cramér-Rao reference."""
+    """``t`` and the ``median`` over episodes of the error expected at the Cramér-Rao reference, in
+    the steady window."""
     over_floor: Columns
     """Each estimator's errors over the floor; see `over_episodes.over_floor`."""
     floor_errors: Columns
@@ -108,12 +111,21 @@ def _results(
         settling=settled,
         ratios=ratios(rows),
         errors=errors(own),
-        reference=reference(own.values()),
+        reference=reference(own.values(), _transient_end(game)),
         over_floor=over_floor({e.name: e.standing for e in table.entries if e.name in players}),
         floor_errors=errors(_curves(game, floors, folders)),
         floor_settling=settling(floor_rows, until=max(settled["t"])),
         states=states(own),
     )
+
+
+def _transient_end(game: GameName) -> float:
+    """Return the end of a game's transient window in s from the first sample; infinite if this
+    process does not know the game."""
+    try:
+        return Game.of(game.env_id, game.setup, game.condition).source.setup.transient_end
+    except ValueError:
+        return np.inf
 
 
 def _curves(game: GameName, players: Players, folders: Sequence[Path]) -> dict[str, Curves]:
