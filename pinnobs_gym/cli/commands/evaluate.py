@@ -73,11 +73,13 @@ class Evaluate:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         check_writable(self.out)
         evaluated = self._score(game, estimator, episodes)
-        found = floors([*evaluated.rows, *filter(is_floor, rows.read(self._rows))])
-        found = found.among([game.name])
+        known = [row for row in rows.read(self._rows) if rows.game_of(row) == game.name]
+        found = floors([*evaluated.rows, *filter(is_floor, known)])
         for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
             hint = f"pinnobs tables {self._rows} -o FILE writes all"
             print_table(standings_table.layouts(table), hint)
+        for note in found.notes:
+            console.print(note, style="yellow", soft_wrap=True)
         print_table([[by_state(game.source.system, evaluated.rows)]])
         # To draw takes as long as all else of one episode.
         drawn = evaluated.first_played if self.episodes > 1 else None
