@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pinnobs_gym.leaderboard import ranks
 from pinnobs_gym.leaderboard.contenders import Contender, among, contenders
 from pinnobs_gym.leaderboard.distinct import distinct
+from pinnobs_gym.leaderboard.floor import NO_FLOORS, Floors, contending, floors
 from pinnobs_gym.leaderboard.places import Places
 from pinnobs_gym.leaderboard.ranks import Line
 from pinnobs_gym.leaderboard.runs import ScoredRun, apart, runs_of
@@ -66,6 +67,8 @@ class Board:
     None if there are none."""
     notes: tuple[str, ...] = ()
     """What was left out, a sentence each."""
+    floors: Floors = NO_FLOORS
+    """The floors of errors of all games, which no table ranks."""
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -73,19 +76,22 @@ class Board:
         return (self.main,) if self.on_record is None else (self.main, self.on_record)
 
 
-def board(stored: Stored) -> Board:
-    """Compute all tables from stored scores."""
+def board(stored: Stored, shipped: Sequence[Row] = ()) -> Board:
+    """Compute all tables from stored scores, some of which may be floors, and further rows of
+    floors (`pinnobs_gym.leaderboard.floor.floors`)."""
     kept, notes = distinct(stored.rows, stored.uses)
-    made_before, on_record = apart(runs_of(kept))
-    main = _part(made_before, stored.failures)
-    second = _part(on_record, ()) if on_record else None
+    found = floors(kept, shipped)
+    made_before, on_record = apart(runs_of(contending(kept), found))
+    main = _part(made_before, stored.failures, found)
+    own_floors = found.among({run.game for run in on_record})
+    second = _part(on_record, (), own_floors) if on_record else None
     own = [main.note] if main.note else []
     if second is not None and second.note:
         own.append(f"Trained on each record: {second.note}")
-    return Board(main, second, (*notes, *own))
+    return Board(main, second, (*notes, *found.notes, *own), found)
 
 
-def _part(runs: Sequence[ScoredRun], failures: Sequence[Row]) -> Part:
+def _part(runs: Sequence[ScoredRun], failures: Sequence[Row], found_floors: Floors) -> Part:
     """Compute the tables of runs that can be compared."""
     found, setup = contenders(runs), _setup(runs)
     compared = among(found, lambda run: run.game.setup == setup)
@@ -94,7 +100,7 @@ def _part(runs: Sequence[ScoredRun], failures: Sequence[Row]) -> Part:
         contenders=tuple(found),
         setup=setup,
         compared=tuple(compared),
-        tables=tuple(tables(found, failures)),
+        tables=tuple(tables(found, failures, found_floors)),
         lines=tuple(lines),
         places=places,
         conditions=ranks.by_condition(compared),

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pinnobs_gym.leaderboard.influence import Influence, Results, divergence, interquartile_mean
+from pinnobs_gym.leaderboard.intervals import CONFIDENCE, Interval
 
 SEEDS_WEIGHT = 2.0
 """Factor of the seeds' terms in the degrees of freedom, see `estimate`."""
@@ -194,3 +195,16 @@ def p_value(estimate: Estimate) -> float:
 
     t = abs(estimate.value) / estimate.standard_error
     return max(2 * float(stdtr(estimate.degrees, -t)), estimate.least_p)
+
+
+def interval(estimate: Estimate) -> Interval:
+    """Return an estimate with its 95 % interval, which may be unbounded or, where nothing but
+    rounding varies, empty."""
+    if not np.isfinite(estimate.standard_error) or estimate.least_p > 1 - CONFIDENCE:
+        return Interval(estimate.value, -np.inf, np.inf)
+    if estimate.standard_error <= ROUNDING:
+        return Interval(estimate.value, estimate.value, estimate.value)
+    from scipy.special import stdtrit  # scipy.stats takes long to import
+
+    half = float(stdtrit(estimate.degrees, (1 + CONFIDENCE) / 2)) * estimate.standard_error
+    return Interval(estimate.value, estimate.value - half, estimate.value + half)

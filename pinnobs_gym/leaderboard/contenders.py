@@ -11,6 +11,7 @@ import numpy as np
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.distinct import name_of
+from pinnobs_gym.leaderboard.influence import SMALLEST
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
 from pinnobs_gym.leaderboard.standings import Standing, standing
 
@@ -20,8 +21,6 @@ LOST = 1.0
 """Smallest NRMSE that counts for a diverged episode in comparisons: an error of the whole scale."""
 LARGEST = 10.0
 """Largest NRMSE that counts for any episode in comparisons."""
-SMALLEST = 1e-12
-"""Smallest NRMSE that counts, of an estimate that is exact."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Contender:
     def standing(self, game: GameName) -> Standing:
         """Return the summary of one of its games over all training seeds."""
         runs = self.games[game]
-        return runs[0].standing if len(runs) == 1 else standing(rows_of(runs))
+        return runs[0].standing if len(runs) == 1 else standing(rows_of(runs), runs[0].floor)
 
 
 def contenders(runs: Iterable[ScoredRun]) -> list[Contender]:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.comparison import ROUNDING, Estimate, score
+from pinnobs_gym.leaderboard.comparison import ROUNDING, interval, score
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender
 from pinnobs_gym.leaderboard.influence import Results
-from pinnobs_gym.leaderboard.intervals import CONFIDENCE, Interval
+from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 
 PEER = "ukf"
@@ -157,17 +157,4 @@ def _factor(results: Mapping[str, Results]) -> Interval:
     estimate = score(results)
     if estimate.standard_error <= ROUNDING and abs(estimate.value) <= ROUNDING:
         return ITSELF
-    return _interval(estimate).exp
-
-
-def _interval(estimate: Estimate) -> Interval:
-    """Return an estimate with its 95 % interval, which may be unbounded or, where nothing but
-    rounding varies, empty."""
-    if not np.isfinite(estimate.standard_error) or estimate.least_p > 1 - CONFIDENCE:
-        return Interval(estimate.value, -np.inf, np.inf)
-    if estimate.standard_error <= ROUNDING:
-        return Interval(estimate.value, estimate.value, estimate.value)
-    from scipy.special import stdtrit  # scipy.stats takes long to import
-
-    half = float(stdtrit(estimate.degrees, (1 + CONFIDENCE) / 2)) * estimate.standard_error
-    return Interval(estimate.value, estimate.value - half, estimate.value + half)
+    return interval(estimate).exp

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.contenders import Contender, among
+from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender, among
+from pinnobs_gym.leaderboard.floor import FEWEST_COMMON, is_particles, over_floor
+from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.places import Place, Places, places
+from pinnobs_gym.leaderboard.runs import rows_of
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.simulation.conditions import CONDITIONS
 
@@ -26,6 +30,11 @@ class Line:
     """Summary of each game that it played."""
     us_per_step: float
     """Median over games."""
+    over_floor: Mapping[str, Interval] = field(default_factory=dict)
+    """Its error over the floor in each window, the geometric mean over `floor_games` of its track
+    (`pinnobs_gym.leaderboard.floor.over_floor`); absent if it lacks one of them."""
+    floor_games: Mapping[GameName, bool] = field(default_factory=dict)
+    """The games with a floor for its track, and whether this is a particle reference."""
 
     @property
     def diverged(self) -> float:
@@ -46,7 +55,8 @@ def lines(contenders: Iterable[Contender]) -> tuple[list[Line], Places]:
     """
     compared = among(contenders, lambda run: run.ranked)
     found = places(compared)
-    unsorted = [_line(contender, found) for contender in compared]
+    floor_games = _floor_games(compared)
+    unsorted = [_line(contender, found, floor_games[contender.track]) for contender in compared]
     order = {
         line.estimator: (line.track != "online", line.track, -len(line.games)) for line in unsorted
     }
@@ -54,7 +64,32 @@ def lines(contenders: Iterable[Contender]) -> tuple[list[Line], Places]:
     return sorted(unsorted, key=key), found
 
 
-def _line(contender: Contender, found: Places) -> Line:
+def _floor_games(compared: Iterable[Contender]) -> dict[str, dict[GameName, bool]]:
+    """Return, for each track, the games in which any of its contenders can be compared with a
+    floor, and whether this is a particle reference."""
+    found: dict[str, dict[GameName, bool]] = defaultdict(dict)
+    for contender in compared:
+        own = found[contender.track]
+        for run in contender.runs:
+            known = run.floor.among(row["episode"] for row in run.rows)
+            if len(known) >= FEWEST_COMMON:
+                own[run.game] = is_particles(known[0])
+    return found
+
+
+def _over_floor(contender: Contender, games: Iterable[GameName]) -> dict[str, Interval]:
+    """Return the ratios to the floor over these games, by window."""
+    if not set(games) <= contender.games.keys():
+        return {}
+    parts = {
+        " ".join(game): (rows_of(contender.games[game]), contender.games[game][0].floor)
+        for game in games
+    }
+    ratios = {window: over_floor(parts, window) for window in WINDOWS}
+    return {window: ratio for window, ratio in ratios.items() if ratio is not None}
+
+
+def _line(contender: Contender, found: Places, floor_games: Mapping[GameName, bool]) -> Line:
     """Return the line of a contender."""
     standings = {game: contender.standing(game) for game in contender.games}
     own = {window: placed.get(contender.name) for window, placed in found.windows.items()}
@@ -64,6 +99,8 @@ def _line(contender: Contender, found: Places) -> Line:
         places={window: place for window, place in own.items() if place is not None},
         games=standings,
         us_per_step=float(np.median([s.us_per_step for s in standings.values()])),
+        over_floor=_over_floor(contender, floor_games),
+        floor_games=floor_games,
     )
 
 

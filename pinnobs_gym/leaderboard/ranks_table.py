@@ -12,7 +12,12 @@ from pinnobs_gym.leaderboard.numerals import interval_text, number
 from pinnobs_gym.leaderboard.places import FEWEST, Place, Places
 from pinnobs_gym.leaderboard.ranks import Line, worst_ranks
 from pinnobs_gym.leaderboard.standings import Standing
-from pinnobs_gym.leaderboard.standings_table import facts_of, track_blocks, with_letters
+from pinnobs_gym.leaderboard.standings_table import (
+    facts_of,
+    over_floor_text,
+    track_blocks,
+    with_letters,
+)
 
 NOTE = (
     "Under the condition that each system is ranked under. The factor is the error over the "
@@ -63,12 +68,19 @@ def layouts(found: Sequence[Line], peer: str) -> Layouts:
 def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Grid:
     """Return the overview with columns of these games."""
     over = f" / {peer}" if peer else ""
+    compared = any(line.over_floor for line in found)  # with a floor
     columns: list[tuple[Column, Callable[[Line], str]]] = [
         (Column("rank"), lambda line: _rank(line.places.get("steady"))),
         (Column("estimator", numeric=False), lambda line: line.estimator),
         (Column(f"steady{over}"), lambda line: _factor(line.places.get("steady"))),
+        *(((Column("/ Bayes", 3), lambda line: _over_floor(line, "steady")),) if compared else ()),
         (Column("transient rank", 4), lambda line: _rank(line.places.get("transient"))),
         (Column(f"transient{over}", 2), lambda line: _factor(line.places.get("transient"))),
+        *(
+            ((Column("transient / Bayes", 4), lambda line: _over_floor(line, "transient")),)
+            if compared
+            else ()
+        ),
         (Column("diverged %", 1), lambda line: number(100 * line.diverged, 2)),
         *((Column(label(game)), lambda line, game=game: _of_game(line, game)) for game in games),
         (Column("track", 3, numeric=False), lambda line: line.track),
@@ -80,6 +92,24 @@ def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Gr
         tuple(column for column, _ in columns),
         tuple(tuple(cell(line) for _, cell in columns) for line in found),
         track_blocks([line.track for line in found]),
+        _floor_note(found) if compared else "",
+    )
+
+
+def _floor_note(found: Sequence[Line]) -> str:
+    """Return over which games the ratios to floors are means."""
+    means: dict[str, list[str]] = {}
+    for line in found:
+        if line.over_floor:
+            games = (
+                label(game) + (" (particle reference)" if particles else "")
+                for game, particles in sorted(line.floor_games.items())
+            )
+            means.setdefault(", ".join(games), []).append(line.track)
+    parts = (f"{', '.join(dict.fromkeys(tracks))} {games}" for games, tracks in means.items())
+    return (
+        "/ Bayes: root mean square of the error over that of exact Bayes on the same episodes (see "
+        f"the games), geometric mean over games with this floor: {'; '.join(parts)}."
     )
 
 
@@ -185,6 +215,11 @@ def _of_game(line: Line, game: GameName) -> str:
     lost = f"div {s.diverged.percent.value:.0f} %" if s.diverged.value else ""
     median = number(s.steady.value)
     return ", ".join(filter(None, [median, lost]))
+
+
+def _over_floor(line: Line, window: str) -> str:
+    ratio = line.over_floor.get(window)
+    return over_floor_text(ratio, lambda interval: interval_text(interval, 2))
 
 
 def _rank(place: Place | None) -> str:

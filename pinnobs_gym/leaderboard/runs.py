@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 
 from pinnobs_gym.envs.game import GameName
+from pinnobs_gym.leaderboard.floor import NO_FLOOR, NO_FLOORS, Floor, Floors
 from pinnobs_gym.leaderboard.standings import Standing, is_identifiable, standing
 from pinnobs_gym.scoring.rows import Row, game_of
 
@@ -22,6 +23,8 @@ class ScoredRun:
     """The scored rows, at least one."""
     position: int
     """Index of its first row among all stored rows."""
+    floor: Floor = NO_FLOOR
+    """The floor of the game for estimators of its track."""
 
     @property
     def estimator(self) -> str:
@@ -56,16 +59,16 @@ class ScoredRun:
     @cached_property
     def standing(self) -> Standing:
         """The summary of its rows, computed on first use."""
-        return standing(self.rows)
+        return standing(self.rows, self.floor)
 
 
-def runs_of(rows: Iterable[Row]) -> list[ScoredRun]:
-    """Group scored episodes into runs, in the order of their first rows."""
+def runs_of(rows: Iterable[Row], floors: Floors = NO_FLOORS) -> list[ScoredRun]:
+    """Group scored episodes into runs, in the order of their first rows, each with its floor."""
     runs: dict[tuple[GameName, str, str, str], ScoredRun] = {}
     for position, row in enumerate(rows):
         key = (game_of(row), row["game_hash"], row["estimator"], row["estimator_hash"])
         if key not in runs:
-            runs[key] = ScoredRun(key[0], [], position)
+            runs[key] = ScoredRun(key[0], [], position, floors.of(key[0], row["track"]))
         runs[key].rows.append(row)
     return list(runs.values())
 
@@ -83,7 +86,7 @@ def apart(runs: Sequence[ScoredRun]) -> tuple[list[ScoredRun], list[ScoredRun]]:
     for run in runs:
         wanted = None if run.per_record else common.get(run.game, set())
         rows = [row for row in run.rows if wanted is None or row["episode"] in wanted]
-        on_record += [ScoredRun(run.game, rows, run.position)] if rows else []
+        on_record += [replace(run, rows=rows)] if rows else []
     return [run for run in runs if not run.per_record], on_record if own else []
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.leaderboard.floor import NO_FLOOR, Floor, over_floor
 from pinnobs_gym.leaderboard.intervals import Interval, median, rate
 from pinnobs_gym.scoring.consistency import band
 from pinnobs_gym.scoring.identifiability import Identifiability
@@ -51,6 +52,11 @@ class Standing:
     over_reference: float | None
     """Root mean square over episodes of the NRMSE of the steady window, over that of the
     Cramér-Rao reference of the same episodes; None without a reference."""
+    over_floor_steady: Interval | None
+    """Root mean square over episodes of the NRMSE of the steady window, over that of the floor on
+    the same episodes (`pinnobs_gym.leaderboard.floor`); None without a floor."""
+    over_floor_transient: Interval | None
+    """The same of the transient window."""
     identifiable: bool
     """Whether the states can be told from the outputs under the game's condition
     (`pinnobs_gym.scoring.identifiability`)."""
@@ -71,8 +77,9 @@ class Standing:
     """Short description of the training."""
 
 
-def standing(rows: Sequence[Row]) -> Standing:
-    """Summarise one estimator's rows; diverged episodes have infinite scores."""
+def standing(rows: Sequence[Row], floor: Floor = NO_FLOOR) -> Standing:
+    """Summarise one estimator's rows; diverged episodes have infinite scores, but for the ratios to
+    the Cramér-Rao reference and to the floor of the game."""
     diverged = np.array([row["diverged"] for row in rows])
 
     def values(name: str) -> np.ndarray:
@@ -96,6 +103,8 @@ def standing(rows: Sequence[Row]) -> Standing:
         late=float(np.median(values("nrmse_75"))),
         tail=float(np.median(values("nrmse_tail"))),
         over_reference=over_reference(referred) if referred else None,
+        over_floor_steady=over_floor({"": (rows, floor)}, "steady"),
+        over_floor_transient=over_floor({"": (rows, floor)}, "transient"),
         identifiable=is_identifiable(first),
         anees=_anees(rows),
         coverage=_statistic(np.mean, rows, "coverage"),

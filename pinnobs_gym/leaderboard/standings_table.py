@@ -20,8 +20,13 @@ COLUMNS: tuple[tuple[Column, Callable[[Entry, Show], str]], ...] = (
     (Column("rank"), lambda e, _: _rank(e.ranks["steady"])),
     (Column("estimator", numeric=False), lambda e, _: e.name),
     (Column("steady"), lambda e, show: _steady(e.standing, show)),
+    (Column("/ Bayes", 2), lambda e, show: over_floor_text(e.standing.over_floor_steady, show)),
     (Column("transient rank", 4), lambda e, _: _rank(e.ranks["transient"])),
     (Column("transient", 2), lambda e, show: show(e.standing.transient)),
+    (
+        Column("transient / Bayes", 4),
+        lambda e, show: over_floor_text(e.standing.over_floor_transient, show),
+    ),
     (Column("diverged %", 1), lambda e, show: show(e.standing.diverged.percent)),
     (Column("settled s", 5), lambda e, _: number(e.standing.settling.value)),
     (Column("track", 3, numeric=False), lambda e, _: e.standing.track),
@@ -44,15 +49,21 @@ COLUMNS: tuple[tuple[Column, Callable[[Entry, Show], str]], ...] = (
 
 
 def grid(table: Table, intervals: bool = True) -> Grid:
-    """Return the table as text, with or without intervals, and a rule between the tracks."""
+    """Return the table as text, with or without intervals, and a rule between the tracks and before
+    the floor."""
     show: Show = interval_text if intervals else lambda interval: number(interval.value)
-    return Grid(
-        table.title,
-        tuple(column for column, _ in COLUMNS),
-        tuple(tuple(cell(entry, show) for _, cell in COLUMNS) for entry in table.entries),
-        track_blocks([entry.standing.track for entry in table.entries]),
-        table.note,
+    lines = tuple(tuple(cell(entry, show) for _, cell in COLUMNS) for entry in table.lines)
+    columns = tuple(
+        column if any(line[i] for line in lines) or not column.priority else _emptied(column)
+        for i, (column, _) in enumerate(COLUMNS)
     )
+    tracks = [*(entry.standing.track for entry in table.entries), *("floor" for _ in table.floor)]
+    return Grid(table.title, columns, lines, track_blocks(tracks), table.note)
+
+
+def _emptied(column: Column) -> Column:
+    """Return a column without any text in its cells, the first to be dropped."""
+    return replace(column, priority=max(other.priority for other, _ in COLUMNS) + 1)
 
 
 def layouts(table: Table) -> Layouts:
@@ -60,7 +71,7 @@ def layouts(table: Table) -> Layouts:
     for what estimators know; and where that does not fit either, and lines become records, with
     intervals again."""
     whole = grid(table)
-    known = [entry.standing.knows for entry in table.entries]
+    known = [entry.standing.knows for entry in table.lines]
     short = with_letters(grid(table, intervals=False), known, facts_of(known))
     note = " ".join(filter(None, [short.note, "95 % intervals are not shown at this width."]))
     return ((whole,), (replace(short, note=note),), (whole,))
@@ -118,12 +129,29 @@ NOTE = (
     "CPU time that each training was given. / CRR: root mean square over episodes of the steady "
     "NRMSE, over that of the Cramér-Rao reference of the same episodes; empty where there is none "
     "(the condition is not in the model, there is no noise, or the reference is below the error of "
-    "a single step of the model). For those that give covariances, means over episodes: ANEES, "
-    "which should be 1 (▲ above its 95 % band: errors are larger than P says, ▼ below); how many "
-    "errors the central 90 % interval covers; NIS, which should be 1; and the correlation of "
-    "successive innovations, 0 if white."
+    "a single step of the model). / Bayes: root mean square over episodes of the NRMSE, in the "
+    "steady window modulo states that no output tells apart, over that of the floor on the same "
+    "episodes, with its 95 % interval; diverged episodes count with their own errors, and fewer "
+    "than ten common ones give no ratio. The floor, in lines of its own at the end, is exact "
+    "Bayes, the mean of the posterior under the law that makes the episodes, whatever estimators "
+    "are told: filtered for online estimators, smoothed for offline ones; with process noise it is "
+    "a particle reference. It bounds mean squares over that law, not medians: below 1 beyond the "
+    "interval (▼) is chance, or the estimator knows more. For those that give covariances, means "
+    "over episodes: ANEES, which should be 1 (▲ above its 95 % band: errors are larger than P "
+    "says, ▼ below); how many errors the central 90 % interval covers; NIS, which should be 1; and "
+    "the correlation of successive innovations, 0 if white. The samples of an episode depend on "
+    "each other, so that over few episodes even the ANEES of the floor, whose covariances are "
+    "right, is off 1: compare with it."
 )
 """Explanation of the tables."""
+
+
+def over_floor_text(ratio: Interval | None, show: Show) -> str:
+    """Format a ratio to the floor, marked if it is below 1 beyond its interval; empty if there is
+    none."""
+    if ratio is None:
+        return ""
+    return show(ratio) + (" ▼" if ratio.high < 1 else "")
 
 
 def _optional(value: float | None, digits: int = 3) -> str:

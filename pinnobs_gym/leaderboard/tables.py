@@ -8,9 +8,16 @@ from dataclasses import dataclass
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender, among
+from pinnobs_gym.leaderboard.floor import (
+    FEWEST_EFFECTIVE,
+    NO_FLOORS,
+    TRACKS,
+    Floors,
+    is_particles,
+)
 from pinnobs_gym.leaderboard.numerals import number
 from pinnobs_gym.leaderboard.places import FEWEST, Places, places
-from pinnobs_gym.leaderboard.standings import Standing, is_identifiable
+from pinnobs_gym.leaderboard.standings import Standing, is_identifiable, standing
 from pinnobs_gym.scoring.rows import Row, game_of
 
 
@@ -32,6 +39,14 @@ class Table:
     entries: tuple[Entry, ...]
     note: str = ""
     """Remarks on the table, possibly empty."""
+    floor: tuple[Entry, ...] = ()
+    """The floor of errors, for online and for offline estimators, on the episodes that any of the
+    estimators played; it has no ranks."""
+
+    @property
+    def lines(self) -> tuple[Entry, ...]:
+        """All lines: estimators, and below them the floor."""
+        return self.entries + self.floor
 
     @property
     def title(self) -> str:
@@ -39,8 +54,11 @@ class Table:
         return ", ".join(self.game)
 
 
-def tables(contenders: Iterable[Contender], failures: Iterable[Row] = ()) -> list[Table]:
-    """Return a table per game, including games with failures only; failed jobs are in the notes."""
+def tables(
+    contenders: Iterable[Contender], failures: Iterable[Row] = (), floors: Floors = NO_FLOORS
+) -> list[Table]:
+    """Return a table per game, including games with failures or a floor only; failed jobs are in
+    the notes."""
     played: dict[GameName, list[Contender]] = defaultdict(list)
     for contender in contenders:
         for game in contender.games:
@@ -48,13 +66,18 @@ def tables(contenders: Iterable[Contender], failures: Iterable[Row] = ()) -> lis
     failed: dict[GameName, list[str]] = defaultdict(list)
     for row in failures:
         failed[game_of(row)].append(_failed(row))
-    games = sorted(played.keys() | failed.keys())
-    return [table(game, played[game], failed[game]) for game in games]
+    games = sorted(played.keys() | failed.keys() | floors.games)
+    return [table(game, played[game], failed[game], floors) for game in games]
 
 
-def table(game: GameName, contenders: Iterable[Contender], notes: Sequence[str] = ()) -> Table:
-    """Return the table of a game with notes. Within a track, estimators are sorted by their rank in
-    the steady window, those of one rank by their factor to the peer."""
+def table(
+    game: GameName,
+    contenders: Iterable[Contender],
+    notes: Sequence[str] = (),
+    floors: Floors = NO_FLOORS,
+) -> Table:
+    """Return the table of a game with notes and its floor. Within a track, estimators are sorted by
+    their rank in the steady window, those of one rank by their factor to the peer."""
     players = among(contenders, lambda run: run.game == game)
     found = places(players)
     entries = [
@@ -67,8 +90,49 @@ def table(game: GameName, contenders: Iterable[Contender], notes: Sequence[str] 
             e.standing.steady.value,
         )
     )
-    own = [_uneven(players), _unranked(players, found), *notes]
-    return Table(game, tuple(entries), " ".join(filter(None, own)))
+    rows = _floor_rows(game, players, floors)
+    own = [_uneven(players), _unranked(players, found), *notes, _floor_note(rows)]
+    return Table(game, tuple(entries), " ".join(filter(None, own)), _floor_entries(rows))
+
+
+def _floor_rows(game: GameName, players: Sequence[Contender], floors: Floors) -> list[Row]:
+    """Return the rows of a game's floors, of the episodes that any of the contenders played, or of
+    all if none did."""
+    played = {row["episode"] for player in players for run in player.runs for row in run.rows}
+    own = [floors.by_game[game, track] for track in TRACKS if (game, track) in floors.by_game]
+    return [row for floor in own for row in floor.among(played or floor.rows)]
+
+
+def _floor_entries(rows: Sequence[Row]) -> tuple[Entry, ...]:
+    """Return a line per floor."""
+    named: dict[tuple[str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        named[row["track"], row["estimator"]].append(row)
+    unranked: dict[str, int | None] = dict.fromkeys(WINDOWS)
+    return tuple(Entry(name, standing(own), unranked) for (_, name), own in named.items())
+
+
+def _floor_note(rows: Sequence[Row]) -> str:
+    """Return how precise the floors are."""
+    parts = []
+    exact = [row for row in rows if not is_particles(row)]
+    sizes = [row["effective_sample_size"] for row in exact if row.get("effective_sample_size")]
+    if exact:
+        least = min(sizes, default=0.0)
+        few = f", fewer than the {FEWEST_EFFECTIVE} that make it exact"
+        counted = (
+            f"at least {number(least)} effective draws{few if least < FEWEST_EFFECTIVE else ''}"
+        )
+        parts.append(f"Floor: exact Bayes, with {counted if sizes else 'unknown precision'}.")
+    particles = [row for row in rows if is_particles(row)]
+    errors = [row["monte_carlo"] for row in particles if row.get("monte_carlo") is not None]
+    if particles:
+        size = f"at most {number(100 * max(errors), 2)} %" if errors else "unknown"
+        parts.append(
+            "Floor: a particle reference in place of exact Bayes; the Monte-Carlo standard error "
+            f"of its RMS is {size} in an episode."
+        )
+    return " ".join(parts)
 
 
 def _failed(row: Row) -> str:

@@ -22,13 +22,10 @@ from pinnobs_gym.scoring.evaluation import Results, run_episodes
 from pinnobs_gym.scoring.exact_bayes import LEAST_ESS, Posterior, Posteriors, exact_bayes
 from pinnobs_gym.scoring.particle_reference import particle_reference
 from pinnobs_gym.scoring.playing import Played
+from pinnobs_gym.scoring.row_format import FLOOR, FLOOR_WHOLE
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.record import Record
 
-FILTERED = "floor"
-"""Track of the posterior given the outputs up to each sample."""
-SMOOTHED = "floor, whole record"
-"""Track of the posterior given all outputs."""
 LARGEST = 3
 """Largest number of states for which exact Bayes is computed."""
 
@@ -90,7 +87,7 @@ class ExactBayes(Floor):
     """The posterior mean given the outputs up to each sample (`exact_bayes`)."""
 
     name = "exact_bayes"
-    track = FILTERED
+    track = FLOOR
 
     def check(self) -> None:
         name, nx = type(self.system).__name__, self.system.nx
@@ -121,7 +118,7 @@ class ExactBayesSmoother(ExactBayes):
     """The posterior mean given all outputs of the record (`exact_bayes`)."""
 
     name = "exact_bayes_smoother"
-    track = SMOOTHED
+    track = FLOOR_WHOLE
 
     def posterior(self, record: Record) -> Posterior:
         return self._both(record).smoothed
@@ -137,7 +134,7 @@ class ParticleReference(Floor):
     (`particle_reference`)."""
 
     name = "particle_reference"
-    track = FILTERED
+    track = FLOOR
 
     def check(self) -> None:
         if not self.law.source.noise.stochastic:

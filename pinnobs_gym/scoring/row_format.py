@@ -38,6 +38,10 @@ Row: TypeAlias = dict[str, Any]
 - ``state_rmse``: RMSE of each state in its unit, by window (``transient``, ``steady``) and name.
 - the scores of `pinnobs_gym.scoring.metrics.OPTIONAL_SCORES` that apply, in the same format; the
   others are None here and absent from the file.
+- ``effective_sample_size``, ``monte_carlo``: of a floor, how precise it is: the smallest effective
+  sample size of the weighted draws at any sample of the episode, of exact Bayes; the Monte-Carlo
+  standard error of its RMS, relative to the RMS, of a particle reference. Absent otherwise. Floors
+  have the tracks ``floor`` (filtered) and ``floor, whole`` (smoothed).
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in; without what
   an online estimator prepares once.
 - ``batch``: the size of that batch.
@@ -69,8 +73,15 @@ KEY = (
 """The fields that identify a scored row; they are unique in a file."""
 JOB = ("env_id", "setup", "condition", "estimator", "episode", "episodes", "job")
 """The fields of a job in failures and recoveries."""
-OPTIONAL = (*OPTIONAL_SCORES, "free_over_known", "nominal_over_free")
+OPTIONAL = (
+    *OPTIONAL_SCORES,
+    *("free_over_known", "nominal_over_free", "effective_sample_size", "monte_carlo"),
+)
 """The numbers that may be absent."""
+FLOOR = "floor"
+"""Track of the floor of errors that is filtered, for online estimators."""
+FLOOR_WHOLE = "floor, whole"
+"""Track of the floor of errors that is smoothed, for offline estimators."""
 NAMES = ("env_id", "setup", "condition", "estimator", "track")
 """The fields that are names."""
 NEEDED = {

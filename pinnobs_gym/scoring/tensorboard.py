@@ -14,6 +14,8 @@ from pinnobs_gym.training.log import Log
 
 LOGGED = ("nrmse", "nrmse_transient", "nrmse_steady", "rmse", "settling", "peak")
 """The scores that are logged."""
+SQUARED = ("nrmse_transient", "nrmse_steady_modulo")
+"""The scores whose root mean square over episodes is logged: that which a floor bounds."""
 
 
 def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
@@ -30,17 +32,35 @@ def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
 
 
 def log_summary(log: Log, rows: list[Row]) -> None:
-    """Log an estimator's settings and median scores for the HPARAMS table. Diverged episodes count
-    as infinite; medians that are not finite are left out."""
+    """Log an estimator's settings and scores for the HPARAMS table: medians, in which diverged
+    episodes count as infinite, and root mean squares, in which they count with their own errors.
+    What is not finite is left out. Of a floor (`pinnobs_gym.scoring.row_format.FLOOR`), log also
+    how precise it is."""
     first = rows[0]
     parameters = {n: first[n] for n in ("env_id", "setup", "condition", "estimator", "track")}
     parameters |= first["options"]
     diverged = np.array([row["diverged"] for row in rows])
     scores = {name: np.where(diverged, np.inf, [row[name] for row in rows]) for name in LOGGED}
     medians = {f"median/{name}": float(np.median(values)) for name, values in scores.items()}
-    summary = {name: value for name, value in medians.items() if np.isfinite(value)}
+    with np.errstate(over="ignore"):
+        squares = {name: np.mean(np.square([row[name] for row in rows])) for name in SQUARED}
+    means = {f"rms/{name}": float(np.sqrt(square)) for name, square in squares.items()}
+    summary = {
+        n: value for n, value in (medians | means | _precision(rows)).items() if np.isfinite(value)
+    }
     summary["diverged"] = float(diverged.mean())
     log.hparams(parameters, summary)
+
+
+def _precision(rows: list[Row]) -> dict[str, float]:
+    """Return the smallest effective sample size and the largest Monte-Carlo error of a floor's
+    episodes, where they are known."""
+    found = {}
+    for name, worst in (("effective_sample_size", min), ("monte_carlo", max)):
+        known = [row[name] for row in rows if row.get(name) is not None]
+        if known:
+            found[name] = float(worst(known))
+    return found
 
 
 def log_folder(folder: Path, row: Row) -> Path:

@@ -1,4 +1,5 @@
-"""The ranking: what a fair prior changes, whether equal estimators tie, and who is told apart."""
+"""The ranking: what a fair prior changes, whether equal estimators tie, who is told apart, and how
+far all are from the floor."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.floor import FEWEST_EFFECTIVE
 from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.scoring import rows as stored_rows
 from pinnobs_gym.scoring.evaluation import evaluate, make_estimator
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.rows import Row, Stored
@@ -39,6 +42,10 @@ ASKED = {
 random numbers of the systems were independent, told the moments of the initial set."""
 
 
+ROWS = Path("runs/leaderboard/rows.jsonl")
+"""Rows whose errors over the floor are measured, if there are any."""
+
+
 def figures(repeats: int) -> Iterator[Figure]:
     """Measure all figures of the ranking."""
     yield from with_fair_prior()
@@ -51,6 +58,7 @@ def figures(repeats: int) -> Iterator[Figure]:
     for name, largest in one_score.differences().items():
         what = f"{name}: scores alone and in batches of 7, 60 and 256, largest relative difference"
         yield at_most(what, largest, "", 1e-12)
+    yield from over_floor(stored_rows.load(ROWS).rows)
 
 
 def with_fair_prior() -> Iterator[Figure]:
@@ -114,3 +122,35 @@ def groups() -> Iterator[Figure]:
             shown = f"{factor.value:.3g} ({factor.low:.3g}-{factor.high:.3g})"
             what = f"{window} rank of {name}, {shown} of {nominal.peer}'s error"
             yield Figure(what, float(place.rank or np.nan), "", "", None)
+
+
+def over_floor(rows: Sequence[Row], shipped: Sequence[Row] = ()) -> Iterator[Figure]:
+    """Compare every estimator with the floor of each game, in both windows, and tell how precise
+    the floors are.
+
+    Args:
+        rows: scored episodes of estimators and, possibly, of floors.
+        shipped: further rows of floors.
+    """
+    found = board(Stored(list(rows), []), shipped)
+    for table in found.main.tables:
+        game = ", ".join((table.game.system, table.game.setup, table.game.condition))
+        for entry in table.entries:
+            own = entry.standing
+            ratios = {"steady": own.over_floor_steady, "transient": own.over_floor_transient}
+            for window, ratio in ratios.items():
+                if ratio is not None:
+                    shown = f"({ratio.low:.3g}-{ratio.high:.3g})"
+                    what = f"{game}: {entry.name} over the floor, {window} {shown}"
+                    yield Figure(what, ratio.value, "", "", None)
+    for (name, track), floor in sorted(found.floors.by_game.items()):
+        game = ", ".join((name.system, name.setup, name.condition, track))
+        known = list(floor.rows.values())
+        sizes = [size for row in known if (size := row.get("effective_sample_size")) is not None]
+        if sizes:
+            what = f"{game}: smallest effective sample size of {len(sizes)} episodes"
+            yield at_least(what, min(sizes), "", FEWEST_EFFECTIVE)
+        errors = [error for row in known if (error := row.get("monte_carlo")) is not None]
+        if errors:
+            what = f"{game}: largest Monte-Carlo error of {len(errors)} episodes"
+            yield Figure(what, 100 * max(errors), "%", "", None)

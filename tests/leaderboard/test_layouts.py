@@ -113,9 +113,9 @@ rank  estimator       steady  transient  diverged %  track    knows
    2  ekf             0.0412      0.412     0 (0–6)  online   model
 ----  --------------  ------  ---------  ----------  -------  ------------------
    1  rts_smoother    0.0118      0.118     0 (0–6)  offline  model
-not shown at this width: transient rank, settled s, episodes, / CRR, ANEES,
-covers %, 90th pct., first, whole, last 75 %, last 25 %, NIS, corr., µs/step,
-training (leaderboard.md has all)"""
+not shown at this width: / Bayes, transient rank, transient / Bayes, settled s,
+episodes, / CRR, ANEES, covers %, 90th pct., first, whole, last 75 %, last 25 %,
+NIS, corr., µs/step, training (leaderboard.md has all)"""
 GAME_120 = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
 rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  knows
@@ -124,25 +124,25 @@ rank  estimator       steady  transient rank  transient  diverged %  settled s  
    2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60  model
 ----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  ------------------
    1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60  model
-not shown at this width: / CRR, ANEES, covers %, 90th pct., first, whole, last 75 %, last 25 %, NIS, corr., µs/step,
-training (leaderboard.md has all)"""  # noqa: E501
+not shown at this width: / Bayes, transient / Bayes, / CRR, ANEES, covers %, 90th pct., first, whole, last 75 %,
+last 25 %, NIS, corr., µs/step, training (leaderboard.md has all)"""  # noqa: E501
 GAME_200 = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
-rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  / CRR  ANEES  covers %  90th pct.   first   whole   NIS  corr.  µs/step  knows
-----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ----  -----  -------  ------------------
-   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0–6)     0.0206  online         60                             0.0206  0.0206  0.0206                     1  model, true states
-   2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412  1.04               1  model
-----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ----  -----  -------  ------------------
-   1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60                             0.0118  0.0118  0.0118                     1  model
-not shown at this width: last 75 %, last 25 %, training (leaderboard.md has all)"""  # noqa: E501
+rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  / CRR  ANEES  covers %  90th pct.   first   whole  last 75 %   NIS  µs/step  knows
+----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ----  -------  ------------------
+   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0–6)     0.0206  online         60                             0.0206  0.0206  0.0206     0.0206              1  model, true states
+   2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412     0.0412  1.04        1  model
+----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ----  -------  ------------------
+   1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60                             0.0118  0.0118  0.0118     0.0118              1  model
+not shown at this width: / Bayes, transient / Bayes, last 25 %, corr., training (leaderboard.md has all)"""  # noqa: E501
 GAME = """\
 pinnobs/ReverseDuffing-v0, benchmark, nominal
-rank  estimator       steady  transient rank  transient  diverged %  settled s  track    episodes  / CRR  ANEES  covers %  90th pct.   first   whole  last 75 %  last 25 %   NIS  corr.  µs/step  knows               training
-----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ---------  ----  -----  -------  ------------------  ----------------------------------------
-   1  kkl_pinn, 45 s  0.0206               1      0.206     0 (0–6)     0.0206  online         60                             0.0206  0.0206  0.0206     0.0206     0.0206                     1  model, true states  budget 45 s, 700 iterations, 45.02 CPU s
-   2  ekf             0.0412               2      0.412     0 (0–6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412     0.0412     0.0412  1.04               1  model
-----  --------------  ------  --------------  ---------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ---------  ----  -----  -------  ------------------  ----------------------------------------
-   1  rts_smoother    0.0118               1      0.118     0 (0–6)     0.0118  offline        60                             0.0118  0.0118  0.0118     0.0118     0.0118                     1  model"""  # noqa: E501
+rank  estimator       steady  / Bayes  transient rank  transient  transient / Bayes  diverged %  settled s  track    episodes  / CRR  ANEES  covers %  90th pct.   first   whole  last 75 %  last 25 %   NIS  corr.  µs/step  knows               training
+----  --------------  ------  -------  --------------  ---------  -----------------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ---------  ----  -----  -------  ------------------  ----------------------------------------
+   1  kkl_pinn, 45 s  0.0206                        1      0.206                        0 (0–6)     0.0206  online         60                             0.0206  0.0206  0.0206     0.0206     0.0206                     1  model, true states  budget 45 s, 700 iterations, 45.02 CPU s
+   2  ekf             0.0412                        2      0.412                        0 (0–6)     0.0412  online         60   1.25  1.5 ▲        88     0.0412  0.0412  0.0412     0.0412     0.0412  1.04               1  model
+----  --------------  ------  -------  --------------  ---------  -----------------  ----------  ---------  -------  --------  -----  -----  --------  ---------  ------  ------  ---------  ---------  ----  -----  -------  ------------------  ----------------------------------------
+   1  rts_smoother    0.0118                        1      0.118                        0 (0–6)     0.0118  offline        60                             0.0118  0.0118  0.0118     0.0118     0.0118                     1  model"""  # noqa: E501
 
 
 @pytest.fixture(scope="module")
@@ -173,12 +173,12 @@ def test_the_table_of_a_game(part, width, expected):
 
 
 RECORD = """\
-rank:           1
-estimator:      an estimator of some length
-steady:         0.0421 (0.042–0.043)
-transient rank: 1
-transient:      0.0421 (0.042–0.043)
-diverged %:     0 (0–16)
+rank:              1
+estimator:         an estimator of some length
+steady:            0.0421 (0.042–0.043)
+transient rank:    1
+transient:         0.0421 (0.042–0.043)
+diverged %:        0 (0–16)
 """
 
 
@@ -189,7 +189,7 @@ def test_intervals_are_left_out_before_the_table_becomes_records():
     assert "  0.0421     0.0421 " in shown(layouts, 75)
     assert "\nknows: a model. 95 % intervals are not shown at this width.\n" in shown(layouts, 75)
     assert RECORD in shown(layouts, 40)
-    assert shown(layouts, 40).endswith("\nknows:          model")
+    assert shown(layouts, 40).endswith("\nknows:             model")
 
 
 RANKS_80 = """\

@@ -290,7 +290,7 @@ def test_rows_of_the_floor_are_stored_once(tmp_path):
     found = run_floor(game, range(3), path)
     assert [(row["estimator"], row["track"]) for row in found] == [
         *[("exact_bayes", "floor")] * 3,
-        *[("exact_bayes_smoother", "floor, whole record")] * 3,
+        *[("exact_bayes_smoother", "floor, whole")] * 3,
     ]
     assert all(row["effective_sample_size"] >= LEAST_ESS for row in found)
     assert not too_few(found)

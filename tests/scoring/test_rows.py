@@ -54,6 +54,17 @@ def test_optional_scores_are_absent_infinite_or_a_number(tmp_path):
     assert back["coverage"] is None
 
 
+def test_the_precision_of_a_floor_is_absent_from_other_rows(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    floor = {"estimator": "exact_bayes", "track": row_format.FLOOR, "effective_sample_size": 812.5}
+    rows.append(path, [row(0, **floor), row(1)])
+    exact, other = rows.read(path)
+    assert (exact["effective_sample_size"], exact["monte_carlo"]) == (812.5, None)
+    assert other["effective_sample_size"] is None
+    assert path.read_text().count("effective_sample_size") == 1
+    assert "monte_carlo" not in path.read_text()
+
+
 def test_no_file_is_no_rows(tmp_path):
     assert rows.read(tmp_path / "none.jsonl") == []
 
@@ -404,6 +415,8 @@ WRONG = {
     "training": ("[]",),
     "versions": ("1",),
     "nominal_over_free": ("-1",),
+    "effective_sample_size": ("-1", "true"),
+    "monte_carlo": ("-0.1", '"a"'),
     "free_over_known": ("-1", '"a"'),
     "state_rmse": ("1", "[]", "null"),
 }

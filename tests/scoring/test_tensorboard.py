@@ -5,6 +5,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
+from made_rows import rows_of
 from PIL import Image
 from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -19,7 +20,8 @@ from tensorboard.plugins.hparams.metadata import (
 
 from pinnobs_gym.cli import main
 from pinnobs_gym.scoring import rows
-from pinnobs_gym.scoring.tensorboard import log_folder
+from pinnobs_gym.scoring.row_format import FLOOR
+from pinnobs_gym.scoring.tensorboard import log_folder, log_summaries
 
 DRAWN = {"ReverseDuffing": (800, 420), "HarmonicOscillator": (800, 580)}
 """Width and height of the pictures, a panel per state."""
@@ -120,7 +122,24 @@ def test_the_table_has_every_estimators_settings_and_medians(played):
                 assert shown.scalars(run, f"median/{name}") == {0: pytest.approx(median, rel=1e-6)}
             else:
                 assert f"median/{name}" not in shown.runs[run].Tags()["scalars"]
-    assert {"median/nrmse", "diverged"} <= metrics
+        for name in ("nrmse_transient", "nrmse_steady_modulo"):
+            square = np.mean([r[name] ** 2 for r in group])
+            if np.isfinite(square):
+                assert shown.scalars(run, f"rms/{name}") == {0: pytest.approx(np.sqrt(square))}
+    assert {"median/nrmse", "rms/nrmse_transient", "diverged"} <= metrics
+
+
+def test_a_floor_has_the_worst_precision_of_its_episodes(tmp_path):
+    first = {"effective_sample_size": 4.0}
+    floor = rows_of("exact_bayes", [3.0, 4.0], track=FLOOR, **first)
+    floor[1]["effective_sample_size"] = 7.0
+    log_summaries(tmp_path, floor)
+    shown = Shown(tmp_path / "tensorboard")
+    (run,) = shown.runs
+    assert shown.settings(run)["track"] == "floor"
+    assert shown.scalars(run, "effective_sample_size") == {0: 4.0}
+    assert shown.scalars(run, "rms/nrmse_steady_modulo") == {0: pytest.approx(12.5**0.5)}
+    assert "monte_carlo" not in shown.runs[run].Tags()["scalars"]
 
 
 def test_other_settings_of_one_estimator_are_other_lines(tmp_path):

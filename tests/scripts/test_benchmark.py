@@ -5,7 +5,8 @@ import importlib
 import benchmark
 import pytest
 import three_recipes
-from benchmarks import kernels, pinn
+from benchmarks import kernels, pinn, ranking
+from made_rows import rows_of
 
 
 @pytest.mark.parametrize("name", benchmark.GROUPS)
@@ -44,3 +45,16 @@ def test_the_table_of_pinn_obs_has_a_line_for_each_recipe(monkeypatch):
     assert table[-3].startswith("| ReverseDuffing | paper | 0.045 | 0.045 | 0.253 | 0.253 |")
     assert table[-2] == f"| ReverseDuffing | fast, paper's loss | {cells}"
     assert table[-1] == f"| ReverseDuffing | fast, guided by a smoother | {cells}"
+
+
+def test_errors_over_the_floor_and_its_precision_are_figures():
+    rows = rows_of("ukf", [0.2] * 12)
+    exact = rows_of("exact_bayes", [0.1] * 12, track="floor", effective_sample_size=700.0)
+    exact[3]["effective_sample_size"] = 400.0
+    found = {figure.figure: figure for figure in ranking.over_floor(rows, exact)}
+    steady = found["X-v0, benchmark, nominal: ukf over the floor, steady (2-2)"]
+    assert steady.value == pytest.approx(2)
+    size = found["X-v0, benchmark, nominal, floor: smallest effective sample size of 12 episodes"]
+    assert (size.value, size.holds) == (400, False)
+    assert len(found) == 3
+    assert list(ranking.over_floor(rows)) == []

@@ -15,9 +15,11 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.floor import floors, is_floor
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.states_table import by_state
 from pinnobs_gym.leaderboard.tables import tables
+from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.evaluation import (
     Evaluated,
     Results,
@@ -71,9 +73,13 @@ class Evaluate:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         check_writable(self.out)
         evaluated = self._score(game, estimator, episodes)
-        for table in tables(contenders(runs_of(evaluated.rows))):
+        known = [row for row in rows.read(self._rows) if rows.game_of(row) == game.name]
+        found = floors([*evaluated.rows, *filter(is_floor, known)])
+        for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
             hint = f"pinnobs tables {self._rows} -o FILE writes all"
             print_table(standings_table.layouts(table), hint)
+        for note in found.notes:
+            console.print(note, style="yellow", soft_wrap=True)
         print_table([[by_state(game.source.system, evaluated.rows)]])
         # To draw takes as long as all else of one episode.
         drawn = evaluated.first_played if self.episodes > 1 else None

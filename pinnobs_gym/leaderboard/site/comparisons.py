@@ -19,6 +19,8 @@ from pinnobs_gym.leaderboard.site.charts import (
 
 STEP = 21
 """Height of a line, in pixels, in charts with one line per estimator."""
+TALL_STEP = 27
+"""The same of lines with two symbols, one below the other."""
 PLAIN_NAMES = alt.Axis(
     domain=False, ticks=False, grid=False, labelLimit=150, labelPadding=8, minExtent=0
 )
@@ -90,6 +92,34 @@ def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spe
         .encode(x=alt.X("rms:Q", scale=scale, axis=axis, title=title)),
         height=STEP * len(order),
     )
+
+
+def over_floor(styled: Styled, order: Sequence[str], low: float, high: float) -> Spec:
+    """Chart errors over the floor with their intervals, a line per estimator, on an axis from low
+    to high: a filled symbol in the steady window, and below it a hollow one in the transient."""
+    scale, axis = log_scale(low, high), log_axis(low, high)
+    x = alt.X("shown:Q", scale=scale, axis=axis, title="root mean square error / the floor's")
+    base = (
+        named("over_floor")
+        .transform_calculate(shown=finite("ratio"), lower=finite("low"), upper=finite("high"))
+        .encode(
+            y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
+            color=styled.colour,
+            tooltip=["estimator:N", "window:N", *map(exact, ("ratio", "low", "high"))],
+        )
+    )
+    layers = [level(scale, vertical=True)]
+    for window, offset, filled in (("steady", -4, True), ("transient", 5, False)):
+        own = base.transform_filter(f"datum.window === '{window}'")
+        layers += [
+            own.mark_rule(strokeWidth=2 if filled else 1, yOffset=offset).encode(
+                x=alt.X("lower:Q", scale=scale, axis=axis), x2="upper:Q"
+            ),
+            own.mark_point(filled=filled, size=55, opacity=1, yOffset=offset).encode(
+                x=x, shape=styled.shape
+            ),
+        ]
+    return finished(*layers, height=TALL_STEP * len(order))
 
 
 def cost(

@@ -19,6 +19,17 @@ from pinnobs_gym.leaderboard.site.palette import Style
 COSTS = {"us": "CPU time per step and episode (µs)", "seconds": "CPU time of training (s)"}
 """Axis titles of the costs, by column."""
 
+TABLES = (
+    "settling",
+    "ratios",
+    "errors",
+    "reference",
+    "over_floor",
+    "floor_errors",
+    "floor_settling",
+)
+"""The tables of a game that its charts need, by the names of their fields."""
+
 
 @dataclass(frozen=True)
 class Charts:
@@ -74,11 +85,12 @@ def _across(styled: Styled, costs: Columns) -> Charts:
 
 def _game(styled: Styled, game: GameResults) -> Charts:
     """Return the charts of one game."""
-    tables = {name: getattr(game, name) for name in ("settling", "ratios", "errors", "reference")}
-    end = max([*game.errors["t"], *game.settling["t"], 1e-9])
+    tables = {name: getattr(game, name) for name in TABLES}
+    end = max([*game.errors["t"], *game.settling["t"], *game.floor_settling["t"], 1e-9])
     specs = {}
     if game.errors["t"]:
-        seen = [*game.errors["median"], *game.reference["median"]]
+        lines = (game.errors, game.reference, game.floor_errors)
+        seen = [value for table in lines for value in table["median"]]
         specs[f"errors{game.number}"] = over_time.errors(styled, end, *nice_range(seen, 1e-6, 3.0))
     specs[f"settling{game.number}"] = over_time.settling(styled, end)
     order = game.ratios["estimator"]
@@ -86,6 +98,14 @@ def _game(styled: Styled, game: GameResults) -> Charts:
         low, high = nice_range([*game.ratios["q10"], *game.ratios["q90"]], 0.01, 100.0)
         spec = comparisons.ratios(styled, order, min(low, 0.8), max(high, 2.0))
         specs[f"ratios{game.number}"] = spec
+    if game.over_floor["estimator"]:
+        order = list(dict.fromkeys(game.over_floor["estimator"]))
+        seen = [
+            1.0,
+            *(value for part in ("ratio", "low", "high") for value in game.over_floor[part]),
+        ]
+        low, high = nice_range(seen, 0.1, 100.0)
+        specs[f"over_floor{game.number}"] = comparisons.over_floor(styled, order, low, high)
     if game.states is not None:
         tables |= {"truth": game.states.truth, "estimates": game.states.estimates}
         for i, name in enumerate(game.states.names):

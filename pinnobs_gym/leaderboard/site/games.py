@@ -7,11 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.envs.game import GameName
+import numpy as np
+
+from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.leaderboard.contenders import Contender
-from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of
+from pinnobs_gym.leaderboard.floor import NO_FLOORS, Floors, label
+from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.site.columns import Columns
-from pinnobs_gym.leaderboard.site.over_episodes import ratios, settling
+from pinnobs_gym.leaderboard.site.over_episodes import over_floor, ratios, settling
 from pinnobs_gym.leaderboard.site.over_samples import States, errors, reference, states
 from pinnobs_gym.leaderboard.standings_table import Table
 from pinnobs_gym.scoring import curves
@@ -37,13 +40,23 @@ class GameResults:
     errors: Columns
     """``estimator``, ``t``, and ``median``, ``q10``, ``q90`` over episodes of a sample's NRMSE."""
     reference: Columns
-    """``t`` and the ``median`` over episodes of the error expected at the Cramér-Rao reference."""
+    """``t`` and the ``median`` over episodes of the error expected at the Cramér-Rao reference, in
+    the steady window."""
+    over_floor: Columns
+    """Each estimator's errors over the floor; see `over_episodes.over_floor`."""
+    floor_errors: Columns
+    """Those of the floor, as `errors`."""
+    floor_settling: Columns
+    """That of the floor, as `settling`."""
     states: States | None
     """The example episode; None without curves."""
 
 
 def games_of(
-    contenders: Iterable[Contender], tables: Iterable[Table], folders: Sequence[Path]
+    contenders: Iterable[Contender],
+    tables: Iterable[Table],
+    folders: Sequence[Path],
+    floors: Floors = NO_FLOORS,
 ) -> list[GameResults]:
     """Return the results of the games in a system's ranked condition, and of nominal games after
     them.
@@ -52,6 +65,7 @@ def games_of(
         contenders: in the order of the charts.
         tables: of all games.
         folders: folders with their curves.
+        floors: the floors of all games.
 
     Raises:
         ValueError: in one line, if a file of curves is damaged.
@@ -67,24 +81,51 @@ def games_of(
         played, key=lambda game: (game.env_id, game.setup, not ranked[game], game.condition)
     )
     return [
-        _results(number, known[game], played[game], folders) for number, game in enumerate(order)
+        _results(number, known[game], played[game], _floors(floors, game, played[game]), folders)
+        for number, game in enumerate(order)
     ]
 
 
-def _results(number: int, table: Table, players: Players, folders: Sequence[Path]) -> GameResults:
+def _floors(floors: Floors, game: GameName, players: Players) -> Players:
+    """Return the floors of a game by their names, on the episodes that were played."""
+    episodes = {row["episode"] for runs in players.values() for row in rows_of(runs)}
+    found: dict[str, list[ScoredRun]] = defaultdict(list)
+    for floor in floors.among([game]).by_game.values():
+        for run in runs_of(floor.among(episodes)):
+            found[label(run.rows[0])].append(run)
+    return found
+
+
+def _results(
+    number: int, table: Table, players: Players, floors: Players, folders: Sequence[Path]
+) -> GameResults:
     game = table.game
     own = _curves(game, players, folders)
     rows = {name: rows_of(runs) for name, runs in players.items()}
+    floor_rows = {name: rows_of(runs) for name, runs in floors.items()}
+    settled = settling(rows)
     return GameResults(
         number=number,
         game=game,
         table=table,
-        settling=settling(rows),
+        settling=settled,
         ratios=ratios(rows),
         errors=errors(own),
-        reference=reference(own.values()),
+        reference=reference(own.values(), _transient_end(game)),
+        over_floor=over_floor({e.name: e.standing for e in table.entries if e.name in players}),
+        floor_errors=errors(_curves(game, floors, folders)),
+        floor_settling=settling(floor_rows, until=max(settled["t"])),
         states=states(own),
     )
+
+
+def _transient_end(game: GameName) -> float:
+    """Return the end of a game's transient window in s from the first sample; infinite if this
+    process does not know the game."""
+    try:
+        return Game.of(game.env_id, game.setup, game.condition).source.setup.transient_end
+    except ValueError:
+        return np.inf
 
 
 def _curves(game: GameName, players: Players, folders: Sequence[Path]) -> dict[str, Curves]:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.leaderboard.contenders import Contender
+from pinnobs_gym.leaderboard.board import Board
+from pinnobs_gym.leaderboard.contenders import Contender, contenders
+from pinnobs_gym.leaderboard.floor import contending
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.standings import training_of
 from pinnobs_gym.scoring.rows import Row, Stored, game_of, seed_of
@@ -43,32 +45,37 @@ class Method:
     """Provenance of all scores."""
 
     estimators: tuple[EstimatorMethod, ...]
+    floors: tuple[EstimatorMethod, ...]
+    """Those of the floors of errors."""
     failures: tuple[FailedJob, ...]
     versions: Mapping[str, str]
     """Versions of each package."""
     notes: tuple[str, ...]
     """What was left out, a sentence each."""
     commands: tuple[str, ...]
-    """Command lines that reproduce the rows."""
+    """Command lines that reproduce the rows of the estimators."""
     dates: str
     """The day, or the first and last day."""
     episodes: int
-    """Number of rows."""
+    """Number of rows of the estimators."""
 
 
-def method_of(stored: Stored, contenders: Iterable[Contender], notes: tuple[str, ...]) -> Method:
-    """Return the provenance of stored scores, given their contenders and what was left out."""
+def method_of(stored: Stored, drawn: Iterable[Contender], board: Board) -> Method:
+    """Return the provenance of stored scores, given their contenders and tables."""
+    scored = contending(stored.rows)
+    floors = [row for floor in board.floors.by_game.values() for row in floor.rows.values()]
     return Method(
-        estimators=tuple(map(estimator_method, contenders)),
+        estimators=tuple(map(estimator_method, drawn)),
+        floors=tuple(map(estimator_method, contenders(runs_of(floors)))),
         failures=tuple(
             FailedJob(row["estimator"], game_of(row), row["episodes"], row["error"])
             for row in stored.failures
         ),
-        versions=versions(stored.rows),
-        notes=notes,
-        commands=tuple(commands(runs_of(stored.rows))),
-        dates=dates(stored.rows),
-        episodes=len(stored.rows),
+        versions=versions([*scored, *floors]),
+        notes=board.notes,
+        commands=tuple(commands(runs_of(scored))),
+        dates=dates(scored or stored.rows),
+        episodes=len(scored),
     )
 
 

@@ -13,7 +13,7 @@ from pinnobs_gym.leaderboard.site.across import Factors, costs, factors, trainin
 from pinnobs_gym.leaderboard.site.columns import Columns
 from pinnobs_gym.leaderboard.site.games import GameResults, games_of
 from pinnobs_gym.leaderboard.site.method import Method, method_of
-from pinnobs_gym.scoring.rows import Stored
+from pinnobs_gym.scoring.rows import Row, Stored
 from pinnobs_gym.systems import SYSTEMS
 
 SHOWN = 3
@@ -50,17 +50,18 @@ class Page:
     method: Method
 
 
-def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
+def page_model(stored: Stored, folders: Sequence[Path], shipped: Sequence[Row] = ()) -> Page:
     """Compute the page model of stored scores.
 
     Args:
         stored: scored episodes, at least one, and failed jobs.
         folders: folders with the curves of these rows.
+        shipped: further rows of floors (`pinnobs_gym.leaderboard.floor.floors`).
 
     Raises:
         ValueError: in one line, if a file of curves is damaged.
     """
-    results = board(stored)
+    results = board(stored, shipped)
     main, on_record = results.main, results.on_record
     listed = _listed(main.contenders, main.lines)
     others = [] if on_record is None else _listed(on_record.contenders, on_record.lines)
@@ -74,9 +75,9 @@ def page_model(stored: Stored, folders: Sequence[Path]) -> Page:
         main=main,
         on_record=on_record,
         costs=costs(main.lines, seconds),
-        sections=tuple(_sections(games_of(drawn, tables.values(), folders))),
+        sections=tuple(_sections(games_of(drawn, tables.values(), folders, results.floors))),
         factors=tuple(factors(main.compared, main.conditions)),
-        method=method_of(stored, drawn, results.notes),
+        method=method_of(stored, drawn, results),
     )
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pinnobs_gym.leaderboard.site.columns import QUANTILES, Columns, extend, number, quantiles
-from pinnobs_gym.leaderboard.standings import over_reference
+from pinnobs_gym.leaderboard.standings import Standing, over_reference
 from pinnobs_gym.scoring.rows import Row
 
 STEPS = 100
@@ -26,11 +26,12 @@ class _Ratios(NamedTuple):
     quantiles: np.ndarray
 
 
-def settling(players: Players) -> Columns:
+def settling(players: Players, until: float = 0.0) -> Columns:
     """Return, for every estimator, the ``share`` of its episodes that have settled by the time
-    ``t`` in s; diverged episodes never settle. Values hold until the next time."""
+    ``t`` in s; diverged episodes never settle. Values hold until the next time, the last ones until
+    the last time of all or ``until``, in s, if that is later."""
     times = {name: _settled(rows) for name, rows in players.items()}
-    last = max([0.0, *(float(t[-1]) for t in times.values() if len(t))])
+    last = max([until, *(float(t[-1]) for t in times.values() if len(t))])
     table: Columns = {"estimator": [], "t": [], "share": []}
     for name, settled in times.items():
         t, shares = _steps(settled, len(players[name]))
@@ -78,4 +79,28 @@ def ratios(players: Players) -> Columns:
     table["rms"] = [number(each.rms) for each in spreads]
     for i, q in enumerate(QUANTILES):
         table[f"q{100 * q:.0f}"] = [number(each.quantiles[i]) for each in spreads]
+    return table
+
+
+def over_floor(standings: Mapping[str, Standing]) -> Columns:
+    """Return the ``ratio`` of each estimator's error to the floor in each ``window``, with its
+    interval ``low`` to ``high``; the smallest in the steady window first."""
+    found = {
+        name: {"steady": own.over_floor_steady, "transient": own.over_floor_transient}
+        for name, own in standings.items()
+    }
+    first = {name: next(filter(None, own.values()), None) for name, own in found.items()}
+    order = sorted((ratio.value, name) for name, ratio in first.items() if ratio is not None)
+    table: Columns = {"estimator": [], "window": [], "ratio": [], "low": [], "high": []}
+    for _, name in order:
+        for window, ratio in found[name].items():
+            if ratio is not None:
+                extend(
+                    table,
+                    estimator=[name],
+                    window=[window],
+                    ratio=[number(ratio.value)],
+                    low=[number(ratio.low)],
+                    high=[number(ratio.high)],
+                )
     return table

@@ -52,8 +52,9 @@ def errors(found: Mapping[str, Curves]) -> Columns:
     return table
 
 
-def reference(found: Iterable[Curves]) -> Columns:
-    """Return the median over all episodes of the error at the Cramér-Rao reference."""
+def reference(found: Iterable[Curves], after: float) -> Columns:
+    """Return the median over all episodes of the error at the Cramér-Rao reference, at the samples
+    later than ``after``, in s from the first: in the transient window it bounds nothing."""
     episodes: dict[int, np.ndarray] = {}
     t = np.empty(0)
     for own in found:
@@ -66,7 +67,7 @@ def reference(found: Iterable[Curves]) -> Columns:
         return {"t": [], "median": []}
     k = kept(len(t), POINTS)
     lines = np.stack(list(episodes.values()))[:, k].astype(float)
-    some = ~np.isnan(lines).all(axis=0)
+    some = ~np.isnan(lines).all(axis=0) & (t[k] - t[0] > after * (1 + 1e-9))
     return {"t": numbers(t[k][some]), "median": numbers(medians(lines[:, some]))}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import altair as alt
 
 from pinnobs_gym.leaderboard.site.charts import (
@@ -21,9 +23,19 @@ HEIGHT = 300
 """Height of a chart over time, in pixels."""
 
 
+def _floor(base: alt.Chart, **line: Any) -> list[alt.Chart]:
+    """Return the lines of the floors: grey, and dashed where the whole record is known."""
+    whole = "indexof(datum.estimator, 'whole record') >= 0"
+    return [
+        base.transform_filter(f"!({whole})").mark_line(style="floor", **line),
+        base.transform_filter(whole).mark_line(style="floor", strokeDash=[7, 4], **line),
+    ]
+
+
 def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
     """Chart the error over time up to ``end`` (s), on an axis from low to high: medians and bands
-    of the selected estimators, over the medians of all others, and the Cramér-Rao reference."""
+    of the selected estimators, over the medians of all others, the floor and the Cramér-Rao
+    reference."""
     scale, axis = log_scale(low, high), log_axis(low, high)
     y = alt.Y("shown_median:Q", scale=scale, title="NRMSE of a sample", axis=axis)
     base = (
@@ -41,16 +53,23 @@ def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
         .transform_calculate(shown_median="datum.median > 0 ? datum.median : null")
         .encode(x=time_of(end), y=y)
     )
+    floor = (
+        named("floor_errors")
+        .transform_calculate(shown_median="datum.median > 0 ? datum.median : null")
+        .encode(x=time_of(end), y=y, detail="estimator:N")
+    )
     tips = ["estimator:N", exact("t", "t (s)"), exact("median"), exact("q10", "10 %")]
     return finished(
         base.transform_filter(f"!({SHOWN})")
         .mark_line(style="others", clip=True)
         .encode(detail="estimator:N"),
+        *_floor(floor, clip=True),
         chosen.mark_area(opacity=0.11, clip=True).encode(
             y=alt.Y("low:Q", scale=scale), y2="high:Q", color=styled.colour
         ),
         chosen.mark_line(clip=True).encode(color=styled.colour, strokeDash=styled.dash),
         reference.mark_line(style="reference", clip=True),
+        floor.mark_point(opacity=0, size=90, filled=True, clip=True).encode(tooltip=tips[:3]),
         chosen.mark_point(opacity=0, size=90, filled=True, clip=True).encode(
             color=styled.colour, tooltip=[*tips, exact("q90", "90 %")]
         ),
@@ -60,16 +79,19 @@ def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
 
 
 def settling(styled: Styled, end: float) -> Spec:
-    """Chart the share of settled episodes against time up to ``end`` (s)."""
+    """Chart the share of settled episodes against time up to ``end`` (s), also of the floor."""
     axis = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
     y = alt.Y("share:Q", scale=alt.Scale(domain=[0, 1]), title="episodes settled", axis=axis)
     base = named("settling").encode(x=time_of(end), y=y)
     chosen = base.transform_filter(SHOWN).encode(color=styled.colour)
+    floor = named("floor_settling").encode(x=time_of(end), y=y, detail="estimator:N")
     tips = ["estimator:N", exact("t", "t (s)"), alt.Tooltip("share:Q", format=".0%")]
     return finished(
         base.transform_filter(f"!({SHOWN})")
         .mark_line(style="others", interpolate="step-after")
         .encode(detail="estimator:N"),
+        *_floor(floor, interpolate="step-after"),
+        floor.mark_point(opacity=0, size=90, filled=True).encode(tooltip=tips),
         chosen.mark_line(interpolate="step-after").encode(strokeDash=styled.dash),
         chosen.mark_point(opacity=0, size=90, filled=True).encode(tooltip=tips),
         height=HEIGHT,

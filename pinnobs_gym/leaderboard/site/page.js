@@ -40,6 +40,7 @@
       style: {
         others: { color: others, strokeWidth: 1 },
         reference: { color: text, strokeWidth: 1.6, strokeDash: [1, 3], strokeCap: "round" },
+        floor: { color: soft, strokeWidth: 2.6, opacity: 0.75 },
         truth: { color: text, strokeWidth: 1.6 },
         measured: { color: soft, filled: true, size: 7, opacity: 0.7 },
         level: { color: soft, strokeDash: [3, 3], strokeWidth: 1 },

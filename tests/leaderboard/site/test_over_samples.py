@@ -33,9 +33,10 @@ def test_the_median_of_an_even_number_is_between_the_two():
 def test_the_reference_is_of_each_episode_once():
     first = curves(np.ones((2, 3)), reference=[[1, 2, 3], [3, 4, 5]])
     second = curves(np.ones((2, 3)), reference=[[3, 4, 5], [8, 8, 8]], seeds=[1, 2])
-    table = over_samples.reference([first, second, curves(np.ones((1, 3)))])
-    assert table == {"t": [0, 1, 2], "median": [3, 4, 5]}
-    assert over_samples.reference([curves(np.ones((1, 3)))]) == {"t": [], "median": []}
+    found = [first, second, curves(np.ones((1, 3)))]
+    assert over_samples.reference(found, -1.0) == {"t": [0, 1, 2], "median": [3, 4, 5]}
+    assert over_samples.reference(found, 1.0) == {"t": [2], "median": [5]}  # the steady window
+    assert over_samples.reference(found[2:], 0.0) == {"t": [], "median": []}
 
 
 def test_lines_of_an_angle_have_a_gap_where_it_jumps():

@@ -14,7 +14,7 @@ from waiting import PATIENCE
 from pinnobs_gym import evaluate
 from pinnobs_gym.cli import main
 from pinnobs_gym.leaderboard.site.charts import Styled
-from pinnobs_gym.leaderboard.site.comparisons import cost, factors, ratios
+from pinnobs_gym.leaderboard.site.comparisons import cost, factors, over_floor, ratios
 from pinnobs_gym.leaderboard.site.model import page_model
 from pinnobs_gym.leaderboard.site.over_time import errors, settling, state
 from pinnobs_gym.leaderboard.site.page import draw
@@ -136,6 +136,31 @@ def test_every_table_says_what_each_estimator_knows():
         assert table.count("model") == 2
 
 
+def test_a_floor_is_shown_but_is_no_contender():
+    facts = {"track": "floor", "effective_sample_size": 900.0, "game_hash": "game", **COMMON}
+    floor = rows_of("exact_bayes", [0.05] * 60, **facts)
+    text, alone = drawn(*floor), drawn()
+    for chip in ("exact_bayes", "exact Bayes"):
+        assert f'data-estimator="{chip}"' not in text
+    assert [each.partition("<")[0] for each in text.split("<b>")[1:4]] == [
+        each.partition("<")[0]
+        for each in alone.split("<b>")[1:4]  # systems, estimators, episodes
+    ]
+    assert "at least 900 effective draws" in text
+    assert "<b>Error over exact Bayes.</b>" in text
+    assert '"over_floor1"' in text
+    assert "--estimators ekf ukf --episodes" in text  # no command names it
+    methods = tables_of(text)[-1]
+    assert "exact_bayes" in methods
+    assert "Error over exact Bayes" not in alone
+
+
+def test_a_page_of_a_floor_alone_is_no_error():
+    facts = {"track": "floor", "game_hash": "game", **COMMON}
+    text = draw(page_model(Stored(rows_of("exact_bayes", [0.05] * 60, **facts), []), []))
+    assert "exact_bayes" in text
+
+
 def test_a_condition_names_the_systems_that_are_left_out_of_it():
     facts = {"condition": "delay1", "ranked": False, **COMMON}
     made = rows_of("ukf", [0.1] * 60, **facts)
@@ -205,6 +230,7 @@ def test_charts_are_valid():
         state(styled, 0, "x1", 20.0, (0.0, 1.0), True),
         factors(styled, ["ekf"], 0.5, 20.0),
         ratios(styled, ["ekf"], 0.5, 20.0),
+        over_floor(styled, ["ekf"], 0.5, 20.0),
         cost(styled, "us", "µs", (0.1, 10.0), (0.5, 20.0)),
     ):
         alt.LayerChart.from_dict(spec)  # validates
