@@ -2,10 +2,15 @@
 
 A file in this folder is known by its name; any other is given by its path. Each key is a field of
 `Suite`, and every key is optional. An estimator is a name, ``module:Class``, or a table of
-``name``, ``label`` (its name in tables) and ``settings``::
+``name``, ``label`` (its name in tables) and ``settings``, or ``tuned = true`` for the settings that
+are stored with each system (`pinnobs_gym.scoring.tuned`)::
 
-    systems = ["ReverseDuffing", "my_module:VanDerPol"]
-    estimators = ["ekf", { name = "ekf", label = "robust ekf", settings = { huber = 1.345 } }]
+    systems = ["ReverseDuffing", "Academic"]
+    estimators = [
+        "ekf",
+        { name = "ekf", tuned = true },
+        { name = "ekf", label = "gated ekf", settings = { gate = 0.9999 } },
+    ]
     conditions = ["nominal", "noise5+dropout10"]
     episodes = 20
 """
@@ -34,6 +39,8 @@ class Entry:
     """Its name in tables; its own, with its recipe if its trainer has several, if None."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Its settings or, if it is trained, its trainer's."""
+    tuned: bool = False
+    """Whether it has its tuned settings; it plays no system that has none of it."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,8 @@ class Suite:
     systems: tuple[str, ...] = ()
     """Names or ``module:Class``; all known systems if empty."""
     estimators: tuple[Entry, ...] = ()
-    """All estimators that can be ranked if empty, in all their `BaseEstimator.variants`."""
+    """If empty, all estimators that can be ranked, in all their `BaseEstimator.variants`, and also
+    tuned where settings are stored with the system."""
     conditions: tuple[str, ...] = ()
     """If empty, nominal and the system's ranked condition. With "all", estimators that need no
     training also play every other condition that applies to the system."""
@@ -152,6 +160,10 @@ def _entry(value: Any) -> Entry:
         )
     if not isinstance(entry.settings, Mapping):
         raise ValueError(f"estimators: settings={entry.settings!r}; expected a table")
+    if not isinstance(entry.tuned, bool):
+        raise ValueError(f"estimators: tuned={entry.tuned!r}; expected true or false")
+    if entry.tuned and entry.settings:
+        raise ValueError(f"estimators: {dict(value)!r} is tuned and has settings; expected one")
     return entry
 
 
