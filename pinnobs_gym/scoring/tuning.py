@@ -130,8 +130,8 @@ class Search:
 
     def best(self) -> Tried | None:
         """Return the best trial so far; None if no settings worked."""
-        trials = [trial for trial in self._study().trials if trial.value is not None]
-        tried = [Tried(_rounded(trial.params), trial.value) for trial in trials]
+        trials = self._study().trials
+        tried = [Tried(_rounded(t.params), t.value) for t in trials if t.value is not None]
         return min(tried, key=lambda one: one.error, default=None)
 
     def _study(self) -> optuna.Study:

@@ -32,7 +32,8 @@ def default_estimators() -> tuple[Entry, ...]:
     for name, cls in ESTIMATORS.classes().items():
         if cls.needs_training is None or cls.track == "online":
             entries += [Entry(name, settings=settings) for settings in cls.variants]
-            entries += [Entry(name, tuned=True)] if cls.tunable else []
+            trained = cls.needs_training or cls.trains_on_record
+            entries += [Entry(name, tuned=True)] if cls.tunable and not trained else []
     return tuple(entries)
 
 

@@ -3,12 +3,13 @@
 A file in this folder is known by its name; any other is given by its path. Each key is a field of
 `Suite`, and every key is optional. An estimator is a name, ``module:Class``, or a table of
 ``name``, ``label`` (its name in tables) and ``settings``, or ``tuned = true`` for the settings that
-are stored with each system (`pinnobs_gym.scoring.tuned`)::
+are stored with each system (`pinnobs_gym.scoring.tuned`). The name in tables stands for the latter,
+too, as in ``"ekf, tuned"``::
 
     systems = ["ReverseDuffing", "Academic"]
     estimators = [
         "ekf",
-        { name = "ekf", tuned = true },
+        { name = "ekf", tuned = true, label = "best ekf" },
         { name = "ekf", label = "gated ekf", settings = { gate = 0.9999 } },
     ]
     conditions = ["nominal", "noise5+dropout10"]
@@ -24,6 +25,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pinnobs_gym.scoring.tuned import SUFFIX
 from pinnobs_gym.training.settings import SEEDS
 
 FOLDER = Path(__file__).parent
@@ -142,8 +144,10 @@ def _checked(key: str, value: Any) -> Any:
 
 
 def _entry(value: Any) -> Entry:
+    if isinstance(value, Entry):
+        return value
     if not isinstance(value, Mapping):
-        return value if isinstance(value, Entry) else Entry(value)
+        return Entry(value.removesuffix(SUFFIX), tuned=value.endswith(SUFFIX))
     known = [f.name for f in fields(Entry)]
     for key in value:
         if key not in known:
