@@ -25,6 +25,7 @@ from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import consistency, metrics, row_format
 from pinnobs_gym.scoring.playing import play
+from pinnobs_gym.scoring.tuned_file import path_of, read
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
 from pinnobs_gym.simulation.system import System
@@ -146,7 +147,36 @@ def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
     if cls.tunable:
         ranges = [(f"`{n}`", f"{r.low:g} to {r.high:g}") for n, r in cls.tunable.items()]
         parts += [f"\n`pinnobs tune {name}` searches\n", markdown_table(("name", "range"), ranges)]
+        parts += _tuned(name)
     return "\n".join(parts) + "\n"
+
+
+def _tuned(name: str) -> list[str]:
+    """The tuned settings of an estimator that are stored with the systems of the package."""
+    entries = [
+        entry
+        for system in SYSTEMS.sources
+        for entry in read(path_of(SYSTEMS.resolve(system)))
+        if entry.estimator == name
+    ]
+    if not entries:
+        return []
+    header = ("system", "setup", "settings", "default NRMSE", "tuned NRMSE")
+    lines = [
+        (
+            entry.env_id.removeprefix("pinnobs/"),
+            entry.setup,
+            ", ".join(f"`{setting}={value}`" for setting, value in entry.settings.items()),
+            f"{entry.default_error:.4g}",
+            f"{entry.error:.4g}",
+        )
+        for entry in entries
+    ]
+    said = (
+        "\nTuned settings (`pinnobs evaluate --tuned`), with the geometric mean NRMSE over both "
+        "ranked windows and the episodes of the search, which are never scored\n"
+    )
+    return [said, markdown_table(header, lines)]
 
 
 _TRACKS = {"online": "x̂(k|k) from y₀..y_k", "offline": "sees the whole record first"}

@@ -6,6 +6,7 @@ from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.takes import lacking
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.scoring.tuned import SUFFIX
 
 NOT_APPLICABLE = "not applicable"
 """The cell of an estimator that does not take a game's system."""
@@ -26,7 +27,8 @@ def cell_without_scores(estimator: str, game: GameName) -> str:
         estimator: its name in rows.
         game: the game.
     """
-    name = estimator.partition(" (")[0]  # without the recipe of its training
+    # Without the recipe of its training, and whether it is tuned.
+    name = estimator.partition(" (")[0].removesuffix(SUFFIX)
     try:
         cls = ESTIMATORS.resolve(name)
         played = Game.of(game.env_id, game.setup, game.condition)

@@ -13,9 +13,11 @@ from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender
 from pinnobs_gym.leaderboard.influence import Results
 from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
+from pinnobs_gym.scoring.tuned import SUFFIX
 
-PEER = "ukf"
-"""The estimator with which all others are compared, if it played."""
+PEERS = ("ukf" + SUFFIX, "ukf")
+"""The estimators with which all others are compared: of those that played, the first of those with
+the most episodes."""
 FEWEST = 50
 """Fewest episodes of a game that are ranked under a condition other than nominal and that which
 the system is ranked under."""
@@ -104,11 +106,14 @@ def places(contenders: Iterable[Contender]) -> Places:
 
 
 def peer_of(contenders: Sequence[Contender]) -> Contender | None:
-    """Return the contender that all are compared with: `PEER` or, if it did not play, the online
-    one with the most rows; None if there is none."""
+    """Return the contender that all are compared with: one of `PEERS` or, if none of them played,
+    the online one with the most rows; None if there is none."""
     online = [contender for contender in contenders if contender.track == "online"]
-    named = [contender for contender in online if contender.name == PEER]
-    return next(iter([*named, *online]), None)
+    named = [each for name in PEERS for each in online if each.name == name]
+    # The tuned one only if it played all that the other did, or else games would be left out.
+    return max(
+        named or online, key=lambda each: sum(len(run.rows) for run in each.runs), default=None
+    )
 
 
 def _comparable(contender: Contender) -> list[GameName]:

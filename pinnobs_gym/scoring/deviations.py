@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.provenance import canonical
+from pinnobs_gym.scoring.tuned import changed_options, is_tuned
 from pinnobs_gym.training.settings import ALWAYS_MAY_CHANGE
 
 _ASIDE = ("seed", *ALWAYS_MAY_CHANGE)
@@ -21,9 +22,13 @@ _ASIDE = ("seed", *ALWAYS_MAY_CHANGE)
 def deviations(estimator: BaseEstimator, game: Game) -> dict[str, Any]:
     """Return what differs between an estimator and the one that its name stands for in a game: its
     settings or those of its training that are not the defaults, a noise level or a model other than
-    those of the game, and a condition that it was trained under."""
-    trained = type(estimator).needs_training or type(estimator).trains_on_record
-    found = _of_training(estimator) if trained else _of_options(estimator)
+    those of the game, and a condition that it was trained under. If its settings are those tuned
+    for the game, its name says so (`pinnobs_gym.scoring.tuned`), and they are none of these."""
+    cls, options = type(estimator), estimator.options
+    if cls.needs_training or cls.trains_on_record:
+        found = _of_training(estimator)
+    else:
+        found = {} if is_tuned(cls, options, game) else changed_options(cls, options)
     if "noise" in estimator.knows:
         system, setup = game.source.system, game.source.setup
         known = system.noise(estimator.noise_std, estimator.process_noise)
@@ -48,19 +53,6 @@ def _level(root: np.ndarray) -> np.ndarray | float:
     if root.shape != (len(std), len(std)) or not np.array_equal(root, np.diag(std)):
         return root
     return std if len(std) > 1 else float(std[0])
-
-
-def _of_options(estimator: BaseEstimator) -> dict[str, Any]:
-    """Return the options that are not the defaults of the class."""
-    found = {}
-    for field in estimator.setting_fields():
-        default = field.default
-        if default is MISSING and field.default_factory is not MISSING:
-            default = field.default_factory()
-        value = canonical(getattr(estimator, field.name))
-        if default is MISSING or canonical(default) != value:
-            found[field.name] = value
-    return found
 
 
 def _of_training(estimator: BaseEstimator) -> dict[str, Any]:

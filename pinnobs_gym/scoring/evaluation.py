@@ -30,6 +30,7 @@ from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.row_format import NEEDED, SCHEMA, Row, check_names
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
+from pinnobs_gym.scoring.tuned import SUFFIX, TUNED, is_tuned, required_settings
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import SILENT, Log
@@ -91,6 +92,7 @@ def evaluate(
     setup: str = "benchmark",
     condition: str = "nominal",
     options: Mapping[str, Any] | None = None,
+    tuned: bool = False,
     results: Path | str | None = None,
     fresh: bool = False,
     log: Log = SILENT,
@@ -112,6 +114,8 @@ def evaluate(
         condition: change of the episodes relative to the setup, such as ``load_step`` or
             ``noise5+dropout10``.
         options: settings of an estimator that is instantiated here.
+        tuned: whether it has the settings that are stored with the system, see
+            `pinnobs_gym.scoring.tuned`, in place of ``options``.
         results: a rows file to append to, in whole batches. Episodes already in it, of the same
             settings and the same code of estimator, system, simulation and scores, are not run
             again: their rows are taken from it, which is logged as a warning. Curves for figures
@@ -124,11 +128,11 @@ def evaluate(
         The rows, in the order of seeds; a list of dicts with a method ``to_pandas``.
 
     Raises:
-        ValueError: in one line, for an unknown id, setup, condition or option, or an estimator
-            whose model does not match the env.
+        ValueError: in one line, for an unknown id, setup, condition or option, an estimator whose
+            model does not match the env, or tuned settings that are not stored.
     """
     game = Game.of(env_id, setup, condition)
-    made = make_estimator(estimator, game, options or {})
+    made = make_estimator(estimator, game, options or {}, tuned)
     stored = None if results is None else Results(Path(results), fresh=fresh)
     evaluated = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
     if evaluated.reused:
@@ -224,14 +228,21 @@ def _scored(played: Played) -> list[Row]:
 
 
 def make_estimator(
-    estimator: BaseEstimator | type[BaseEstimator] | str, game: Game, options: Mapping[str, Any]
+    estimator: BaseEstimator | type[BaseEstimator] | str,
+    game: Game,
+    options: Mapping[str, Any],
+    tuned: bool = False,
 ) -> BaseEstimator:
-    """Return the estimator that a name, a class or an instance denotes in a game.
+    """Return the estimator that a name, a class or an instance denotes in a game, with its tuned
+    settings if ``tuned``.
 
     Raises:
         ValueError: in one line, if it is unknown, has to be trained first, does not accept the
-            options, or has another model than the game's.
+            options, has no tuned settings, or has another model than the game's.
     """
+    if tuned and (options or isinstance(estimator, BaseEstimator)):
+        given = f"options {dict(options)}" if options else "an instance"
+        raise ValueError(f"tuned settings and {given}; expected one of them")
     system, setup = game.source.system, game.source.setup
     if isinstance(estimator, BaseEstimator):
         if options:
@@ -239,6 +250,8 @@ def make_estimator(
         _check_model(estimator.system, system)
         return estimator
     cls = ESTIMATORS.resolve(estimator)
+    if tuned:
+        options = required_settings(cls, game)
     if cls.needs_training is not None:
         name = ESTIMATORS.name_of(cls)
         trainer = TRAINERS.spec_of(trainer_class(cls))
@@ -271,6 +284,8 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
     informed = condition != "nominal" and estimator.training.get("condition") == condition
     knows = [*estimator.knows, *estimator.training.get("knows", ())]
     knows += ["condition"] if informed else []
+    tuned = is_tuned(type(estimator), estimator.options, game)
+    knows += [TUNED] if tuned else []
     return {
         "schema": SCHEMA,
         "kind": "score",
@@ -279,7 +294,7 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "ranked": game.name.condition == canonical_name(system.ranked_condition),
         "nx": system.nx,
         **_identifiability(game),
-        "estimator": estimator.label,
+        "estimator": estimator.label + (SUFFIX if tuned else ""),
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
         "knows": list(dict.fromkeys(knows)),
         "options": canonical(estimator.options),

@@ -23,8 +23,14 @@ if TYPE_CHECKING:
 
 TUNING_SEED = 2 * 10**6
 """Seed of the first tuning episode; none of these episodes is scored."""
+WINDOWS = ("steady", "transient")
+"""The windows whose errors are searched for the least; those that a leaderboard ranks by."""
 WORST = 10.0
-"""NRMSE of a diverged episode, and the largest NRMSE of the others."""
+"""NRMSE of a diverged episode in each window, and the largest NRMSE of the others."""
+LEAST = 1e-12
+"""The smallest NRMSE that counts, of an estimate that is exact."""
+DIGITS = 4
+"""Number of significant digits of settings that are tried, so that they are short to write."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,7 @@ class Tried:
 
     settings: Mapping[str, float]
     error: float
-    """Geometric mean of the NRMSE over the episodes; see `WORST`."""
+    """See `Search.error`."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +60,15 @@ class Search:
     """Seed of the search."""
 
     def __post_init__(self) -> None:
-        name = ESTIMATORS.name_of(self.estimator)
-        if self.estimator.needs_training or self.estimator.trains_on_record:
-            raise ValueError(f"estimator {name!r} is trained; its settings are not searched")
-        if not self.estimator.tunable:
-            raise ValueError(f"estimator {name!r} declares no settings to search")
+        check_searchable(self.estimator)
         if self.episodes < 1:
             raise ValueError(f"episodes={self.episodes}; expected at least 1")
         if self.seed not in range(SEEDS):
             raise ValueError(f"seed={self.seed}; expected a whole number from 0 to {SEEDS - 1}")
 
     def error(self, settings: Mapping[str, Any]) -> float:
-        """Return the geometric mean of the NRMSE over the episodes with these settings.
+        """Return the geometric mean of the NRMSE with these settings, over the episodes and the
+        windows (`WINDOWS`), which thus count alike; see also `WORST`.
 
         Raises:
             ValueError: in one line, if the estimator does not accept the settings.
@@ -75,7 +78,8 @@ class Search:
         seeds = range(TUNING_SEED, TUNING_SEED + self.episodes)
         played = play(self.game, estimator, seeds)
         scores = played.scores_alone
-        nrmse = np.where(scores.diverged, WORST, np.minimum(scores.nrmse, WORST))
+        nrmse = np.array([getattr(scores, f"nrmse_{window}") for window in WINDOWS])
+        nrmse = np.where(scores.diverged, WORST, np.clip(nrmse, LEAST, WORST))
         return float(np.exp(np.mean(np.log(nrmse))))
 
     def run(self, trials: int, progress: Callable[[Tried | None], None]) -> None:
@@ -90,14 +94,16 @@ class Search:
 
         while self.done() < trials:
             trial = study.ask()
-            settings = {
-                name: (
-                    trial.suggest_int(name, int(bounds.low), int(bounds.high), log=bounds.log)
-                    if bounds.whole
-                    else trial.suggest_float(name, bounds.low, bounds.high, log=bounds.log)
-                )
-                for name, bounds in self.estimator.tunable.items()
-            }
+            settings = _rounded(
+                {
+                    name: (
+                        trial.suggest_int(name, int(bounds.low), int(bounds.high), log=bounds.log)
+                        if bounds.whole
+                        else trial.suggest_float(name, bounds.low, bounds.high, log=bounds.log)
+                    )
+                    for name, bounds in self.estimator.tunable.items()
+                }
+            )
             try:
                 error = self.error(settings)
             except ValueError:
@@ -124,7 +130,8 @@ class Search:
 
     def best(self) -> Tried | None:
         """Return the best trial so far; None if no settings worked."""
-        tried = [Tried(t.params, t.value) for t in self._study().trials if t.value is not None]
+        trials = self._study().trials
+        tried = [Tried(_rounded(t.params), t.value) for t in trials if t.value is not None]
         return min(tried, key=lambda one: one.error, default=None)
 
     def _study(self) -> optuna.Study:
@@ -160,4 +167,26 @@ class Search:
         code = estimator_code(self.estimator)
         hashes = (game_hash(self.game.source), unique() if code == UNREADABLE else code)
         what = (*self.game.name, ESTIMATORS.name_of(self.estimator), *hashes)
-        return "-".join([*what, f"{self.episodes} episodes", str(dict(self.estimator.tunable))])
+        what += (f"{self.episodes} episodes", *WINDOWS, str(dict(self.estimator.tunable)))
+        return "-".join(what)
+
+
+def check_searchable(cls: type[BaseEstimator]) -> None:
+    """Check that an estimator has settings to search.
+
+    Raises:
+        ValueError: in one line, if it is trained or declares none.
+    """
+    name = ESTIMATORS.name_of(cls)
+    if cls.needs_training or cls.trains_on_record:
+        raise ValueError(f"estimator {name!r} is trained; its settings are not searched")
+    if not cls.tunable:
+        raise ValueError(f"estimator {name!r} declares no settings to search")
+
+
+def _rounded(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of `DIGITS` significant digits."""
+    return {
+        name: float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+        for name, value in settings.items()
+    }

@@ -38,6 +38,8 @@ def test_a_file_is_read_and_options_change_it(write):
     )
     assert suite.systems == ("Academic",)
     assert suite.estimators == (Entry("ekf"), Entry("ekf", "robust", {"huber": 1.3}))
+    tuned = write('estimators = ["ekf, tuned", {name = "ekf", tuned = true}]').estimators
+    assert tuned == (Entry("ekf", tuned=True),) * 2
     assert (suite.episodes, suite.budgets, suite.training_seeds) == (7, (1, 2.5), (0, 1))
     assert (suite.setup, suite.seed) == ("benchmark", 0)
     other = suite.changed(episodes=3, setup=None, systems=(), estimators=("ukf",))
@@ -59,6 +61,13 @@ def test_a_file_is_read_and_options_change_it(write):
         ('estimators = [{use = "ekf"}]', "estimators: unknown key 'use' in {'use': 'ekf'}; expe"),
         ('estimators = [{label = "a"}]', "estimators: {'label': 'a'} has no name"),
         ('estimators = [{name = "ekf", label = "a/b"}]', "estimators: label='a/b'; expected lett"),
+        ('estimators = [{name = "ekf", tuned = 1}]', "estimators: tuned=1; expected true or false"),
+        (
+            'estimators = [{name = "ekf", tuned = true, settings = {huber = 1}}]',
+            "is tuned and has settings; expected one",
+        ),
+        ('estimators = ["pinn_gain, tuned"]', "estimators: estimator 'pinn_gain' is trained"),
+        ('estimators = ["ekf, tuned", "ekf, tuned"]', "estimators: 'ekf, tuned' stands for two"),
         ("episodes", "is no TOML: "),
         ('systems = ["Duffing"]', "systems: unknown system 'Duffing'; known are Academic"),
         ('estimators = ["kf"]', "estimators: unknown estimator 'kf'; known are batch_least"),
@@ -116,7 +125,8 @@ def test_an_option_is_not_told_as_the_files(write, tmp_path):
 def test_every_suite_of_ours_has_jobs(name, tmp_path):
     jobs = jobs_of(suites.load(name), tmp_path)
     assert jobs
-    assert len({job.digest for job in jobs}) == len(jobs)
+    told = {(job.game.name, job.called, str(job.training), job.seed) for job in jobs}
+    assert len(told) == len(jobs)
     assert {job.game.system.partition(":")[2] for job in jobs} == set(SYSTEMS.classes())
 
 

@@ -44,6 +44,8 @@ class Evaluate:
     """Trained estimator to load."""
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as assumed_noise=0.1."""
+    tuned: bool = False
+    """Use the settings that pinnobs tune --store has stored with the system."""
     setup: str = "benchmark"
     """Setup to play."""
     condition: str = "nominal"
@@ -63,11 +65,14 @@ class Evaluate:
         """Evaluate and print."""
         game = Game.of(self.system, self.setup, self.condition)
         cls = ESTIMATORS.resolve(self.estimator)
+        if self.tuned and (self.set or self.checkpoint is not None):
+            other = "--checkpoint" if self.checkpoint is not None else "--set"
+            raise ValueError(f"--tuned and {other}; expected one of them")
         options = settings_of(cls, self.set)
         if self.video is not None:
             check_video(self.video)
         trained = None if self.checkpoint is None else load(cls, self.checkpoint, game)
-        estimator = make_estimator(trained or cls, game, options)
+        estimator = make_estimator(trained or cls, game, options, self.tuned)
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")

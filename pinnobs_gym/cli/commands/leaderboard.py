@@ -32,7 +32,7 @@ class Leaderboard:
     systems: tuple[str, ...] = ()
     """Names or module:Class of systems."""
     estimators: tuple[str, ...] = ()
-    """Names or module:Class of estimators."""
+    """Names or module:Class of estimators; "ekf, tuned" is the EKF with its stored settings."""
     setup: str | None = None
     """Setup to play."""
     condition: tuple[str, ...] = ()

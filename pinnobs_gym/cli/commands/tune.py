@@ -1,8 +1,10 @@
-"""`tune NAME ...`: search an estimator's settings on a system."""
+"""`tune NAME ...`: search the settings of estimators on systems."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,18 +16,24 @@ from pinnobs_gym.cli.options import parse
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable, file_name
-from pinnobs_gym.scoring.tuning import Search, Tried
+from pinnobs_gym.scoring.provenance import now, versions
+from pinnobs_gym.scoring.tuned import changed_options
+from pinnobs_gym.scoring.tuned_file import TunedEntry, path_of, store
+from pinnobs_gym.scoring.tuning import WINDOWS, Search, Tried
+from pinnobs_gym.simulation import notices
+from pinnobs_gym.systems import SYSTEMS
 
 
 @dataclass(frozen=True)
 class Tune:
-    """Search an estimator's settings on episodes that the leaderboard never uses. Trials are
-    stored, and an interrupted search continues."""
+    """Search the settings of estimators on episodes that are never scored. What is searched for is
+    the least geometric mean of the steady and the transient NRMSE. Trials are stored, and an
+    interrupted search continues."""
 
-    name: Annotated[str, tyro.conf.Positional]
-    """Name or module:Class of the estimator."""
-    system: str
-    """Name or module:Class of the system."""
+    names: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Names or module:Class of the estimators."""
+    system: tuple[str, ...] = ()
+    """Names or module:Class of systems; all of the package if not given."""
     setup: str = "benchmark"
     """Setup to play."""
     condition: str = "nominal"
@@ -38,27 +46,85 @@ class Tune:
     """Seed of the search."""
     fresh: bool = False
     """Search anew, without the trials of earlier runs."""
+    store: bool = False
+    """Store the best settings with the system, for pinnobs evaluate --tuned and the leaderboard.
+    Without it, they are only printed."""
     out: Path = Path("runs/tune")
     """Folder of the trials."""
 
     def run(self) -> int:
-        """Search, and print the best settings."""
+        """Search, print the best settings, and store them if asked to."""
         if self.trials < 1:
             raise ValueError(f"trials={self.trials}; expected at least 1")
-        cls = ESTIMATORS.resolve(self.name)
-        game = Game.of(self.system, self.setup, self.condition)
+        if not self.names:
+            raise ValueError("no estimator is given; expected NAME ..., see pinnobs tune --help")
+        searches = self._searches()
+        for i, search in enumerate(searches):
+            if i:
+                console.print()
+            if not self._run(search):
+                return 130
+        return 0
+
+    def _searches(self) -> list[Search]:
+        """Return the searches, one for each estimator and system, after all have been checked.
+
+        Raises:
+            ValueError: in one line, before anything is run.
+        """
+        classes = [ESTIMATORS.resolve(name) for name in dict.fromkeys(self.names)]
+        games = [
+            Game.of(name, self.setup, self.condition)
+            for name in dict.fromkeys(self.system or SYSTEMS.sources)
+        ]
         check_writable(self.out)
-        path = self.out / f"{game.name.file_stem}-{file_name(ESTIMATORS.name_of(cls))}.journal"
-        search = Search(cls, game, self.episodes, path, self.seed)
+        if self.store:
+            if games[0].name.condition != "nominal":
+                raise ValueError(
+                    f"condition {self.condition!r} with --store; settings are stored for the "
+                    "condition 'nominal' only"
+                )
+            for game in games:
+                check_writable(path_of(type(game.source.system)).parent)
+        searches = []
+        for game in games:
+            for cls in classes:
+                path = f"{game.name.file_stem}-{file_name(ESTIMATORS.name_of(cls))}.journal"
+                searches.append(Search(cls, game, self.episodes, self.out / path, self.seed))
+                cls.for_setup(game.source.system, game.source.setup)  # it may not take the system
+        return searches
+
+    def _run(self, search: Search) -> bool:
+        """Run one search, print its result, and store it if asked to; return whether the search was
+        finished."""
         if self.fresh:
             search.forget()
         done = search.done()
+        name, game = ESTIMATORS.name_of(search.estimator), search.game.name
+        title = f"{name} on {game.system}, setup {game.setup}, condition {game.condition}"
+        console.print(title, soft_wrap=True, highlight=False)
         if done:
-            console.print(f"{done} trials taken from {path}", soft_wrap=True, highlight=False)
+            console.print(
+                f"{done} trials taken from {search.storage}", soft_wrap=True, highlight=False
+            )
         default = Tried({}, search.error({}))
-        console.print(f"default: geometric mean NRMSE {default.error:.4g}", highlight=False)
-        stopped = False
-        with progress() as bar:
+        _print_error("default:", default)
+        finished = self._search(search, done)
+        best = search.best()
+        if best is None or best.error >= default.error:
+            nothing = "; nothing is stored" if self.store else ""
+            console.print(f"nothing better than the default was found{nothing}")
+        else:
+            _print_error("best:", best)
+            console.print(arguments(best.settings), soft_wrap=True, highlight=False)
+            if self.store and finished:
+                self._store(search, default, best)
+        console.print(f"trials: {search.storage}", soft_wrap=True)
+        return finished
+
+    def _search(self, search: Search, done: int) -> bool:
+        """Run the trials that are missing; return False if Ctrl-C stopped them."""
+        with progress() as bar, _without_notices():
             task = bar.add_task("trials", total=self.trials, completed=min(done, self.trials))
 
             def report(tried: Tried | None) -> None:
@@ -69,23 +135,50 @@ class Tune:
             try:
                 search.run(self.trials, report)
             except KeyboardInterrupt:
-                stopped = True
-        self._report(default, search.best())
-        console.print(f"trials: {path}", soft_wrap=True)
-        return 130 if stopped else 0
+                return False
+        return True
 
-    def _report(self, default: Tried, best: Tried | None) -> None:
-        if best is None or best.error >= default.error:
-            console.print("nothing better than the default was found")
+    def _store(self, search: Search, default: Tried, best: Tried) -> None:
+        """Store the settings with the system, if they are not the defaults."""
+        if not changed_options(search.estimator, best.settings):
+            console.print("these are the default settings; nothing is stored")
             return
-        console.print(f"best:    geometric mean NRMSE {best.error:.4g}", highlight=False)
-        console.print(arguments(best.settings), soft_wrap=True, highlight=False)
+        entry = TunedEntry(
+            env_id=search.game.name.env_id,
+            setup=search.game.name.setup,
+            estimator=ESTIMATORS.spec_of(search.estimator),
+            settings=best.settings,
+            error=best.error,
+            default_error=default.error,
+            trials=search.done(),
+            episodes=search.episodes,
+            condition=search.game.name.condition,
+            versions=versions(),
+            date=now(),
+        )
+        path = store(type(search.game.source.system), entry)
+        console.print(f"stored: {path}", soft_wrap=True, highlight=False)
+
+
+def _print_error(what: str, tried: Tried) -> None:
+    windows = " and ".join(WINDOWS)
+    console.print(f"{what:8} geometric mean NRMSE {tried.error:.4g} ({windows})", highlight=False)
+
+
+@contextmanager
+def _without_notices() -> Iterator[None]:
+    """Yield a context without lines about what estimators do with settings that are only tried."""
+    logger = logging.getLogger(notices.__name__)
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def arguments(settings: Mapping[str, Any]) -> str:
     """Format settings as command line arguments."""
-    shown = (f"{n}={v:.4g}" if isinstance(v, float) else f"{n}={v}" for n, v in settings.items())
-    return "--set " + " ".join(shown)
+    return "--set " + " ".join(f"{name}={value}" for name, value in settings.items())
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -28,6 +28,7 @@ from pinnobs_gym.scoring.provenance import (
 from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder
+from pinnobs_gym.scoring.tuned import SUFFIX, is_tuned
 from pinnobs_gym.training.by_name import load, train_by_name
 from pinnobs_gym.training.log import Log
 
@@ -68,7 +69,11 @@ class Job:
     def called(self) -> str:
         """Name of the estimator in rows, unless its class makes another; see
         `BaseEstimator.label`."""
-        return self.label or called(ESTIMATORS.resolve(self.estimator), self.training)
+        if self.label is not None:
+            return self.label
+        cls = ESTIMATORS.resolve(self.estimator)
+        tuned = is_tuned(cls, self.settings, self.game)
+        return called(cls, self.training) + (SUFFIX if tuned else "")
 
     @property
     def name(self) -> str:

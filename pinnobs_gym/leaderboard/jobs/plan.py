@@ -19,24 +19,29 @@ from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
 from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.rows import Stored, episode_of, game_of
+from pinnobs_gym.scoring.tuned import SUFFIX, tuned_settings
+from pinnobs_gym.scoring.tuning import check_searchable
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
 
 
 def default_estimators() -> tuple[Entry, ...]:
-    """Return all estimators that can be scored on unseen episodes, in all their variants."""
-    return tuple(
-        Entry(name, settings=settings)
-        for name, cls in ESTIMATORS.classes().items()
-        for settings in cls.variants
-        if cls.needs_training is None or cls.track == "online"
-    )
+    """Return all estimators that can be scored on unseen episodes, in all their variants, and also
+    tuned if they declare settings to search."""
+    entries = []
+    for name, cls in ESTIMATORS.classes().items():
+        if cls.needs_training is None or cls.track == "online":
+            entries += [Entry(name, settings=settings) for settings in cls.variants]
+            trained = cls.needs_training or cls.trains_on_record
+            entries += [Entry(name, tuned=True)] if cls.tunable and not trained else []
+    return tuple(entries)
 
 
 def jobs_of(suite: Suite, folder: Path) -> list[Job]:
     """Return the jobs of a suite in a folder.
 
-    An estimator has none in a game whose system it does not take, see `BaseEstimator.takes`. Jobs
+    An estimator has none in a game whose system it does not take, see `BaseEstimator.takes`, and a
+    tuned one has none where no settings are stored with the system. Jobs
     with training come first, since they take longest. The others are ordered by game, since
     the references of episodes are cached from one job to the next. Estimators that train on each
     record play fewer episodes, with one job per episode.
@@ -56,12 +61,18 @@ def jobs_of(suite: Suite, folder: Path) -> list[Job]:
         for planned, (entry, cls) in product(_planned_games(suite, system), chosen):
             if not applies(cls, planned.game):
                 continue
+            if entry.tuned:
+                settings = tuned_settings(cls, planned.game)
+                if settings is None:
+                    continue
+                entry = replace(entry, settings=settings)
             if cls.needs_training or cls.trains_on_record:
                 if not planned.untrained_only:
                     long += _learning(suite, entry, cls, planned.game, folder)
             else:
                 _check_settings(suite, entry, cls, planned.game, {})
                 quick.append(_job(suite, entry, planned.game, folder, settings=entry.settings))
+    _check_tuned(suite, [*long, *quick])
     return long + quick
 
 
@@ -113,7 +124,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
     failed = {row["job"] for row in stored.failures}
     to_run, left_out = [], []
     for job in jobs:
-        again = job.digest in failed
+        again = bool(failed) and job.digest in failed  # a digest reads the code of a whole game
         if again and not retry_failed:
             left_out.append(job)
             continue
@@ -128,11 +139,25 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
     return to_run, left_out
 
 
+def _check_tuned(suite: Suite, jobs: Sequence[Job]) -> None:
+    """Check that each tuned estimator that a suite lists has a job in some game."""
+    for entry in suite.estimators:
+        name = entry.label or called(ESTIMATORS.resolve(entry.name), {}) + SUFFIX
+        if entry.tuned and name not in {job.called for job in jobs}:
+            message = (
+                f"no tuned settings of {entry.name!r} are stored with any of the systems for setup "
+                f"{suite.setup!r}; they are found by: pinnobs tune {entry.name} --store"
+            )
+            raise suite.wrong("estimators", message)
+
+
 def _class(suite: Suite, entry: Entry) -> type[BaseEstimator]:
     try:
         cls = ESTIMATORS.resolve(entry.name)
         if cls.needs_training is not None and cls.track == "offline":
             raise ValueError(f"estimator {entry.name!r} knows one record; it cannot be ranked")
+        if entry.tuned:
+            check_searchable(cls)
     except ValueError as error:
         raise suite.wrong("estimators", error) from error
     if cls.needs_training or cls.trains_on_record:
@@ -146,7 +171,7 @@ def _class(suite: Suite, entry: Entry) -> type[BaseEstimator]:
 def _name(suite: Suite, entry: Entry, cls: type[BaseEstimator]) -> str:
     """Return the name in rows of a suite's estimator."""
     try:
-        return entry.label or called(cls, entry.settings)
+        return entry.label or called(cls, entry.settings) + (SUFFIX if entry.tuned else "")
     except (ValueError, TypeError) as error:
         raise suite.wrong("estimators", f"settings of {entry.name!r}: {error}") from error
 

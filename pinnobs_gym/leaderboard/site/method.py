@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -145,7 +146,8 @@ def _command(runs: Sequence[ScoredRun], conditions: Sequence[str] = ()) -> str:
     words = ["pinnobs leaderboard"]
     systems = {run.game.system.rpartition("-v")[0] for run in runs}
     words += ["--systems", *sorted(systems)]
-    words += ["--estimators", *sorted({run.estimator.partition(" (")[0] for run in runs})]
+    names = {run.estimator.partition(" (")[0] for run in runs}
+    words += ["--estimators", *map(shlex.quote, sorted(names))]
     setup = runs[0].game.setup
     words += ["--setup", setup] if setup != "benchmark" else []
     words += ["--condition", *conditions] if conditions else []

@@ -26,7 +26,7 @@ from pinnobs_gym.simulation.conditions import CONDITIONS
 
 def draw(page: Page) -> str:
     """Render the page as HTML; computes nothing from rows."""
-    drawn = styles(list(page.tracks))
+    drawn = styles(list(page.tracks), page.main.places.peer)
     charts = charts_of(page, drawn)
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True

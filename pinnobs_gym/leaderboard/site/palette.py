@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.leaderboard.places import PEER
-
 LIGHT = ("#0072b2", "#d55e00", "#009e73", "#b8559a", "#c78500", "#3d9bd6", "#7a5230")
 DARK = ("#4aa8e0", "#ff8a3d", "#2fc79b", "#e08ec4", "#f2b733", "#9ad4ff", "#c9a27e")
 """Colours after Okabe & Ito, distinguishable by colour-blind readers, for light and dark
@@ -30,12 +28,13 @@ class Style:
     shape: str
 
 
-def styles(names: Sequence[str]) -> dict[str, Style]:
-    """Return the style of each estimator; styles repeat after `SHAPES` rounds of the colours."""
+def styles(names: Sequence[str], peer: str) -> dict[str, Style]:
+    """Return the style of each estimator, with the peer in `PEER_COLOURS`; styles repeat after
+    `SHAPES` rounds of the colours."""
     assigned = {}
     place = 0
     for name in names:
-        if name == PEER:
+        if name == peer:
             assigned[name] = Style(*PEER_COLOURS, DASHES[0], SHAPES[0])
             continue
         turn, hue = divmod(place, len(LIGHT))

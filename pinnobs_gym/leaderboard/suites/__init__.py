@@ -2,10 +2,16 @@
 
 A file in this folder is known by its name; any other is given by its path. Each key is a field of
 `Suite`, and every key is optional. An estimator is a name, ``module:Class``, or a table of
-``name``, ``label`` (its name in tables) and ``settings``::
+``name``, ``label`` (its name in tables) and ``settings``, or ``tuned = true`` for the settings that
+are stored with each system (`pinnobs_gym.scoring.tuned`). The name in tables stands for the latter,
+too, as in ``"ekf, tuned"``::
 
-    systems = ["ReverseDuffing", "my_module:VanDerPol"]
-    estimators = ["ekf", { name = "ekf", label = "robust ekf", settings = { huber = 1.345 } }]
+    systems = ["ReverseDuffing", "Academic"]
+    estimators = [
+        "ekf",
+        { name = "ekf", tuned = true, label = "best ekf" },
+        { name = "ekf", label = "gated ekf", settings = { gate = 0.9999 } },
+    ]
     conditions = ["nominal", "noise5+dropout10"]
     episodes = 20
 """
@@ -19,6 +25,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pinnobs_gym.scoring.tuned import SUFFIX
 from pinnobs_gym.training.settings import SEEDS
 
 FOLDER = Path(__file__).parent
@@ -34,6 +41,8 @@ class Entry:
     """Its name in tables; its own, with its recipe if its trainer has several, if None."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Its settings or, if it is trained, its trainer's."""
+    tuned: bool = False
+    """Whether it has its tuned settings; it plays no system that has none of it."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,8 @@ class Suite:
     systems: tuple[str, ...] = ()
     """Names or ``module:Class``; all known systems if empty."""
     estimators: tuple[Entry, ...] = ()
-    """All estimators that can be ranked if empty, in all their `BaseEstimator.variants`."""
+    """If empty, all estimators that can be ranked, in all their `BaseEstimator.variants`, and also
+    tuned where settings are stored with the system."""
     conditions: tuple[str, ...] = ()
     """If empty, nominal and the system's ranked condition. With "all", estimators that need no
     training also play every other condition that applies to the system."""
@@ -134,8 +144,10 @@ def _checked(key: str, value: Any) -> Any:
 
 
 def _entry(value: Any) -> Entry:
+    if isinstance(value, Entry):
+        return value
     if not isinstance(value, Mapping):
-        return value if isinstance(value, Entry) else Entry(value)
+        return Entry(value.removesuffix(SUFFIX), tuned=value.endswith(SUFFIX))
     known = [f.name for f in fields(Entry)]
     for key in value:
         if key not in known:
@@ -152,6 +164,10 @@ def _entry(value: Any) -> Entry:
         )
     if not isinstance(entry.settings, Mapping):
         raise ValueError(f"estimators: settings={entry.settings!r}; expected a table")
+    if not isinstance(entry.tuned, bool):
+        raise ValueError(f"estimators: tuned={entry.tuned!r}; expected true or false")
+    if entry.tuned and entry.settings:
+        raise ValueError(f"estimators: {dict(value)!r} is tuned and has settings; expected one")
     return entry
 
 

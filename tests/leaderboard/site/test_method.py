@@ -12,8 +12,9 @@ def test_commands_name_what_was_played():
     other = [row(2, condition="noise5", ranked=False)]
     trained = {"config": {"budget": 4.0}, "per_record": True}
     setup = [row(0, setup="paper", estimator="pinn_obs (paper's loss)", training=trained)]
+    nominal += [row(2, estimator="ukf, tuned")]
     assert method.commands(runs_of(nominal + other + setup)) == [
-        "pinnobs leaderboard --systems A --estimators ekf ukf --episodes 2 --seed 2",
+        "pinnobs leaderboard --systems A --estimators ekf ukf 'ukf, tuned' --episodes 2 --seed 2",
         "pinnobs leaderboard --systems A --estimators pinn_obs --setup paper --episodes 1 "
         "--trained-episodes 1 --budget 4",
         "pinnobs leaderboard --systems A --estimators ekf --condition noise5 --episodes 1 --seed 2",

@@ -223,7 +223,7 @@ def test_several_files_make_one_page_and_curves_may_be_missing(capsys, scored, t
 
 
 def test_charts_are_valid():
-    styled = Styled(styles(["ekf", "ukf"]), "ukf")
+    styled = Styled(styles(["ekf", "ukf"], "ukf"), "ukf")
     for spec in (
         errors(styled, 20.0, 1e-3, 1.0),
         settling(styled, 20.0),

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from pinnobs_gym.leaderboard.places import PEER
 from pinnobs_gym.leaderboard.site import palette
 
 
 def test_every_estimator_has_a_style_of_its_own():
     names = [f"e{i}" for i in range(3 * len(palette.LIGHT))]
-    styles = palette.styles([*names, PEER])
+    styles = palette.styles([*names, "peer"], "peer")
     assert len({(s.light, s.dash) for s in styles.values()}) == len(names) + 1
     assert len({(s.dark, s.shape) for s in styles.values()}) == len(names) + 1
-    assert palette.styles([PEER, "e0"])["e0"] == styles["e0"]
+    assert palette.styles(["peer", "e0"], "peer")["e0"] == styles["e0"]
 
 
 def luminance(colour):
