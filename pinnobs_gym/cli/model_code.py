@@ -31,13 +31,15 @@ def equations_text(system: System) -> str:
     """
     found = trace(system)
     lines = [f"{name} = {_plain(value)}" for name, value in _in_order(found.definitions)]
-    for name, value in zip(system.state_names, found.f, strict=True):
+    for name, value in zip(system.state_names, found.f.flat(), strict=True):
         left = f"{name}(k+1)" if system.discrete else f"d({name})/dt"
         lines.append(f"{left} = {_plain(value)}")
-    lines += [f"{n} = {_plain(v)}" for n, v in zip(system.output_names, found.h, strict=True)]
+    lines += [
+        f"{n} = {_plain(v)}" for n, v in zip(system.output_names, found.h.flat(), strict=True)
+    ]
     if system.nu and not system.measured_input:
         names = system.input_names
-        lines += [f"{n}(t) = {_plain(v)}" for n, v in zip(names, found.input, strict=True)]
+        lines += [f"{n}(t) = {_plain(v)}" for n, v in zip(names, found.input.flat(), strict=True)]
     return "\n".join(lines)
 
 

@@ -40,7 +40,7 @@ def match_samples(cells: Cells, seeds: range, t: np.ndarray, dt: float) -> np.nd
         lines[seed].append(i)
     missing = [seed for seed in seeds if seed not in lines]
     if missing:
-        more = f" and {len(missing) - 1} others" if len(missing) > 1 else ""
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ValueError(
             f"{cells.path} lacks episode {missing[0]}{more}; expected all from {seeds.start} to "
             f"{seeds.stop - 1}"
