@@ -13,6 +13,7 @@ from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.scoring.episode_folder import GAME_FILE, Issue
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.systems import SYSTEMS
 
 
 def texts_of(issue: Issue, facts: Mapping[str, Any]) -> dict[str, str]:
@@ -89,6 +90,8 @@ def _task(issue: Issue) -> str:
     system = issue.game.source.system
     states = ",".join(system.state_names)
     stds = ",".join(f"{name}_std" for name in system.state_names)
+    known = type(system).__name__ in SYSTEMS.sources
+    own = "" if known else f" --system {issue.game.system}"
     if issue.with_truth:
         return (
             "Train or try an estimator on these records and true states. For scores, write other "
@@ -101,7 +104,7 @@ def _task(issue: Issue) -> str:
         "a line for each line of the records, and all digits of the numbers. Standard deviations "
         f"of the estimates are optional: `{stds}`, all or none. `inf` marks an estimate that has "
         "diverged; empty cells and NaN are refused. Then, with the file in this folder,\n\n"
-        '    pinnobs score estimates.csv --name "my observer" --track online'
+        f'    pinnobs score estimates.csv --name "my observer" --track online{own}'
     )
 
 
@@ -144,15 +147,16 @@ def _parameters(system: System) -> str:
 def _known(system: System, facts: Mapping[str, Any]) -> str:
     noise, time = facts["process_noise_covariance"], "step" if system.discrete else "second"
     between = "linearly interpolated" if system.input_hold == "linear" else "held from the last one"
+    at = " at t = 0; it depends on time" if facts["noise_depends_on_time"] else ""
     lines = [
         "- The initial state has the mean x̂₀ and the covariance P₀ (rows):",
         f"  - x̂₀ = {facts['prior_mean']}",
         f"  - P₀ = {facts['prior_covariance']}",
         "- The output noise is white and Gaussian, with the covariance R = "
-        f"{facts['output_noise_covariance']}.",
-        f"- The plant has process noise whose covariance grows per {time} by Q = {noise}."
+        f"{facts['output_noise_covariance']}{at}.",
+        f"- The model has process noise, whose covariance grows per {time} by Q = {noise}{at}."
         if any(map(any, noise))
-        else "- The plant has no process noise.",
+        else "- The model has no process noise.",
     ]
     if system.nu and system.measured_input:
         lines.append(f"- Inputs between two samples are {between}.")

@@ -22,6 +22,7 @@ from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.scoring.episode_table import Format, parquet_library, writing
 from pinnobs_gym.scoring.evaluation import BATCH, seeds_of
 from pinnobs_gym.scoring.provenance import canonical, game_hash
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.training.trainer import TRAINING_SEED
 
@@ -102,13 +103,17 @@ class Issue:
 
 
 def noise_facts(game: Game) -> dict[str, Any]:
-    """Return the covariances of the noise at the first sample, as estimators are told them: of the
-    outputs (ny, ny), and of the process noise after one unit of time (nx, nx)."""
+    """Return the covariances of the noise at t = 0, as estimators are told them: of the outputs
+    (ny, ny), and of the process noise after one unit of time (nx, nx)."""
     system, setup = game.source.system, game.source.setup
     noise = system.noise(setup.noise_std, setup.process_noise)
     R = np.asarray(noise.R(0.0))[..., 0]
     L = np.asarray(noise.L(0.0))[..., 0]
-    return {"output_noise_covariance": R.tolist(), "process_noise_covariance": (L @ L.T).tolist()}
+    return {
+        "output_noise_covariance": R.tolist(),
+        "process_noise_covariance": (L @ L.T).tolist(),
+        "noise_depends_on_time": not (noise.constant and type(noise).G is Noise.G),
+    }
 
 
 def write_folder(

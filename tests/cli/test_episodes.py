@@ -501,3 +501,19 @@ def test_records_and_estimates_in_parquet(folder, capsys):
     (folder / "broken.parquet").write_text("no table")
     assert score("broken.parquet", "records") == 2
     assert "cannot read broken.parquet: " in error(capsys)
+
+
+def test_a_system_of_ones_own_is_named_again_at_scoring(folder, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(str(folder))
+    text = blocks(ROOT / "README.md", "python")
+    source = next(block for _, block in text if "class VanDerPol" in block)
+    source = source.partition("\nenv = ")[0]
+    (folder / "van_der_pol_of_mine.py").write_text(source, encoding="utf-8")
+    spec = "van_der_pol_of_mine:VanDerPol"
+    assert run("episodes", "--system", spec, "--episodes", 1, "-o", "records") == 0
+    said = f'pinnobs score estimates.csv --name "my observer" --track online --system {spec}'
+    assert said in (folder / "records/README.md").read_text(encoding="utf-8")
+    write_ekf(folder / "estimates.csv", Game.of(spec), [0])
+    assert score("estimates.csv", "records", "--system", spec, "--out", "runs") == 0
+    assert score("estimates.csv", "records", "--system", "Academic") == 2
+    assert "system='Academic' is pinnobs/Academic-v0" in error(capsys)
