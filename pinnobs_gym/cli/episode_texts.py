@@ -10,7 +10,8 @@ from typing import Any
 from pinnobs_gym.cli.model_code import equations_text, matlab_model
 from pinnobs_gym.cli.system_page import bounded, field_docs, repeating
 from pinnobs_gym.leaderboard.grid import markdown_table
-from pinnobs_gym.scoring.episode_folder import GAME_FILE, Issue
+from pinnobs_gym.scoring.episode_folder import GAME_FILE
+from pinnobs_gym.scoring.issue import Issue
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.systems import SYSTEMS

@@ -14,9 +14,10 @@ from pinnobs_gym.cli.console import console, progress
 from pinnobs_gym.cli.episode_texts import texts_of
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.scoring.episode_folder import Issue, is_there, write_folder
+from pinnobs_gym.scoring.episode_folder import is_there, write_folder
 from pinnobs_gym.scoring.episode_table import Format
 from pinnobs_gym.scoring.evaluation import seeds_of
+from pinnobs_gym.scoring.issue import Issue
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.trainer import TRAINING_SEED
 
