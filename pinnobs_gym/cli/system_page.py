@@ -43,8 +43,8 @@ def page(cls: type[System], env_id: str) -> str:
                 )
             ],
         ),
-        *_repeating(system, system.state_names, system.state_period),
-        *_bounded(system),
+        *repeating(system, system.state_names, system.state_period),
+        *bounded(system),
         "\n## Observation Space\n",
         f"`Box(({system.ny + system.nu + 1},), float32)`: the outputs, the inputs, then time.\n",
         _table(
@@ -54,7 +54,7 @@ def page(cls: type[System], env_id: str) -> str:
                 for i, name in enumerate((*system.output_names, *system.input_names, "t/T"))
             ],
         ),
-        *_repeating(system, system.output_names, system.output_period),
+        *repeating(system, system.output_names, system.output_period),
         "\n## Motion of the Model\n",
         _motion(system, setup),
         jacobians(system, setup),
@@ -116,7 +116,7 @@ def _unit(cls: type[System], name: str) -> str:
     return cls.units.get(name, "")
 
 
-def _repeating(system: System, names: Sequence[str], periods: Periods | None) -> list[str]:
+def repeating(system: System, names: Sequence[str], periods: Periods | None) -> list[str]:
     """Return a line about the states or outputs that repeat, if there are any."""
     found = [
         f"`{name}` repeats every {period:.6g} {_unit(type(system), name)}".rstrip()
@@ -126,7 +126,7 @@ def _repeating(system: System, names: Sequence[str], periods: Periods | None) ->
     return [f"\n{'; '.join(found)}: whole periods do not count."] if found else []
 
 
-def _bounded(system: System) -> list[str]:
+def bounded(system: System) -> list[str]:
     """Return a line about the states that have bounds, if there are any."""
     box, found = system.state_box, []
     if box is None:

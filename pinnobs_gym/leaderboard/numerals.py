@@ -16,6 +16,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
+def optional(value: float | None, digits: int = 3) -> str:
+    """Format a score as `number` does; an empty text if there is none."""
+    return "" if value is None else number(value, digits)
+
+
 def interval_text(interval: Interval, digits: int = 3) -> str:
     """Format a number to this number of significant digits with its interval, unless they are
     equal."""

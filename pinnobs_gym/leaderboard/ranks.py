@@ -28,8 +28,8 @@ class Line:
     """Its place in each window; absent without episodes in common with the peer."""
     games: Mapping[GameName, Standing]
     """Summary of each game that it played."""
-    us_per_step: float
-    """Median over games."""
+    us_per_step: float | None
+    """Median over games; None where it is not known."""
     over_floor: Mapping[str, Interval] = field(default_factory=dict)
     """Its error over the floor in each window, the geometric mean over `floor_games` of its track
     (`pinnobs_gym.leaderboard.floor.over_floor`); absent if it lacks one of them."""
@@ -92,13 +92,14 @@ def _over_floor(contender: Contender, games: Iterable[GameName]) -> dict[str, In
 def _line(contender: Contender, found: Places, floor_games: Mapping[GameName, bool]) -> Line:
     """Return the line of a contender."""
     standings = {game: contender.standing(game) for game in contender.games}
+    costs = [s.us_per_step for s in standings.values() if s.us_per_step is not None]
     own = {window: placed.get(contender.name) for window, placed in found.windows.items()}
     return Line(
         estimator=contender.name,
         track=contender.track,
         places={window: place for window, place in own.items() if place is not None},
         games=standings,
-        us_per_step=float(np.median([s.us_per_step for s in standings.values()])),
+        us_per_step=float(np.median(costs)) if costs else None,
         over_floor=_over_floor(contender, floor_games),
         floor_games=floor_games,
     )

@@ -8,7 +8,7 @@ from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.applicable import cell_without_scores
 from pinnobs_gym.leaderboard.contenders import label
 from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
-from pinnobs_gym.leaderboard.numerals import interval_text, number
+from pinnobs_gym.leaderboard.numerals import interval_text, number, optional
 from pinnobs_gym.leaderboard.places import FEWEST, Place, Places
 from pinnobs_gym.leaderboard.ranks import Line, worst_ranks
 from pinnobs_gym.leaderboard.standings import Standing
@@ -46,7 +46,7 @@ OF_GAME: tuple[tuple[Column, Callable[[Standing], str]], ...] = (
     (Column("steady"), lambda s: number(s.steady.value)),
     (Column("transient", 2), lambda s: number(s.transient.value)),
     (Column("diverged %", 1), lambda s: number(s.diverged.percent.value)),
-    (Column("µs/step", 4), lambda s: number(s.us_per_step, 2)),
+    (Column("µs/step", 4), lambda s: optional(s.us_per_step, 2)),
 )
 """The columns of one game in an overview that has a table per game."""
 
@@ -84,7 +84,7 @@ def _overview(found: Sequence[Line], peer: str, games: Sequence[GameName]) -> Gr
         (Column("diverged %", 1), lambda line: number(100 * line.diverged, 2)),
         *((Column(label(game)), lambda line, game=game: _of_game(line, game)) for game in games),
         (Column("track", 3, numeric=False), lambda line: line.track),
-        (Column("µs/step", 5), lambda line: number(line.us_per_step, 2)),
+        (Column("µs/step", 5), lambda line: optional(line.us_per_step, 2)),
         (Column("knows", numeric=False), lambda line: ", ".join(line.knows)),
     ]
     return Grid(

@@ -11,6 +11,7 @@ from itertools import chain
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.floor import NO_FLOOR, NO_FLOORS, Floor, Floors
 from pinnobs_gym.leaderboard.standings import Standing, is_identifiable, standing
+from pinnobs_gym.scoring.row_format import SUBMITTED
 from pinnobs_gym.scoring.rows import Row, game_of
 
 
@@ -38,8 +39,13 @@ class ScoredRun:
 
     @property
     def track(self) -> str:
-        """``online`` or ``offline``."""
+        """``online`` or ``offline``, or a track apart (`pinnobs_gym.scoring.row_format.Row`)."""
         return self.rows[0]["track"]
+
+    @property
+    def submitted(self) -> bool:
+        """Whether the estimates were made elsewhere (`pinnobs_gym.scoring.submitted`)."""
+        return SUBMITTED in self.rows[0]["knows"]
 
     @property
     def ranked(self) -> bool:

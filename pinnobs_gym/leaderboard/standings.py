@@ -69,7 +69,8 @@ class Standing:
     """Mean over episodes."""
     innovation_correlation: float | None
     """Mean over episodes."""
-    us_per_step: float
+    us_per_step: float | None
+    """Median over episodes; None where it is not known, as of submitted estimates."""
     knows: tuple[str, ...]
     budget: float | None
     """CPU seconds allotted to training; None without such a limit."""
@@ -110,7 +111,7 @@ def standing(rows: Sequence[Row], floor: Floor = NO_FLOOR) -> Standing:
         coverage=_statistic(np.mean, rows, "coverage"),
         nis=_statistic(np.mean, rows, "nis"),
         innovation_correlation=_statistic(np.mean, rows, "innovation_correlation"),
-        us_per_step=float(np.median([row["us_per_step"] for row in rows])),
+        us_per_step=_statistic(np.median, rows, "us_per_step"),
         knows=tuple(first["knows"]),
         budget=first["training"].get("config", {}).get("budget"),
         training=training_of(rows),

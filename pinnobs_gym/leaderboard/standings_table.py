@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
 from pinnobs_gym.leaderboard.intervals import Interval
-from pinnobs_gym.leaderboard.numerals import interval_text, number
+from pinnobs_gym.leaderboard.numerals import interval_text, number, optional
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.leaderboard.tables import Entry, Table
 
@@ -31,17 +31,17 @@ COLUMNS: tuple[tuple[Column, Callable[[Entry, Show], str]], ...] = (
     (Column("settled s", 5), lambda e, _: number(e.standing.settling.value)),
     (Column("track", 3, numeric=False), lambda e, _: e.standing.track),
     (Column("episodes", 5), lambda e, _: _episodes(e.standing)),
-    (Column("/ CRR", 6), lambda e, _: _optional(e.standing.over_reference)),
+    (Column("/ CRR", 6), lambda e, _: optional(e.standing.over_reference)),
     (Column("ANEES", 6), lambda e, _: _banded(e.standing.anees)),
-    (Column("covers %", 6), lambda e, _: _optional(_percent(e.standing.coverage), 2)),
+    (Column("covers %", 6), lambda e, _: optional(_percent(e.standing.coverage), 2)),
     (Column("90th pct.", 8), lambda e, _: number(e.standing.steady_90)),
     (Column("first", 9), lambda e, _: number(e.standing.first)),
     (Column("whole", 8), lambda e, _: number(e.standing.whole)),
     (Column("last 75 %", 9), lambda e, _: number(e.standing.late)),
     (Column("last 25 %", 9), lambda e, _: number(e.standing.tail)),
-    (Column("NIS", 8), lambda e, _: _optional(e.standing.nis)),
-    (Column("corr.", 8), lambda e, _: _optional(e.standing.innovation_correlation, 2)),
-    (Column("µs/step", 7), lambda e, _: number(e.standing.us_per_step)),
+    (Column("NIS", 8), lambda e, _: optional(e.standing.nis)),
+    (Column("corr.", 8), lambda e, _: optional(e.standing.innovation_correlation, 2)),
+    (Column("µs/step", 7), lambda e, _: optional(e.standing.us_per_step)),
     (Column("knows", numeric=False), lambda e, _: ", ".join(e.standing.knows)),
     (Column("training", 10, numeric=False), lambda e, _: e.standing.training),
 )
@@ -123,10 +123,13 @@ NOTE = (
     "trainings, and the total is given where trainings played different ones; a single training "
     "says nothing about how much trainings differ. Online estimators are causal; offline ones see "
     "the whole record first and are ranked apart, as are those that were trained under the very "
-    "condition that is scored; a rule stands between tracks. `initial set`: the estimator knows "
-    "the set that initial states are drawn from, beyond its mean and covariance, which all are "
-    "given. `tuned`: its settings were searched on nominal episodes that are never scored. "
-    "In brackets: modulo states that no output tells apart. Seconds behind a name are the "
+    "condition that is scored; a rule stands between tracks. Submitted estimates were made "
+    "elsewhere from the records: what they know and whether they are causal is what their author "
+    "says and cannot be checked, so that they are ranked apart, too; their cost is not known. "
+    "`initial set`: the estimator knows the set that initial states are drawn from, beyond its "
+    "mean and covariance, which all are given. `tuned`: its settings were searched on nominal "
+    "episodes that are never scored. In brackets: modulo states that no output tells apart. "
+    "Seconds behind a name are the "
     "CPU time that each training was given. / CRR: root mean square over episodes of the steady "
     "NRMSE, over that of the Cramér-Rao reference of the same episodes; empty where there is none "
     "(the condition is not in the model, there is no noise, or the reference is below the error of "
@@ -153,10 +156,6 @@ def over_floor_text(ratio: Interval | None, show: Show) -> str:
     if ratio is None:
         return ""
     return show(ratio) + (" ▼" if ratio.high < 1 else "")
-
-
-def _optional(value: float | None, digits: int = 3) -> str:
-    return "" if value is None else number(value, digits)
 
 
 def _percent(part: float | None) -> float | None:

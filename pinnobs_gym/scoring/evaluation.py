@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -193,9 +194,35 @@ def run_episodes(
         label: name of the estimator in rows; its own if None.
         more: returns further fields of the rows of a batch.
     """
-    common = _common(estimator, game)
+    common = {**game_fields(game), **_estimator_fields(estimator, game)}
     if label is not None:
         common |= {"estimator": label, "settings": {}}  # the label stands for the settings
+    return score_episodes(common, partial(play, game, estimator), seeds, results, progress, more)
+
+
+def score_episodes(
+    common: Row,
+    play_batch: Callable[[Sequence[int]], Played],
+    seeds: range,
+    results: Results | None = None,
+    progress: Callable[[int], None] | None = None,
+    more: Callable[[Played], list[Row]] | None = None,
+) -> Evaluated:
+    """Score the episodes that are not stored yet, batch by batch.
+
+    Args:
+        common: the fields that all rows have in common. They take precedence over those that are
+            found here, such as the cost.
+        play_batch: returns the episodes of some seeds with the estimates.
+        seeds: of the episodes.
+        results: the stored rows, and the file to which new rows are appended.
+        progress: called after each batch with its number of episodes.
+        more: returns further fields of the rows of a batch.
+
+    Raises:
+        ValueError: in one line, if a name in the rows is empty, too long or has white space at its
+            ends.
+    """
     check_names(common)
     wanted = [{**common, "episode": rows_module.episode_of(seed)} for seed in seeds]
     stored = {} if results is None else results.stored(wanted)
@@ -203,9 +230,10 @@ def run_episodes(
     first_played = None
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
-        played = play(game, estimator, [rows_module.seed_of(row) for row in batch])
+        played = play_batch([rows_module.seed_of(row) for row in batch])
         first_played = first_played or played
-        done = [{**row, **scores} for row, scores in zip(batch, _scored(played), strict=True)]
+        scored = zip(batch, _scored(played), strict=True)
+        done = [{**row, **scores, **common} for row, scores in scored]
         if more is not None:
             done = [{**row, **further} for row, further in zip(done, more(played), strict=True)]
         if results is not None:
@@ -277,15 +305,9 @@ def _identifiability(game: Game) -> Row:
     return dict.fromkeys(names) if found is None else asdict(found)
 
 
-def _common(estimator: BaseEstimator, game: Game) -> Row:
-    """Return the fields common to all rows of an evaluation."""
-    system, condition = game.source.system, game.name.condition
-    # An estimator trained under the very condition that is scored is no match for the others.
-    informed = condition != "nominal" and estimator.training.get("condition") == condition
-    knows = [*estimator.knows, *estimator.training.get("knows", ())]
-    knows += ["condition"] if informed else []
-    tuned = is_tuned(type(estimator), estimator.options, game)
-    knows += [TUNED] if tuned else []
+def game_fields(game: Game) -> Row:
+    """Return the fields of rows that say which game was played."""
+    system = game.source.system
     return {
         "schema": SCHEMA,
         "kind": "score",
@@ -294,6 +316,19 @@ def _common(estimator: BaseEstimator, game: Game) -> Row:
         "ranked": game.name.condition == canonical_name(system.ranked_condition),
         "nx": system.nx,
         **_identifiability(game),
+    }
+
+
+def _estimator_fields(estimator: BaseEstimator, game: Game) -> Row:
+    """Return the fields of rows that say which estimator was run."""
+    condition = game.name.condition
+    # An estimator trained under the very condition that is scored is no match for the others.
+    informed = condition != "nominal" and estimator.training.get("condition") == condition
+    knows = [*estimator.knows, *estimator.training.get("knows", ())]
+    knows += ["condition"] if informed else []
+    tuned = is_tuned(type(estimator), estimator.options, game)
+    knows += [TUNED] if tuned else []
+    return {
         "estimator": estimator.label + (SUFFIX if tuned else ""),
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
         "knows": list(dict.fromkeys(knows)),

@@ -28,7 +28,9 @@ Row: TypeAlias = dict[str, Any]
   being told enlarges steady errors (`pinnobs_gym.scoring.identifiability.Identifiability`); absent
   where there is nothing of this kind.
 - ``estimator``, ``track``, ``knows``, ``options``: the estimator, its track, its prior knowledge
-  and its options. One that was trained under the condition that is scored has a track of its own.
+  and its options. One that was trained under the condition that is scored has a track of its own,
+  and so have estimates that were submitted (`pinnobs_gym.scoring.submitted`); ``knows`` of these
+  begins with ``submitted``, and their ``options`` have the hash of the estimates.
 - ``settings``: what is not as usual (`pinnobs_gym.scoring.deviations`); names in tables have it.
 - ``estimator_code``: hash of the estimator's code.
 - ``estimator_hash``: hash of its code, settings, model and training.
@@ -40,10 +42,10 @@ Row: TypeAlias = dict[str, Any]
   others are None here and absent from the file.
 - ``effective_sample_size``, ``monte_carlo``: of a floor, how precise it is: the smallest effective
   sample size of the weighted draws at any sample of the episode, of exact Bayes; the Monte-Carlo
-  standard error of its RMS, relative to the RMS, of a particle reference. Absent otherwise. Floors
-  have the tracks ``floor`` (filtered) and ``floor, whole`` (smoothed).
+  standard error of its means, relative to its standard deviations, of a particle reference. Absent
+  otherwise. Floors have the tracks ``floor`` (filtered) and ``floor, whole`` (smoothed).
 - ``us_per_step``: CPU microseconds per step and episode, in the batch it was run in; without what
-  an online estimator prepares once.
+  an online estimator prepares once. Not known, and absent, of submitted estimates.
 - ``batch``: the size of that batch.
 - ``versions``, ``date``: versions of the packages, and time of the run (UTC).
 
@@ -75,20 +77,28 @@ JOB = ("env_id", "setup", "condition", "estimator", "episode", "episodes", "job"
 """The fields of a job in failures and recoveries."""
 OPTIONAL = (
     *OPTIONAL_SCORES,
-    *("free_over_known", "nominal_over_free", "effective_sample_size", "monte_carlo"),
+    *(
+        "free_over_known",
+        "nominal_over_free",
+        "effective_sample_size",
+        "monte_carlo",
+        "us_per_step",
+    ),
 )
 """The numbers that may be absent."""
 FLOOR = "floor"
 """Track of the floor of errors that is filtered, for online estimators."""
 FLOOR_WHOLE = "floor, whole"
 """Track of the floor of errors that is smoothed, for offline estimators."""
+SUBMITTED = "submitted"
+"""What ``knows`` of submitted estimates begins with."""
 NAMES = ("env_id", "setup", "condition", "estimator", "track")
 """The fields that are names."""
 NEEDED = {
     "score": frozenset(
         (
             *(*KEY, *SCORES, "diverged", "ranked", "nx", "estimator_code", "track", "knows"),
-            *("options", "settings", "training", "versions", "us_per_step", "date", "state_rmse"),
+            *("options", "settings", "training", "versions", "date", "state_rmse"),
         )
     ),
     "failure": frozenset((*JOB, "error", "date")),
@@ -114,7 +124,8 @@ def _is_text(value: object) -> bool:
     return type(value) is str and len(value) <= 1000
 
 
-def _is_name(value: object) -> bool:
+def is_name(value: object) -> bool:
+    """Return whether a value is a name, as `NAME_EXPECTED` says."""
     return type(value) is str and 0 < len(value) <= 1000 and value == value.strip()
 
 
@@ -171,7 +182,9 @@ def _is_cost(value: object) -> bool:
 
 
 _TEXT = ("a text of at most 1000 characters", _is_text)
-_NAME = ("a text of 1 to 1000 characters, without white space at its ends", _is_name)
+NAME_EXPECTED = "a text of 1 to 1000 characters, without white space at its ends"
+"""What a name is, for messages."""
+_NAME = (NAME_EXPECTED, is_name)
 _COUNT = ("a whole number of at least 0", _is_count)
 _COST = ("a number of at least 0", _is_cost)
 _FLAG = ("true or false", _is_flag)
@@ -195,8 +208,6 @@ FIELDS = {
 }
 """The required fields of each kind of row that are no scores: what is expected, and whether a value
 fits."""
-_NUMBERS = (*SCORES, "us_per_step")
-"""The numbers that every scored row has."""
 _TRAINING = {"config": _OBJECT, "seconds": _COST, "iterations": _COST}
 """The fields of a training that are read, each of which may be absent."""
 _BUDGET = ("a positive number, or null", lambda value: value is None or _is_positive(value))
@@ -209,7 +220,7 @@ def check_names(row: Row) -> None:
         ValueError: in one line, if one is empty, too long or has white space at its ends.
     """
     for name in NAMES:
-        if not _is_name(row[name]):
+        if not is_name(row[name]):
             raise ValueError(f"{name}={shown(row[name])}; expected {_NAME[0]}")
 
 
@@ -263,6 +274,8 @@ def _check(row: Row, constants: bool) -> None:
         if not fits(row[name]):
             raise ValueError(f"{name}={shown(row[name])}; expected {expected}")
     if kind == "score":
+        if "us_per_step" not in row and SUBMITTED not in row["knows"]:
+            raise ValueError("a row without us_per_step")
         _check_training(row["training"])
         _restore(row)
 
@@ -293,7 +306,7 @@ def _check_training(training: Mapping[str, Any]) -> None:
 
 def _restore(row: Row) -> None:
     """Check the scores of a row and restore their infinities."""
-    for name in _NUMBERS:
+    for name in SCORES:
         value = row[name]
         if type(value) is not float or not 0 <= value <= 1:  # most are, and every score may be
             row[name] = _score(name, value)

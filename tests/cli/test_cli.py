@@ -168,7 +168,7 @@ def test_estimate_with_process_noise(folder, level):
             ["evaluate", "--system", "Academic", "--set", "process_noise=1e-3"],
             "setting 'process_noise=1e-3'; expected name=value with a name of: assumed_noise, gate",
         ),
-        (["dance"], "unknown command 'dance'; known are estimate, estimators, evaluate"),
+        (["dance"], "unknown command 'dance'; known are episodes, estimate, estimators, evaluate"),
         (["train", "pinn_obs", "--system", "Academic", "--budget", "-1"], "budget=-1.0; expected"),
         (["evaluate", "--systm", "Academic"], "Missing from pinnobs evaluate: --system"),
         (["evaluate", "--system", "Academic", "--episodes", "a"], "parsing --episodes: invalid"),

@@ -522,3 +522,12 @@ def test_every_required_field_is_checked():
     for kind, needed in row_format.NEEDED.items():
         checked = {name for name, *_ in row_format.FIELDS[kind]}
         assert needed - checked - scores == set(), kind
+
+
+def test_only_submitted_estimates_may_be_without_a_cost(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    rows.append(path, [row(0, us_per_step=None, knows=["submitted", "model"])])
+    assert rows.read(path)[0]["us_per_step"] is None
+    rows.append(path, [row(1, us_per_step=None)])
+    with pytest.raises(ValueError, match=r"rows.jsonl, line 2: a row without us_per_step"):
+        rows.read(path)

@@ -4,32 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from pinnobs_gym.cli.console import console, print_table, progress
+from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
+from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import Game
-from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
-from pinnobs_gym.leaderboard import standings_table
-from pinnobs_gym.leaderboard.contenders import contenders
-from pinnobs_gym.leaderboard.floor import floors, is_floor
-from pinnobs_gym.leaderboard.runs import runs_of
-from pinnobs_gym.leaderboard.states_table import by_state
-from pinnobs_gym.leaderboard.tables import tables
-from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.evaluation import (
-    Evaluated,
     Results,
     make_estimator,
     run_episodes,
     seeds_of,
 )
-from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
 from pinnobs_gym.training.by_name import load
-from pinnobs_gym.training.log import Log
 
 
 @dataclass(frozen=True)
@@ -77,45 +68,14 @@ class Evaluate:
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
         check_writable(self.out)
-        evaluated = self._score(game, estimator, episodes)
-        known = [row for row in rows.read(self._rows) if rows.game_of(row) == game.name]
-        found = floors([*evaluated.rows, *filter(is_floor, known)])
-        for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
-            hint = f"pinnobs tables {self._rows} -o FILE writes all"
-            print_table(standings_table.layouts(table), hint)
-        for note in found.notes:
-            console.print(note, style="yellow", soft_wrap=True)
-        print_table([[by_state(game.source.system, evaluated.rows)]])
-        # To draw takes as long as all else of one episode.
-        drawn = evaluated.first_played if self.episodes > 1 else None
-        with Log(log_folder(self.out, evaluated.rows[0])) as log:
-            log_episodes(log, evaluated.rows, drawn)
-            log_summary(log, evaluated.rows)
-        console.print(f"rows: {self._rows}; TensorBoard: {self.out / 'tensorboard'}")
+        seeds = seeds_of(self.seed, episodes)
+        results = Results(rows_file(self.out), fresh=self.fresh)
+        score = partial(run_episodes, game, estimator, seeds, results)
+        report(game, with_progress(episodes, score), self.out, picture=self.episodes > 1)
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)
             console.print(f"video: {self.video}", soft_wrap=True)
         return 0
-
-    @property
-    def _rows(self) -> Path:
-        return self.out / "rows.jsonl"
-
-    def _score(self, game: Game, estimator: BaseEstimator, episodes: int) -> Evaluated:
-        """Score this number of episodes."""
-        seeds = seeds_of(self.seed, episodes)
-        with progress() as bar:
-            task = bar.add_task("episodes", total=episodes)
-
-            def count(done: int) -> None:
-                bar.advance(task, done)
-
-            results = Results(self._rows, fresh=self.fresh)
-            evaluated = run_episodes(game, estimator, seeds, results, count)
-            bar.update(task, completed=episodes)
-        if evaluated.reused:
-            console.print(evaluated.reuse(self._rows), soft_wrap=True, highlight=False)
-        return evaluated
 
 
 def run(arguments: Sequence[str]) -> int:

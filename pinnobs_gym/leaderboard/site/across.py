@@ -76,8 +76,8 @@ def training_seconds(contender: Contender) -> float | None:
 
 def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns:
     """Return a row per line of the overview: its factor to the peer in the steady window with the
-    interval, its µs per step, and the CPU seconds of its training, with a gap for estimators that
-    are not trained.
+    interval, its µs per step, and the CPU seconds of its training, with gaps where these are not
+    known or the estimator is not trained.
 
     ``front`` is true for the Pareto front: lines that no other of their track beats in both
     accuracy and speed. Lines without a factor are left out.
@@ -96,9 +96,11 @@ def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns
             ratio=[number(factor.value)],
             low=[number(factor.low)],
             high=[number(factor.high)],
-            us=[number(line.us_per_step)],
+            us=[None if line.us_per_step is None else number(line.us_per_step)],
             seconds=[None if spent is None else number(spent)],
-            front=[not any(_beats(other, line) for other in lines)],
+            front=[
+                line.us_per_step is not None and not any(_beats(other, line) for other in lines)
+            ],
         )
     return table
 
@@ -106,6 +108,8 @@ def costs(lines: Sequence[Line], seconds: Mapping[str, float | None]) -> Columns
 def _beats(other: Line, line: Line) -> bool:
     """Return whether the other line is both faster and more accurate."""
     if "steady" not in other.places or other.track != line.track:
+        return False
+    if other.us_per_step is None or line.us_per_step is None:
         return False
     faster = other.us_per_step < line.us_per_step
     return faster and other.places["steady"].factor.value < line.places["steady"].factor.value

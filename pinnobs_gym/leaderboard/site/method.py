@@ -125,7 +125,9 @@ def commands(runs: Iterable[ScoredRun]) -> list[str]:
     """Return command lines that reproduce these runs: one per setup for the default conditions, and
     one per set of other conditions for the systems played under it. They may produce more rows,
     since every named estimator plays every named system. Estimators play by their own recipe; any
-    other, which their names in rows say in brackets, needs a suite of one's own."""
+    other, which their names in rows say in brackets, needs a suite of one's own. Submitted
+    estimates are left out: no estimator here makes them."""
+    runs = [run for run in runs if not run.submitted]
     usual: dict[str, list[ScoredRun]] = {}
     others: dict[tuple[str, str], list[ScoredRun]] = {}
     for run in runs:

@@ -1,0 +1,58 @@
+"""What the commands print and log of the scores of one estimator on one system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pinnobs_gym.cli.console import console, print_table, progress
+from pinnobs_gym.envs.game import Game
+from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.floor import floors, is_floor
+from pinnobs_gym.leaderboard.runs import runs_of
+from pinnobs_gym.leaderboard.states_table import by_state
+from pinnobs_gym.leaderboard.tables import tables
+from pinnobs_gym.scoring import rows as rows_module
+from pinnobs_gym.scoring.evaluation import Evaluated
+from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
+from pinnobs_gym.training.log import Log
+
+
+def rows_file(out: Path) -> Path:
+    """Return the rows file in an output folder."""
+    return out / "rows.jsonl"
+
+
+def with_progress(episodes: int, score: Callable[[Callable[[int], None]], Evaluated]) -> Evaluated:
+    """Return the result of ``score``, which is given a function to call after each batch with its
+    number of episodes, and show a progress bar meanwhile."""
+    with progress() as bar:
+        task = bar.add_task("episodes", total=episodes)
+
+        def count(done: int) -> None:
+            bar.advance(task, done)
+
+        evaluated = score(count)
+        bar.update(task, completed=episodes)
+    return evaluated
+
+
+def report(game: Game, evaluated: Evaluated, out: Path, picture: bool = True) -> None:
+    """Print the tables of scored episodes, and log them for TensorBoard, where wanted with a
+    picture of the first one, which takes as long as all else of one episode."""
+    rows = rows_file(out)
+    if evaluated.reused:
+        console.print(evaluated.reuse(rows), soft_wrap=True, highlight=False)
+    known = [row for row in rows_module.read(rows) if rows_module.game_of(row) == game.name]
+    found = floors([*evaluated.rows, *filter(is_floor, known)])
+    for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
+        print_table(standings_table.layouts(table), f"pinnobs tables {rows} -o FILE writes all")
+    for note in found.notes:
+        console.print(note, style="yellow", soft_wrap=True)
+    print_table([[by_state(game.source.system, evaluated.rows)]])
+    drawn = evaluated.first_played if picture else None
+    with Log(log_folder(out, evaluated.rows[0])) as log:
+        log_episodes(log, evaluated.rows, drawn)
+        log_summary(log, evaluated.rows)
+    console.print(f"rows: {rows}; TensorBoard: {out / 'tensorboard'}", soft_wrap=True)
