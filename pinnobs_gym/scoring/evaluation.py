@@ -28,7 +28,7 @@ from pinnobs_gym.scoring.provenance import (
     versions,
 )
 from pinnobs_gym.scoring.recency import LastUse
-from pinnobs_gym.scoring.row_format import NEEDED, SCHEMA, Row, check_names
+from pinnobs_gym.scoring.row_format import NEEDED, OPTIONAL, SCHEMA, Row, check_names
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.scoring.tuned import SUFFIX, TUNED, is_tuned, required_settings
@@ -233,7 +233,7 @@ def score_episodes(
         played = play_batch([rows_module.seed_of(row) for row in batch])
         first_played = first_played or played
         scored = zip(batch, _scored(played), strict=True)
-        done = [{**row, **scores, **common} for row, scores in scored]
+        done = [{**dict.fromkeys(OPTIONAL), **row, **scores, **common} for row, scores in scored]
         if more is not None:
             done = [{**row, **further} for row, further in zip(done, more(played), strict=True)]
         if results is not None:
