@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -169,6 +169,25 @@ class Evaluated:
         return f"{self.reused} of {len(self.rows)} episodes taken from {path}"
 
 
+@dataclass(frozen=True)
+class StandIn:
+    """What plays in the place of an estimator that trains on each record: the result of a training
+    that took place earlier, on the same record."""
+
+    estimator: BaseEstimator
+    """The estimator with this result."""
+    seconds: float
+    """CPU seconds of the training, which are part of the cost of the estimates."""
+    code: Mapping[str, str]
+    """``estimator_code`` and ``estimator_hash`` of the rows of the training."""
+
+    def play(self, game: Game, seeds: Sequence[int]) -> Played:
+        """Run it on episodes, with the training as part of the cost; see `play`."""
+        played = play(game, self.estimator, seeds)
+        training = self.seconds * 1e6 / (played.record.num_samples * played.record.batch)
+        return replace(played, us_per_step=played.us_per_step + training)
+
+
 def run_episodes(
     game: Game,
     estimator: BaseEstimator,
@@ -176,6 +195,7 @@ def run_episodes(
     results: Results | None = None,
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
+    stand_in: StandIn | None = None,
 ) -> Evaluated:
     """Run and score the episodes that are not stored yet, batch by batch.
 
@@ -186,8 +206,11 @@ def run_episodes(
         results: the stored rows, and the file to which new rows are appended.
         progress: called after each batch with its number of episodes.
         label: name of the estimator in rows; its own if None.
+        stand_in: what plays in its place; rows have the code that this was trained by.
     """
     common = _common(estimator, game)
+    if stand_in is not None:
+        common |= stand_in.code
     if label is not None:
         common |= {"estimator": label, "settings": {}}  # the label stands for the settings
     check_names(common)
@@ -197,7 +220,10 @@ def run_episodes(
     first_played = None
     for first in range(0, len(missing), BATCH):
         batch = missing[first : first + BATCH]
-        played = play(game, estimator, [rows_module.seed_of(row) for row in batch])
+        numbers = [rows_module.seed_of(row) for row in batch]
+        played = (
+            play(game, estimator, numbers) if stand_in is None else stand_in.play(game, numbers)
+        )
         first_played = first_played or played
         done = [{**row, **scores} for row, scores in zip(batch, _scored(played), strict=True)]
         if results is not None:

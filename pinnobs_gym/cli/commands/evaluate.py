@@ -14,7 +14,10 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.against import compare, opponents
 from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.published.reading import PUBLISHED
+from pinnobs_gym.leaderboard.published.trained import load_published
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.states_table import by_state
 from pinnobs_gym.leaderboard.tables import tables
@@ -39,7 +42,7 @@ class Evaluate:
     estimator: str = "ekf"
     """Name or module:Class of the estimator."""
     checkpoint: Path | None = None
-    """Trained estimator to load."""
+    """Trained estimator to load; published stands for the one that ships with the package."""
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as assumed_noise=0.1."""
     setup: str = "benchmark"
@@ -52,6 +55,9 @@ class Evaluate:
     """Seed of the first episode."""
     fresh: bool = False
     """Run all episodes, also those whose scores are stored; the new scores replace them."""
+    against: Path | None = None
+    """Rows file among whose estimators this one is shown, on the same episodes; published stands
+    for the rows that ship with the package."""
     out: Path = Path("runs/evaluate")
     """Folder of rows and TensorBoard log."""
     video: Path | None = None
@@ -64,16 +70,25 @@ class Evaluate:
         options = settings_of(cls, self.set)
         if self.video is not None:
             check_video(self.video)
-        trained = None if self.checkpoint is None else load(cls, self.checkpoint, game)
+        trained = self._trained(cls, game)
         estimator = make_estimator(trained or cls, game, options)
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
+        others = None
+        if self.against is not None:
+            others = opponents(self.against, game, seeds_of(self.seed, episodes))
         check_writable(self.out)
         evaluated = self._score(game, estimator, episodes)
-        for table in tables(contenders(runs_of(evaluated.rows))):
-            hint = f"pinnobs tables {self._rows} -o FILE writes all"
-            print_table(standings_table.layouts(table), hint)
+        if others is None:
+            for table in tables(contenders(runs_of(evaluated.rows))):
+                hint = f"pinnobs tables {self._rows} -o FILE writes all"
+                print_table(standings_table.layouts(table), hint)
+        else:
+            comparison = compare(evaluated.rows, others)
+            hint = f"pinnobs tables {self._rows} {self.against} -o FILE writes all"
+            print_table(standings_table.layouts(comparison.table), hint)
+            console.print(comparison.summary + "\n", highlight=False)
         print_table([[by_state(game.source.system, evaluated.rows)]])
         # To draw takes as long as all else of one episode.
         drawn = evaluated.first_played if self.episodes > 1 else None
@@ -89,6 +104,12 @@ class Evaluate:
     @property
     def _rows(self) -> Path:
         return self.out / "rows.jsonl"
+
+    def _trained(self, cls: type[BaseEstimator], game: Game) -> BaseEstimator | None:
+        """Return the trained estimator to score, None if it needs none."""
+        if self.checkpoint == PUBLISHED:
+            return load_published(self.estimator, game)
+        return None if self.checkpoint is None else load(cls, self.checkpoint, game)
 
     def _score(self, game: Game, estimator: BaseEstimator, episodes: int) -> Evaluated:
         """Score this number of episodes."""

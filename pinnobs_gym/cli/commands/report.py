@@ -12,7 +12,8 @@ import tyro
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
-from pinnobs_gym.scoring import curves, rows
+from pinnobs_gym.leaderboard.published.reading import load_rows
+from pinnobs_gym.scoring import curves
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Report:
 
     rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Rows files, such as runs/leaderboard/rows.jsonl; the curves in a folder "curves" beside each
-    are drawn too."""
+    are drawn too. "published" stands for the rows that ship with the package, without curves."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("site")
     """Folder of the page, index.html."""
 
@@ -36,7 +37,7 @@ class Report:
             raise ValueError(
                 f"the page needs {error.name}: pip install 'pinnobs-gym[report]'"
             ) from None
-        stored = rows.load_all(self.rows)
+        stored = load_rows(self.rows)
         if stored.warning:
             console.print(stored.warning, style="yellow", soft_wrap=True)
         if not stored.rows:
