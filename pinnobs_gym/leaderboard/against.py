@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.published import reading
 from pinnobs_gym.leaderboard.tables import Table
@@ -63,8 +63,7 @@ def opponents(source: Path, game: Game, seeds: range) -> Opponents:
         games = {rows.game_of(row) for row in stored}
     own = [row for row in stored if rows.game_of(row) == name]
     if not own:
-        known = "; ".join(", ".join(each) for each in sorted(games)) or "none"
-        raise ValueError(f"{where}: no scores of {', '.join(name)}; it has scores of {known}")
+        raise ValueError(f"{where}: no scores of {', '.join(name)}; {_known(games, name)}")
     present = game_hash(game.source)
     comparable = [row for row in own if row["game_hash"] == present]
     if not comparable:
@@ -114,6 +113,15 @@ def _summary(table: Table, name: str, common: int, played: int, source: str) -> 
     placed = f"rank {' and '.join(ranks)}" if ranks else "no rank"
     episodes = f"{common} episodes" if common == played else f"the {common} of {played} episodes"
     return f"{name}: {placed} of {count} estimators of the track {track}, on {episodes} of {source}"
+
+
+def _known(games: set[GameName], name: GameName) -> str:
+    """Return in words of which games of a system there are scores; if of none, of which systems."""
+    own = [", ".join(game[1:]) for game in sorted(games) if game.env_id == name.env_id]
+    if own:
+        return f"of this system there are those of {'; '.join(own)}"
+    systems = sorted({game.system for game in games})
+    return f"there are those of {', '.join(systems) or 'no system'}"
 
 
 def _command(game: Game) -> str:

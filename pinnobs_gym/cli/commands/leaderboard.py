@@ -18,7 +18,7 @@ from pinnobs_gym.leaderboard.chapters import chapters, markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.job import Job
-from pinnobs_gym.leaderboard.jobs.trainings import of_earlier_code, training_of, will_train
+from pinnobs_gym.leaderboard.jobs.trainings import Outlook, training_of
 from pinnobs_gym.leaderboard.published import manifest
 from pinnobs_gym.scoring import rows, tensorboard
 
@@ -82,9 +82,10 @@ class Leaderboard:
         jobs = [replace(job, fresh=self.fresh) for job in planned]
         to_run, left_out = plan.left(jobs, stored, self.retry_failed)
         earlier = {rows.key(row): row["date"] for row in stored.rows}
-        outdated = of_earlier_code(jobs)
+        outlook = Outlook()
+        outdated = outlook.outdated(jobs)
         engine = Engine(workers)
-        kinds = {_key(job): kind_of(job) for job in to_run}
+        kinds = {_key(job): kind_of(job, outlook) for job in to_run}
         with RunView(list(kinds.values()), engine) as view:
             for job, error, seconds in engine.run(to_run):
                 view.ended(job.name, kinds[_key(job)], error, seconds)
@@ -205,7 +206,7 @@ def _key(job: Job) -> tuple[str, str]:
     return job.name, repr(job.training)
 
 
-def kind_of(job: Job) -> Kind:
+def kind_of(job: Job, outlook: Outlook) -> Kind:
     """Return what a job mostly does, and the name that it shares with jobs that take as long."""
     # Some of the known keys may be of other code; then the job takes longer than estimated.
     training = training_of(job)
@@ -213,7 +214,7 @@ def kind_of(job: Job) -> Kind:
     known = {episode for _, _, trained, episode in job.known or () if trained == seed}
     if len(known) >= job.episodes and not job.fresh:
         return Kind("playing", f"{job.called}, stored")
-    return Kind("trainings" if will_train(job) else "playing", job.called)
+    return Kind("trainings" if outlook.will_train(job) else "playing", job.called)
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -113,7 +113,7 @@ def left(jobs: Sequence[Job], stored: Stored, retry_failed: bool) -> tuple[list[
     failed = {row["job"] for row in stored.failures}
     to_run, left_out = [], []
     for job in jobs:
-        again = job.digest in failed
+        again = bool(failed) and job.digest in failed  # to hash the code of all jobs takes long
         if again and not retry_failed:
             left_out.append(job)
             continue

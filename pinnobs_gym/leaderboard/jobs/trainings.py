@@ -31,10 +31,16 @@ def training_of(job: Job) -> Training | None:
     return Training(cls, job.game, recipe, job.seed)
 
 
-def place_of(job: Job, training: Training) -> Path:
+def place_of(job: Job, training: Training, code: str | None = None) -> Path:
     """Return where the result of a job's training is kept: a file or, of a training on a record,
-    the folder in which each of its rows has a folder."""
-    recipe = settings_digest([training.recipe, training.code])
+    the folder in which each of its rows has a folder.
+
+    Args:
+        job: the job.
+        training: its training.
+        code: hash of the training's code, if it is known.
+    """
+    recipe = settings_digest([training.recipe, code or training.code])
     trainer = file_name(trainer_class(training.cls).name)
     name = f"{training.game.name.file_stem}-{trainer}-{recipe}"
     name += ".pt" if training.seed is None else f"-episode{training.seed}"
@@ -64,26 +70,39 @@ def stand_in(job: Job, training: Training, estimator: Any) -> StandIn | None:
     return stand_in(estimator, job.game, *published)
 
 
-def will_train(job: Job) -> bool:
-    """Return whether a job has a training ahead: one whose result is neither in its folder nor
-    published."""
-    training = training_of(job)
-    if training is None or published_of(job, training) is not None:
-        return False
-    return training.seed is not None or not place_of(job, training).exists()
+class Outlook:
+    """What the trainings of many jobs will do. The code of each trainer is hashed only once for
+    each system, since this takes long."""
 
+    def __init__(self) -> None:
+        self._codes: dict[tuple[type, type], str] = {}
 
-def of_earlier_code(jobs: Iterable[Job]) -> dict[str, list[str]]:
-    """Return the systems, by estimator, on which jobs use a published training whose code has
-    changed since."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for job in jobs:
+    def will_train(self, job: Job) -> bool:
+        """Return whether a job has a training ahead: one whose result is neither in its folder nor
+        published."""
         training = training_of(job)
-        published = None if training is None else published_of(job, training)
-        if training is None or published is None:
-            continue
-        own = training.seed is None and place_of(job, training).exists()
-        if not own and published[1].code != training.code:
-            system = job.game.name.system
-            found[job.called] += [system] if system not in found[job.called] else []
-    return dict(found)
+        if training is None or published_of(job, training) is not None:
+            return False
+        return training.seed is not None or not self._is_kept(job, training)
+
+    def outdated(self, jobs: Iterable[Job]) -> dict[str, list[str]]:
+        """Return the systems, by estimator, on which jobs use a published training whose code has
+        changed since."""
+        found: dict[str, dict[str, None]] = defaultdict(dict)
+        for job in jobs:
+            training = training_of(job)
+            published = None if training is None else published_of(job, training)
+            if training is None or published is None or published[1].code == self._code(training):
+                continue
+            if training.seed is not None or not self._is_kept(job, training):
+                found[job.called][job.game.name.system] = None
+        return {name: list(systems) for name, systems in found.items()}
+
+    def _is_kept(self, job: Job, training: Training) -> bool:
+        return place_of(job, training, self._code(training)).exists()
+
+    def _code(self, training: Training) -> str:
+        key = trainer_class(training.cls), type(training.game.source.system)
+        if key not in self._codes:
+            self._codes[key] = training.code
+        return self._codes[key]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,7 +27,7 @@ class TrainedBefore(PinnObs):
     networks: tuple[TrainedNetwork, ...] = field(default=(), kw_only=True, repr=False)
     """One network per row of the record."""
 
-    def fit(self, record: Record) -> Sequence[TrainedNetwork]:
+    def fit(self, record: Record) -> list[TrainedNetwork]:
         return list(self.networks)
 
 
