@@ -40,7 +40,7 @@ class Mismatch(Condition):
     def plants(self, system: System) -> tuple[System, ...]:
         off = self._off(system)
         signs = product((-1.0, 1.0), repeat=len(off.std))
-        return tuple(off.plant(system, self.part * np.array(each)) for each in signs)
+        return tuple(off.plant(system, self.part * np.array([each])) for each in signs)
 
     def unknowns(self, system: System, setup: Setup) -> tuple[Unknowns, ...]:
         """The relative deviation of each parameter, or of each rate of change."""
