@@ -7,11 +7,19 @@ export OMP_NUM_THREADS ?= 1
 TOO_OLD = $(shell $(PYTHON) -c 'import sys; v = sys.version_info[:2]; \
 	sys.stdout.write("" if v >= (3, 11) else "Python %d.%d" % v)' 2>&1)
 
-.PHONY: leaderboard test lint benchmark docs clean
+.PHONY: leaderboard publish test lint benchmark docs clean
 
 leaderboard: $(VENV)/installed
-	$(BIN)/python scripts/leaderboard.py
-	$(BIN)/pinnobs report runs/leaderboard/rows.jsonl -o runs/leaderboard/site
+	@begun=$$(date +%s) && \
+	$(BIN)/python scripts/leaderboard.py && \
+	played=$$(date +%s) && \
+	$(BIN)/pinnobs report runs/leaderboard/rows.jsonl -o runs/leaderboard/site && \
+	ended=$$(date +%s) && \
+	echo "installation, once: $$(cat $(VENV)/installed) s; leaderboard:" \
+		"$$((played - begun)) s; page: $$((ended - played)) s"
+
+publish: $(VENV)/installed
+	$(BIN)/python scripts/publish.py
 
 test: $(VENV)/installed-dev
 	$(BIN)/pytest -n 2
@@ -34,10 +42,12 @@ $(VENV)/bin/python:
 		try make PYTHON=python3.12))
 	$(PYTHON) -m venv $(VENV)
 
+# The file holds the duration of the installation in s.
 $(VENV)/installed: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch>=2.8,<2.14"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[report]"
-	touch $@
+	@begun=$$(date +%s) && \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch>=2.8,<2.14" && \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[report]" && \
+	echo $$(($$(date +%s) - begun)) > $@
 
 $(VENV)/installed-dev: pyproject.toml | $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"

@@ -13,6 +13,7 @@ from pinnobs_gym.envs.registration import register_envs, register_system
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.estimator import Estimator, State
+    from pinnobs_gym.leaderboard.published.trained import load
     from pinnobs_gym.scoring.evaluation import evaluate
     from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.augmented import augmented
@@ -29,6 +30,7 @@ __all__ = [
     "__version__",
     "augmented",
     "evaluate",
+    "load",
     "read_rows",
     "register",
     "stack",
@@ -48,6 +50,7 @@ _HOMES = {
     "stack": "simulation.system",
     "table": "simulation.table",
     "evaluate": "scoring.evaluation",
+    "load": "leaderboard.published.trained",
     "read_rows": "scoring.table",
 }
 """Submodule that defines each lazily imported public name."""

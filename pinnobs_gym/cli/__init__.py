@@ -7,7 +7,7 @@ import importlib
 import os
 import pkgutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from io import TextIOWrapper
 
@@ -40,20 +40,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 for success, 1 if a job failed or an unexpected
     error occurred, 2 for invalid input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    for stream in (sys.stdout, sys.stderr):
-        # The encoding of redirected output on Windows has few characters.
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")
+    _print_anything()
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
         return 0 if arguments else 2
+    return guarded(lambda: _run(arguments[0], arguments[1:]))
+
+
+def _run(name: str, arguments: Sequence[str]) -> int:
+    if name not in COMMANDS:
+        raise ValueError(f"unknown command {name!r}; known are {', '.join(COMMANDS)}")
+    return importlib.import_module(f"{commands.__name__}.{name}").run(arguments)
+
+
+def guarded(command: Callable[[], int]) -> int:
+    """Run a command as a process of its own: with one numerical thread, and with errors told in one
+    line. Returns its exit status, see `main`."""
+    _print_anything()
     _one_thread()
     sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
-    name, rest = arguments[0], list(arguments[1:])
     try:
-        if name not in COMMANDS:
-            raise ValueError(f"unknown command {name!r}; known are {', '.join(COMMANDS)}")
-        return importlib.import_module(f"{commands.__name__}.{name}").run(rest)
+        return command()
     except (ValueError, TypeError, FloatingPointError) as error:
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
@@ -73,6 +80,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("pinnobs: stopped; what was written is kept", file=sys.stderr)
         return 130
+
+
+def _print_anything() -> None:
+    """Replace what the output cannot show: redirected output on Windows has few characters."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def _one_thread() -> None:

@@ -8,8 +8,10 @@ from pathlib import Path
 from pinnobs_gym.cli.console import console, print_table, progress
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.leaderboard import standings_table
+from pinnobs_gym.leaderboard.against import Opponents, compare
 from pinnobs_gym.leaderboard.contenders import contenders
 from pinnobs_gym.leaderboard.floor import floors, is_floor
+from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.states_table import by_state
 from pinnobs_gym.leaderboard.tables import tables
@@ -38,18 +40,39 @@ def with_progress(episodes: int, score: Callable[[Callable[[int], None]], Evalua
     return evaluated
 
 
-def report(game: Game, evaluated: Evaluated, out: Path, picture: bool = True) -> None:
-    """Print the tables of scored episodes, and log them for TensorBoard, where wanted with a
-    picture of the first one, which takes as long as all else of one episode."""
+def report(
+    game: Game,
+    evaluated: Evaluated,
+    out: Path,
+    picture: bool = True,
+    others: Opponents | None = None,
+) -> None:
+    """Print the tables of scored episodes, and log them for TensorBoard.
+
+    Args:
+        game: what was played.
+        evaluated: the episodes.
+        out: the output folder.
+        picture: whether to log a picture of the first one, which takes as long as all else of one
+            episode.
+        others: scores among which they are shown, if any.
+    """
     rows = rows_file(out)
     if evaluated.reused:
         console.print(evaluated.reuse(rows), soft_wrap=True, highlight=False)
-    known = [row for row in rows_module.read(rows) if rows_module.game_of(row) == game.name]
-    found = floors([*evaluated.rows, *filter(is_floor, known)])
-    for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
-        print_table(standings_table.layouts(table), f"pinnobs tables {rows} -o FILE writes all")
-    for note in found.notes:
-        console.print(note, style="yellow", soft_wrap=True)
+    if others is None:
+        known = [row for row in rows_module.read(rows) if rows_module.game_of(row) == game.name]
+        shipped = published_floors([game.name])
+        found = floors([*evaluated.rows, *filter(is_floor, known)], shipped)
+        for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
+            print_table(standings_table.layouts(table), f"pinnobs tables {rows} -o FILE writes all")
+        for note in found.notes:
+            console.print(note, style="yellow", soft_wrap=True)
+    else:
+        comparison = compare(evaluated.rows, others)
+        hint = f"pinnobs tables {rows} {others.path} -o FILE writes all"
+        print_table(standings_table.layouts(comparison.table), hint)
+        console.print(comparison.summary + "\n", highlight=False)
     print_table([[by_state(game.source.system, evaluated.rows)]])
     drawn = evaluated.first_played if picture else None
     with Log(log_folder(out, evaluated.rows[0])) as log:

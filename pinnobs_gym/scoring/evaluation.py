@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -174,6 +174,25 @@ class Evaluated:
         return f"{self.reused} of {len(self.rows)} episodes taken from {path}"
 
 
+@dataclass(frozen=True)
+class StandIn:
+    """What plays in the place of an estimator that trains on each record: the result of a training
+    that took place earlier, on the same record."""
+
+    estimator: BaseEstimator
+    """The estimator with this result."""
+    seconds: float
+    """CPU seconds of the training, which are part of the cost of the estimates."""
+    code: Mapping[str, str]
+    """``estimator_code`` and ``estimator_hash`` of the rows of the training."""
+
+    def play(self, game: Game, seeds: Sequence[int]) -> Played:
+        """Run it on episodes, with the training as part of the cost; see `play`."""
+        played = play(game, self.estimator, seeds)
+        training = self.seconds * 1e6 / (played.record.num_samples * played.record.batch)
+        return replace(played, us_per_step=played.us_per_step + training)
+
+
 def run_episodes(
     game: Game,
     estimator: BaseEstimator,
@@ -181,7 +200,7 @@ def run_episodes(
     results: Results | None = None,
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
-    more: Callable[[Played], list[Row]] | None = None,
+    stand_in: StandIn | None = None,
 ) -> Evaluated:
     """Run and score the episodes that are not stored yet, batch by batch.
 
@@ -192,12 +211,15 @@ def run_episodes(
         results: the stored rows, and the file to which new rows are appended.
         progress: called after each batch with its number of episodes.
         label: name of the estimator in rows; its own if None.
-        more: returns further fields of the rows of a batch.
+        stand_in: what plays in its place; rows have the code that this was trained by.
     """
-    common = {**game_fields(game), **_estimator_fields(estimator, game)}
+    common = {**game_fields(game), **estimator_fields(estimator, game)}
+    if stand_in is not None:
+        common |= stand_in.code
     if label is not None:
         common |= {"estimator": label, "settings": {}}  # the label stands for the settings
-    return score_episodes(common, partial(play, game, estimator), seeds, results, progress, more)
+    plays = partial(play, game, estimator) if stand_in is None else partial(stand_in.play, game)
+    return score_episodes(common, plays, seeds, results, progress)
 
 
 def score_episodes(
@@ -319,7 +341,7 @@ def game_fields(game: Game) -> Row:
     }
 
 
-def _estimator_fields(estimator: BaseEstimator, game: Game) -> Row:
+def estimator_fields(estimator: BaseEstimator, game: Game) -> Row:
     """Return the fields of rows that say which estimator was run."""
     condition = game.name.condition
     # An estimator trained under the very condition that is scored is no match for the others.

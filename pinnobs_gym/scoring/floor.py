@@ -10,6 +10,7 @@ import hashlib
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,10 +19,15 @@ import numpy as np
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.scoring.episode_law import EpisodeLaw
-from pinnobs_gym.scoring.evaluation import Results, run_episodes
+from pinnobs_gym.scoring.evaluation import (
+    Results,
+    estimator_fields,
+    game_fields,
+    score_episodes,
+)
 from pinnobs_gym.scoring.exact_bayes import LEAST_ESS, Posterior, Posteriors, exact_bayes
 from pinnobs_gym.scoring.particle_reference import particle_reference
-from pinnobs_gym.scoring.playing import Played
+from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.row_format import FLOOR, FLOOR_WHOLE
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.record import Record
@@ -202,8 +208,10 @@ def run_floor(
         def quality(played: Played, floor: Floor = floor) -> list[Row]:
             return floor.quality(played.record)
 
+        common = {**game_fields(game), **estimator_fields(floor, game)}
         stored = Results(results, fresh=fresh)
-        rows += run_episodes(game, floor, seeds, stored, progress, more=quality).rows
+        plays = partial(play, game, floor)
+        rows += score_episodes(common, plays, seeds, stored, progress, quality).rows
     return rows
 
 

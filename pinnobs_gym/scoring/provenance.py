@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
+import json
 import math
 import platform
 from collections.abc import Mapping
@@ -119,6 +121,12 @@ def canonical(value: Any) -> Any:
     if isinstance(value, np.generic):
         return canonical(value.item())
     return getattr(value, "__qualname__", type(value).__qualname__)
+
+
+def settings_digest(settings: Any) -> str:
+    """Return a short hash that distinguishes settings, such as recipes, in names of files."""
+    text = json.dumps(canonical(settings), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 @lru_cache(maxsize=1)

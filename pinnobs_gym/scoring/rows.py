@@ -241,20 +241,33 @@ def _parsed_together(lines: list[bytes]) -> list[Any] | None:
 
 
 def load_all(paths: Iterable[Path]) -> Stored:
-    """Load several files as one; an episode in two of them counts once.
+    """Load several files as one; see `merge`.
 
     Raises:
         ValueError: in one line, as `load` does; also if a file does not exist, or two files give
             different scores of an episode.
     """
+    return merge((path, _load_existing(path)) for path in paths)
+
+
+def _load_existing(path: Path) -> Stored:
+    if not path.exists():
+        raise ValueError(f"there is no rows file {path}")
+    return load(path)
+
+
+def merge(sources: Iterable[tuple[Path, Stored]]) -> Stored:
+    """Merge the contents of several sources, each with its path or its name for messages; an
+    episode in two of them counts once.
+
+    Raises:
+        ValueError: in one line, if two sources give different scores of an episode.
+    """
     rows: dict[tuple[Any, ...], tuple[Path, Row]] = {}
     failures: dict[str, Row] = {}
     warnings: list[str] = []
     uses: list[Row] = []
-    for path in paths:
-        if not path.exists():
-            raise ValueError(f"there is no rows file {path}")
-        stored = load(path)
+    for path, stored in sources:
         failures |= {row["job"]: row for row in stored.failures}
         warnings += [stored.warning] if stored.warning else []
         uses += stored.uses
@@ -307,8 +320,12 @@ def _alike(value: Any, other: Any, rounding: float) -> bool:
 
 def _line(row: Row) -> bytes:
     first = {"schema": row["schema"]}  # the first key identifies an incomplete line
-    absent = {name for name in OPTIONAL if row.get(name) is None}
-    return json_line({n: v for n, v in (first | row).items() if n not in absent})
+    return json_line(without_absent(first | row))
+
+
+def without_absent(row: Row) -> Row:
+    """Return a row as it is stored: without the optional numbers that do not apply."""
+    return {n: v for n, v in row.items() if not (v is None and n in OPTIONAL)}
 
 
 def _is_cut(tail: bytes) -> bool:

@@ -17,6 +17,7 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.floor import FEWEST_EFFECTIVE
+from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring import rows as stored_rows
 from pinnobs_gym.scoring.evaluation import evaluate, make_estimator
@@ -58,7 +59,8 @@ def figures(repeats: int) -> Iterator[Figure]:
     for name, largest in one_score.differences().items():
         what = f"{name}: scores alone and in batches of 7, 60 and 256, largest relative difference"
         yield at_most(what, largest, "", 1e-12)
-    yield from over_floor(stored_rows.load(ROWS).rows)
+    rows = stored_rows.load(ROWS).rows
+    yield from over_floor(rows, published_floors(map(stored_rows.game_of, rows)))
 
 
 def with_fair_prior() -> Iterator[Figure]:

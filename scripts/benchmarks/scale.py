@@ -182,7 +182,7 @@ def two_over_one(repeats: int) -> Figure:
         with tempfile.TemporaryDirectory() as folder:
             jobs = plan.jobs_of(suite, Path(folder))
             start = time.perf_counter()
-            for job, error in Engine(Workers(processes)).run(jobs):
+            for job, error, _ in Engine(Workers(processes)).run(jobs):
                 assert error is None, (job, error)
             return time.perf_counter() - start
 

@@ -12,8 +12,12 @@ from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
+from pinnobs_gym.leaderboard.against import opponents
+from pinnobs_gym.leaderboard.published.reading import PUBLISHED
+from pinnobs_gym.leaderboard.published.trained import load_published
 from pinnobs_gym.scoring.evaluation import (
     Results,
     make_estimator,
@@ -32,7 +36,7 @@ class Evaluate:
     estimator: str = "ekf"
     """Name or module:Class of the estimator."""
     checkpoint: Path | None = None
-    """Trained estimator to load."""
+    """Trained estimator to load; published stands for the one that ships with the package."""
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as assumed_noise=0.1."""
     tuned: bool = False
@@ -47,6 +51,9 @@ class Evaluate:
     """Seed of the first episode."""
     fresh: bool = False
     """Run all episodes, also those whose scores are stored; the new scores replace them."""
+    against: Path | None = None
+    """Rows file among whose estimators this one is shown, on the same episodes; published stands
+    for the rows that ship with the package."""
     out: Path = Path("runs/evaluate")
     """Folder of rows and TensorBoard log."""
     video: Path | None = None
@@ -62,20 +69,29 @@ class Evaluate:
         options = settings_of(cls, self.set)
         if self.video is not None:
             check_video(self.video)
-        trained = None if self.checkpoint is None else load(cls, self.checkpoint, game)
+        trained = self._trained(cls, game)
         estimator = make_estimator(trained or cls, game, options, self.tuned)
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
+        others = None
+        if self.against is not None:
+            others = opponents(self.against, game, seeds_of(self.seed, episodes))
         check_writable(self.out)
         seeds = seeds_of(self.seed, episodes)
         results = Results(rows_file(self.out), fresh=self.fresh)
         score = partial(run_episodes, game, estimator, seeds, results)
-        report(game, with_progress(episodes, score), self.out, picture=self.episodes > 1)
+        report(game, with_progress(episodes, score), self.out, self.episodes > 1, others)
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)
             console.print(f"video: {self.video}", soft_wrap=True)
         return 0
+
+    def _trained(self, cls: type[BaseEstimator], game: Game) -> BaseEstimator | None:
+        """Return the trained estimator to score, None if it needs none."""
+        if self.checkpoint == PUBLISHED:
+            return load_published(self.estimator, game)
+        return None if self.checkpoint is None else load(cls, self.checkpoint, game)
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.cli.console import RunView, console
+from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
+from pinnobs_gym.cli.run_view import Kind, RunView
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
-from pinnobs_gym.leaderboard.jobs.floor_job import floor_jobs
+from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.evaluation import seeds_of
 from pinnobs_gym.scoring.exact_bayes import LEAST_ESS
@@ -58,10 +59,7 @@ class FloorCommand:
         path = self.out / "rows.jsonl"
         rows.load(path)  # reject a damaged file before anything is computed
         jobs = list(floor_jobs(games, seeds, self.out.absolute(), self.fresh))
-        engine = Engine(Workers(self.jobs))
-        with RunView(len(jobs), lambda: [job.name for job in engine.running]) as view:
-            for job, error in engine.run(jobs):
-                view.ended(job.name, error)
+        failed = compute(jobs, self.jobs)
         wanted = {game.name for game in games}
         few = too_few([row for row in rows.read(path) if rows.game_of(row) in wanted])
         if few:
@@ -72,13 +70,23 @@ class FloorCommand:
                 soft_wrap=True,
             )
         console.print(f"rows: {path}", soft_wrap=True)
-        return 1 if view.failed else 0
+        return 1 if failed else 0
 
     @property
     def _systems(self) -> Sequence[str]:
         if self.system:
             return self.system
         return [name for name, cls in SYSTEMS.classes().items() if len(cls.state_names) <= LARGEST]
+
+
+def compute(jobs: Sequence[FloorJob], processes: int) -> int:
+    """Compute the floors of some jobs, show the progress, and return how many jobs failed."""
+    engine = Engine(Workers(processes))
+    kinds = {job.name: Kind("floors", " ".join(job.game.name)) for job in jobs}
+    with RunView(list(kinds.values()), engine) as view:
+        for job, error, seconds in engine.run(jobs):
+            view.ended(job.name, kinds[job.name], error, seconds)
+    return view.failed
 
 
 def run(arguments: Sequence[str]) -> int:

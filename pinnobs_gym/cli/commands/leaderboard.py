@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pinnobs_gym.cli.console import RunView, console, print_table
+from pinnobs_gym.cli.console import console, print_table
 from pinnobs_gym.cli.options import parse
+from pinnobs_gym.cli.run_view import Kind, RunView
 from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.leaderboard import suites
 from pinnobs_gym.leaderboard.board import board
@@ -16,6 +18,9 @@ from pinnobs_gym.leaderboard.chapters import chapters, markdown
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.job import Job
+from pinnobs_gym.leaderboard.jobs.trainings import Outlook, training_of
+from pinnobs_gym.leaderboard.published import manifest
+from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.scoring import rows, tensorboard
 
 PROCESSES = 2
@@ -60,13 +65,56 @@ class Leaderboard:
     fresh: bool = False
     """Run all episodes, also those whose scores are stored; the new scores replace them. Trained
     files are kept."""
+    retrain: bool = False
+    """Train all estimators here; otherwise the trained files that ship with the package are used
+    where there is one of the same settings."""
     out: Path = Path("runs/leaderboard")
     """Folder of rows, tables, TensorBoard log and trained files."""
 
     def run(self) -> int:
         """Run the missing jobs, then print and write the tables."""
+        return self.play(self.planned())
+
+    def play(self, planned: Sequence[Job]) -> int:
+        """Run those of the jobs that are missing, then print and write the tables; return the exit
+        status."""
         workers = self._workers()
-        played = suites.load(self.suite).changed(
+        check_writable(self.out)
+        path = self.out / "rows.jsonl"
+        stored = rows.load(path)  # reject a damaged file before anything is run
+        if stored.warning:
+            console.print(stored.warning, style="yellow", soft_wrap=True)
+        jobs = [replace(job, fresh=self.fresh) for job in planned]
+        to_run, left_out = plan.left(jobs, stored, self.retry_failed)
+        earlier = {rows.key(row): row["date"] for row in stored.rows}
+        outlook = Outlook()
+        outdated = outlook.outdated(jobs)
+        engine = Engine(workers)
+        kinds = {_key(job): kind_of(job, outlook) for job in to_run}
+        with RunView(list(kinds.values()), engine) as view:
+            for job, error, seconds in engine.run(to_run):
+                view.ended(job.name, kinds[_key(job)], error, seconds)
+        begun = time.monotonic()
+        stored = rows.load(path)
+        self._say_reuse(to_run, view.failed, earlier, stored)
+        tensorboard.log_summaries(self.out, stored.rows)
+        self._report(stored, {job.game.name.condition for job in jobs})
+        parts = {**view.seconds(), "tables": time.monotonic() - begun}
+        times = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in parts.items())
+        console.print(f"{'time:':14} {times}", soft_wrap=True, highlight=False)
+        _say_outdated(outdated)
+        if left_out:
+            console.print(
+                f"{len(left_out)} job(s) failed before and were left out; --retry-failed runs "
+                "them again",
+                style="yellow",
+                soft_wrap=True,
+            )
+        return 1 if view.failed or left_out else 0
+
+    def planned(self) -> list[Job]:
+        """Return the jobs of the suite with the options."""
+        suite = suites.load(self.suite).changed(
             systems=self.systems,
             estimators=self.estimators,
             setup=self.setup,
@@ -77,30 +125,9 @@ class Leaderboard:
             training_seeds=self.training_seeds,
             seed=self.seed,
         )
-        check_writable(self.out)
-        path = self.out / "rows.jsonl"
-        stored = rows.load(path)  # reject a damaged file before anything is run
-        if stored.warning:
-            console.print(stored.warning, style="yellow", soft_wrap=True)
-        jobs = [replace(job, fresh=self.fresh) for job in plan.jobs_of(played, self.out.absolute())]
-        to_run, left_out = plan.left(jobs, stored, self.retry_failed)
-        earlier = {rows.key(row): row["date"] for row in stored.rows}
-        engine = Engine(workers)
-        with RunView(len(to_run), lambda: [job.name for job in engine.running]) as view:
-            for job, error in engine.run(to_run):
-                view.ended(job.name, error)
-        stored = rows.load(path)
-        self._say_reuse(to_run, view.failed, earlier, stored)
-        tensorboard.log_summaries(self.out, stored.rows)
-        self._report(stored, {job.game.name.condition for job in jobs})
-        if left_out:
-            console.print(
-                f"{len(left_out)} job(s) failed before and were left out; --retry-failed runs "
-                "them again",
-                style="yellow",
-                soft_wrap=True,
-            )
-        return 1 if view.failed or left_out else 0
+        published = None if self.retrain else manifest.FOLDER
+        jobs = plan.jobs_of(suite, self.out.absolute())
+        return [replace(job, published=published) for job in jobs]
 
     def _say_reuse(
         self,
@@ -135,7 +162,7 @@ class Leaderboard:
 
     def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
         """Print and write the results."""
-        results = board(stored)
+        results = board(stored, published_floors({rows.game_of(row) for row in stored.rows}))
         path = self.out / "leaderboard.md"
         hint = f"{path} has all"
         found = chapters(results)
@@ -166,6 +193,33 @@ class Leaderboard:
             f"to make a page: pinnobs report {self.out / 'rows.jsonl'} -o {self.out / 'site'}",
             soft_wrap=True,
         )
+
+
+def _say_outdated(outdated: Mapping[str, Sequence[str]]) -> None:
+    """Print which published trainings are of earlier code, if any are: systems by estimator."""
+    if outdated:
+        found = "; ".join(f"{name} on {', '.join(systems)}" for name, systems in outdated.items())
+        console.print(
+            f"trained by earlier code: {found}; --retrain trains anew",
+            style="yellow",
+            soft_wrap=True,
+        )
+
+
+def _key(job: Job) -> tuple[str, str]:
+    """Return what tells a job from all others of a run."""
+    return job.name, repr(job.training)
+
+
+def kind_of(job: Job, outlook: Outlook) -> Kind:
+    """Return what a job mostly does, and the name that it shares with jobs that take as long."""
+    # Some of the known keys may be of other code; then the job takes longer than estimated.
+    training = training_of(job)
+    seed = None if training is None else training.recipe.seed
+    known = {episode for _, _, trained, episode in job.known or () if trained == seed}
+    if len(known) >= job.episodes and not job.fresh:
+        return Kind("playing", f"{job.called}, stored")
+    return Kind("trainings" if outlook.will_train(job) else "playing", job.called)
 
 
 def run(arguments: Sequence[str]) -> int:

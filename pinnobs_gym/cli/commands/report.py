@@ -12,7 +12,9 @@ import tyro
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
-from pinnobs_gym.scoring import curves, rows
+from pinnobs_gym.leaderboard.published.reading import load_rows, published_floors
+from pinnobs_gym.scoring import curves
+from pinnobs_gym.scoring.rows import game_of
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class Report:
 
     rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Rows files, such as runs/leaderboard/rows.jsonl; the curves in a folder "curves" beside each
-    are drawn too."""
+    are drawn too. "published" stands for the rows that ship with the package, without curves."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("site")
     """Folder of the page, index.html."""
 
@@ -36,14 +38,15 @@ class Report:
             raise ValueError(
                 f"the page needs {error.name}: pip install 'pinnobs-gym[report]'"
             ) from None
-        stored = rows.load_all(self.rows)
+        stored = load_rows(self.rows)
         if stored.warning:
             console.print(stored.warning, style="yellow", soft_wrap=True)
         if not stored.rows:
             raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
         check_writable(self.out)
         folders = list(dict.fromkeys(map(curves.folder_of, self.rows)))
-        text = draw(page_model(stored, folders))
+        shipped = published_floors({game_of(row) for row in stored.rows})
+        text = draw(page_model(stored, folders, shipped))
         path = self.out / "index.html"
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -17,8 +17,9 @@ from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.chapters import Chapter, chapters
 from pinnobs_gym.leaderboard.display import printable
 from pinnobs_gym.leaderboard.grid import Grid, Layouts
+from pinnobs_gym.leaderboard.published.reading import load_rows, published_floors
 from pinnobs_gym.leaderboard.tables import Table
-from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.rows import game_of
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class Tables:
     environment variable COLUMNS; a pipe and a file get all columns, as other formats do."""
 
     rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Rows files, such as runs/leaderboard/rows.jsonl."""
+    """Rows files, such as runs/leaderboard/rows.jsonl; published stands for the rows that ship with
+    the package."""
     format: Literal["text", "markdown", "latex", "csv"] = "text"
     """Format; csv holds one table, and latex needs the packages that it names."""
     table: tuple[str, ...] = ()
@@ -44,10 +46,10 @@ class Tables:
         """Print or write the tables."""
         if not self.rows:
             raise ValueError("no rows file is given; such as runs/leaderboard/rows.jsonl")
-        stored = rows.load_all(self.rows)
+        stored = load_rows(self.rows)
         if not stored.rows and not stored.failures:
             raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
-        results = board(stored)
+        results = board(stored, published_floors({game_of(row) for row in stored.rows}))
         found = chapters(results)
         text = self._text(chosen(found, self.table) if self.table else found)
         for note in filter(None, (stored.warning, *results.notes)):

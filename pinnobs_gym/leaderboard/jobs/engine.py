@@ -36,6 +36,8 @@ class Ended(NamedTuple):
     job: Any
     error: str | None
     """The error in one line; None if the job succeeded."""
+    seconds: float
+    """How long it took, in s of wall-clock time."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def _ended(job: PicklableJob, outcome: Outcome) -> Ended:
     if outcome.died:
         error = " ".join(f"its process died more than once ({error})".split())
         job.fail(error)
-    return Ended(job, error)
+    return Ended(job, error, outcome.seconds)
 
 
 def _pool(workers: Workers) -> AbstractContextManager[Pool]:

@@ -3,8 +3,6 @@ rows."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -13,15 +11,16 @@ from typing import Any, Self
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator, labelled
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.files import file_name
+from pinnobs_gym.leaderboard.jobs import trainings
+from pinnobs_gym.leaderboard.published.trained import Training, opened
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.evaluation import Results, StoredKey, make_estimator, run_episodes
 from pinnobs_gym.scoring.provenance import (
-    canonical,
     estimator_code,
     game_hash,
     now,
+    settings_digest,
     training_code,
     versions,
 )
@@ -59,6 +58,9 @@ class Job:
     """Whether stored episodes are run again; see `Results`."""
     failed: bool = False
     """Whether the job failed before and is retried."""
+    published: Path | None = None
+    """Folder of published results, whose trained files are used instead of training; None to train
+    anew."""
 
     @property
     def rows(self) -> Path:
@@ -85,13 +87,13 @@ class Job:
     @property
     def digest(self) -> str:
         """Hash of the job's specification and of the code that it runs."""
-        aside = ("folder", "known", "last_use", "fresh", "failed")
+        aside = ("folder", "known", "last_use", "fresh", "failed", "published")
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in aside}
         cls = ESTIMATORS.resolve(self.estimator)
         code = [game_hash(self.game.source), estimator_code(cls)]
         if cls.needs_training is not None:
             code.append(training_code(trainer_class(cls), self.game.source))
-        return _digest({**own, "code": code})
+        return settings_digest({**own, "code": code})
 
     def run(self) -> None:
         """Append the missing rows; see `run_job`."""
@@ -134,49 +136,42 @@ def called(cls: type[BaseEstimator], training: Mapping[str, Any]) -> str:
 
 def run_job(job: Job) -> None:
     """Train the estimator if needed, evaluate it, and append the missing rows."""
-    cls = ESTIMATORS.resolve(job.estimator)
-    if cls.needs_training or cls.trains_on_record:
+    training, stand_in = trainings.training_of(job), None
+    if training is None:
+        estimator = make_estimator(job.estimator, job.game, job.settings)
+    else:
         import torch
 
         torch.set_num_threads(1)  # a job is one thread
-    options = dict(job.settings)
-    chosen: BaseEstimator | type[BaseEstimator] = cls
-    if cls.trains_on_record is not None:
-        trainer = trainer_class(cls)
-        recipe = cls.trainer_config(job.training)
-        stem = job.game.name.file_stem
-        code = training_code(trainer, job.game.source)
-        place = f"{stem}-{file_name(trainer.name)}-{_digest([recipe, code])}-episode{job.seed}"
-        options = {"config": recipe, "folder": job.folder / "trained" / place}
-    elif cls.needs_training is not None:
-        chosen = trained(cls, job)
-    estimator = make_estimator(chosen, job.game, options)
+        if training.seed is None:
+            estimator = trained(training, job)
+        else:
+            options = {"config": training.recipe, "folder": trainings.place_of(job, training)}
+            estimator = make_estimator(training.cls, job.game, options)
+            stand_in = trainings.stand_in(job, training, estimator)
     seeds = range(job.seed, job.seed + job.episodes)
     results = Results(job.rows, job.known, job.fresh, job.last_use)
-    evaluated = run_episodes(job.game, estimator, seeds, results, label=job.label)
+    evaluated = run_episodes(
+        job.game, estimator, seeds, results, label=job.label, stand_in=stand_in
+    )
     scored = [row for row in evaluated.rows if "nrmse" in row]
     if evaluated.first_played is not None:  # some episodes were not stored
         with Log(log_folder(job.folder, scored[0])) as log:
             log_episodes(log, scored, evaluated.first_played)
 
 
-def trained(cls: type[BaseEstimator], job: Job) -> BaseEstimator:
+def trained(training: Training, job: Job) -> BaseEstimator:
     """Return the estimator trained on nominal episodes that are never scored; load it if it was
-    trained before."""
-    trainer, game = trainer_class(cls), job.game.nominal
-    recipe = cls.trainer_config(job.training)
-    code = training_code(trainer, game.source)
-    label = f"{game.name.file_stem}-{file_name(trainer.name)}-{_digest([recipe, code])}"
-    path = job.folder / "trained" / f"{label}.pt"
-    if not path.exists():
-        with Log(job.folder / "tensorboard" / "training" / label) as log:
-            result = train_by_name(trainer, recipe, game, log=log)
-        if not path.exists():  # of two simultaneous trainings, the first counts
-            result.save(path)
+    trained before, in this folder or for the published results."""
+    cls, path = training.cls, trainings.place_of(job, training)
+    if path.exists():
+        return load(cls, path, job.game)
+    published = trainings.published_of(job, training)
+    if published is not None:
+        with opened(*published) as shipped:
+            return load(cls, shipped, job.game)
+    with Log(job.folder / "tensorboard" / "training" / path.stem) as log:
+        result = train_by_name(trainer_class(cls), training.recipe, training.game, log=log)
+    if not path.exists():  # of two simultaneous trainings, the first counts
+        result.save(path)
     return load(cls, path, job.game)
-
-
-def _digest(recipe: Any) -> str:
-    """Return a hash that distinguishes recipes in file names."""
-    text = json.dumps(canonical(recipe), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -61,6 +61,8 @@ class Outcome(NamedTuple):
     """Whether no other job can succeed either."""
     died: bool = False
     """Whether its process died without reporting an outcome."""
+    seconds: float = 0.0
+    """How long it took, in s of wall-clock time."""
 
 
 class Origin(NamedTuple):
@@ -90,7 +92,8 @@ def attempt(number: int, job: PicklableJob, origin: Origin) -> Outcome:
             _prepare(origin)
             outcome = _earlier_outcome(number, origin.mark)
             if outcome is None:
-                outcome = Outcome(_run(job))
+                begun = time.monotonic()
+                outcome = Outcome(_run(job), seconds=time.monotonic() - begun)
                 _note(number, outcome, origin.mark)
         except CannotWrite as error:
             return Outcome(str(error), ends_all=True)

@@ -225,7 +225,7 @@ def test_no_scheduler_is_one_line(folder, monkeypatch, capsys):
 def test_a_job_that_kills_its_process_has_failed_and_the_others_are_done(tmp_path):
     kinds = {2: "die", 4: "fail"}
     jobs = [Simple(tmp_path, i, kinds.get(i, "work")) for i in range(9)]
-    ended = {job.number: error for job, error in Engine(Workers(2)).run(jobs)}
+    ended = {job.number: error for job, error, _ in Engine(Workers(2)).run(jobs)}
     assert ended.keys() == set(range(9))
     assert ended[2].startswith("its process died more than once (exit codes {")
     assert "SIGKILL(-9)" in ended[2]
@@ -239,7 +239,7 @@ def test_jobs_that_end_are_told_and_those_that_run_are_named(tmp_path):
     found = Engine(Workers(1))
     assert found.running == []
     names = []
-    for job, error in found.run([Simple(tmp_path, i) for i in range(3)]):
+    for job, error, _ in found.run([Simple(tmp_path, i) for i in range(3)]):
         assert error is None
         names.append((job.name, [other.name for other in found.running]))
     assert [name for name, _ in names] == ["job 0", "job 1", "job 2"]
