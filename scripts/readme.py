@@ -1,11 +1,11 @@
 """Update the README's picture and table, and the tables of docs/results.md, from stored scores.
 
-    python scripts/readme.py [--rows-file runs/leaderboard/rows.jsonl]
+    python scripts/readme.py [--rows-file published]
         [--conditions-file runs/conditions/rows.jsonl]
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
         [--figures-file runs/benchmark.jsonl]
 
-The leaderboard goes to the README, the other tables to docs/results.md, and all measured figures to
+The leaderboard, of the published rows, goes to the README, the other tables to docs/results.md, and all measured figures to
 docs/benchmarks.md. Sections without stored scores are left unchanged.
 """
 
@@ -31,6 +31,7 @@ from pinnobs_gym.leaderboard import ranks_table
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.chapters import chapters
 from pinnobs_gym.leaderboard.grid import text_table
+from pinnobs_gym.leaderboard.published.reading import PUBLISHED, load_rows
 from pinnobs_gym.scoring import rows
 
 ROOT = Path(__file__).parents[1]
@@ -64,8 +65,8 @@ def summary(scored: list[rows.Row]) -> str:
     trainings = len(seeds - {None})
     intro = (
         f"Measured on {dates[-1]} with Python {platform.python_version()}, one thread a job "
-        f"({processor()}), by `make leaderboard`{_with_seeds(trainings)}, which writes the details "
-        "of each system to `runs/leaderboard/leaderboard.md`."
+        f"({processor()}), {trainings} trainings of each estimator that is trained before. "
+        "`pinnobs tables published` prints the details of each system."
     )
     parts = [intro]
     for chapter in chapters(board(rows.Stored(scored, []))):
@@ -73,14 +74,6 @@ def summary(scored: list[rows.Row]) -> str:
             grid = chapter.tables[0][0][0]
             parts += [chapter.note, text_table(grid.header, grid.lines)]
     return "\n\n".join(parts)
-
-
-def _with_seeds(trainings: int) -> str:
-    """Return how the trainings of several seeds were added."""
-    if trainings <= 1:
-        return ""
-    seeds = " ".join(map(str, range(trainings)))
-    return f" and `pinnobs leaderboard --training-seeds {seeds}`"
 
 
 def under_conditions(scored: list[rows.Row]) -> str:
@@ -115,7 +108,7 @@ def _rewrite(path: Path, sections: Mapping[str, str]) -> None:
 
 
 def main(
-    rows_file: Path = ROOT / "runs/leaderboard/rows.jsonl",
+    rows_file: Path = PUBLISHED,
     paper_file: Path = ROOT / "runs/paper/results.jsonl",
     conditions_file: Path = ROOT / "runs/conditions/rows.jsonl",
     comparison_file: Path = ROOT / "runs/paper/comparison.md",
@@ -124,20 +117,20 @@ def main(
     """Rewrite the picture and the tables.
 
     Args:
-        rows_file: the leaderboard's scores.
+        rows_file: the leaderboard's scores, or ``published`` for those of the package.
         paper_file: the results of reproduce_paper.py.
         conditions_file: scores under every condition.
         comparison_file: the table that reproduce_paper.py comparison wrote.
         figures_file: output of benchmark.py.
     """
-    scored = rows.read(rows_file)
+    scored = load_rows([rows_file]).rows
     section = paper.readme_section(paper.read(paper_file), TABLES.values())
     figures = measured.read(figures_file)
     compared = comparison_file.read_text(encoding="utf-8") if comparison_file.exists() else ""
     everywhere = rows.read(conditions_file)
     if not (scored or everywhere or section or compared or figures):
         print(
-            f"nothing in {rows_file}, {paper_file} or {figures_file}; run make leaderboard, "
+            f"nothing in {rows_file}, {paper_file} or {figures_file}; run make publish, "
             "reproduce_paper.py or benchmark.py",
             file=sys.stderr,
         )

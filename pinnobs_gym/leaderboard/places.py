@@ -16,8 +16,9 @@ from pinnobs_gym.leaderboard.tie_groups import ranks_of, tie_groups
 from pinnobs_gym.scoring.tuned import SUFFIX
 
 PEERS = ("ukf" + SUFFIX, "ukf")
-"""The estimators with which all others are compared: of those that played, the first of those with
-the most episodes."""
+"""The estimators with which all others are compared: of those that played the most episodes, the
+one with the smaller steady errors. The tuned one is the worse of the two where a system is ranked
+under another condition than that under which it was tuned, as the motor is."""
 FEWEST = 50
 """Fewest episodes of a game that are ranked under a condition other than nominal and that which
 the system is ranked under."""
@@ -110,10 +111,21 @@ def peer_of(contenders: Sequence[Contender]) -> Contender | None:
     the online one with the most rows; None if there is none."""
     online = [contender for contender in contenders if contender.track == "online"]
     named = [each for name in PEERS for each in online if each.name == name]
-    # The tuned one only if it played all that the other did, or else games would be left out.
-    return max(
-        named or online, key=lambda each: sum(len(run.rows) for run in each.runs), default=None
-    )
+    if not named:
+        return max(online, key=_num_rows, default=None)
+    # Only one that played all that the other did, or else games would be left out.
+    most = max(map(_num_rows, named))
+    return min((each for each in named if _num_rows(each) == most), key=_steady)
+
+
+def _num_rows(contender: Contender) -> int:
+    return sum(len(run.rows) for run in contender.runs)
+
+
+def _steady(contender: Contender) -> float:
+    """Return the mean over comparable games of the mean log of the steady errors."""
+    games = _comparable(contender)
+    return float(np.mean([contender.errors[game].logs["steady"].mean() for game in games]))
 
 
 def _comparable(contender: Contender) -> list[GameName]:

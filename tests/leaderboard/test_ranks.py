@@ -101,13 +101,15 @@ def test_without_the_peer_the_first_online_estimator_stands_in():
     assert main_part(rows_of("s", NOISY[0], track="offline")).places.peer == ""
 
 
-def test_the_peer_is_the_tuned_ukf_if_it_played_as_much_as_the_other():
+def test_the_peer_is_the_better_ukf_of_those_that_played_the_most():
     ukf, tuned = rows_of("ukf", NOISY[0]), rows_of("ukf, tuned", NOISY[0] / 2)
     part = main_part([*ukf, *tuned])
     assert part.places.peer == "ukf, tuned"
     found = {line.estimator: line.places["steady"].factor.value for line in part.lines}
     assert found == {"ukf": pytest.approx(2), "ukf, tuned": 1}
     assert main_part([*ukf, *tuned[:-1]]).places.peer == "ukf"
+    worse = rows_of("ukf, tuned", NOISY[0] * 2)
+    assert main_part([*ukf, *worse]).places.peer == "ukf"
     assert main_part([*ukf, *tuned, *rows_of("ukf", NOISY[1], **MOTOR)]).places.peer == "ukf"
     assert main_part([*tuned, *rows_of("a", NOISY[1])]).places.peer == "ukf, tuned"
 
