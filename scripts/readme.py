@@ -5,8 +5,8 @@
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
         [--figures-file runs/benchmark.jsonl]
 
-The leaderboard, of the published rows, goes to the README, the other tables to docs/results.md, and all measured figures to
-docs/benchmarks.md. Sections without stored scores are left unchanged.
+The leaderboard, of the published rows, goes to the README, the other tables to docs/results.md, and
+all measured figures to docs/benchmarks.md. Sections without stored scores are left unchanged.
 """
 
 from __future__ import annotations
