@@ -92,6 +92,9 @@ class Floor(OfflineEstimator):
 class ExactBayes(Floor):
     """The posterior mean given the outputs up to each sample (`exact_bayes`)."""
 
+    given: str = "outputs so far"
+    """What the posterior is conditioned on."""
+
     name = "exact_bayes"
     track = FLOOR
 
@@ -122,6 +125,10 @@ class ExactBayes(Floor):
 @dataclass(frozen=True)
 class ExactBayesSmoother(ExactBayes):
     """The posterior mean given all outputs of the record (`exact_bayes`)."""
+
+    given: str = "all outputs"
+    """What the posterior is conditioned on. As it differs from `ExactBayes.given`, so do the hashes
+    of the two in rows."""
 
     name = "exact_bayes_smoother"
     track = FLOOR_WHOLE
