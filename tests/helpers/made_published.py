@@ -3,12 +3,14 @@
 from pathlib import Path
 from typing import NamedTuple
 
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.job import Job, run_job
 from pinnobs_gym.leaderboard.published.manifest import Manifest
 from pinnobs_gym.leaderboard.published.packing import pack
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.floor import run_floor
 
 KKL = {"trajectories": 40, "samples": 20, "iterations": 4, "width": 6, "patience": 1.0}
 NETWORK = {"depth": 2, "width": 8, "iterations": 3}
@@ -44,5 +46,6 @@ def make(folder):
     for job in jobs:
         run_job(job)
     path = folder / "run" / "rows.jsonl"
+    run_floor(Game.of("ReverseDuffing"), range(2), path)
     packed = pack(jobs, rows.load(path), folder / "published", SUITE.training_seeds)
     return Made(jobs, path, folder / "published", packed)

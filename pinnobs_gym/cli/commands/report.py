@@ -12,6 +12,7 @@ import tyro
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
+from pinnobs_gym.leaderboard.published import manifest
 from pinnobs_gym.leaderboard.published.reading import load_rows, published_floors
 from pinnobs_gym.scoring import curves
 from pinnobs_gym.scoring.rows import game_of
@@ -45,6 +46,7 @@ class Report:
             raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")
         check_writable(self.out)
         folders = list(dict.fromkeys(map(curves.folder_of, self.rows)))
+        folders.append(manifest.FOLDER / manifest.CURVES)
         shipped = published_floors({game_of(row) for row in stored.rows})
         text = draw(page_model(stored, folders, shipped))
         path = self.out / "index.html"

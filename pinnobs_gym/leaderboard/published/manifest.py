@@ -18,12 +18,14 @@ FOLDER = Path(__file__).parent
 """The folder of the results that ship with the package."""
 FORMAT = 1
 """Version of the format of published results."""
+CURVES = "curves"
+"""The folder of errors over time, as `pinnobs_gym.scoring.curves` writes it."""
 _NAME = "published.json"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedFile:
-    """A published file, compressed by xz."""
+    """A published file, compressed."""
 
     file: str
     """Its path in the folder."""
@@ -90,6 +92,8 @@ class Manifest:
     """Training seeds of the rows; the trained files are those of the first."""
     rows: tuple[PublishedRows, ...]
     trained: tuple[PublishedTraining, ...]
+    curves: tuple[PublishedFile, ...] = ()
+    """Errors over time of the floors, in the folder `CURVES`."""
 
     @classmethod
     def read(cls, folder: Path) -> Manifest | None:
@@ -117,7 +121,7 @@ class Manifest:
         try:
             parts = {
                 name: tuple(_made(kind, entry) for entry in content.pop(name))
-                for name, kind in (("rows", PublishedRows), ("trained", PublishedTraining))
+                for name, kind in _KINDS.items()
             }
             return _made(cls, content | parts | {"folder": folder})
         except (KeyError, TypeError, ValueError) as error:
@@ -155,6 +159,9 @@ class Manifest:
                 f"{path} is not the published file: its SHA-256 differs; install the package again"
             )
         return lzma.decompress(data)
+
+
+_KINDS = {"rows": PublishedRows, "trained": PublishedTraining, "curves": PublishedFile}
 
 
 def _made(kind: Any, content: Any) -> Any:

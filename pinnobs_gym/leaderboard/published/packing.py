@@ -6,8 +6,9 @@ import hashlib
 import lzma
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pinnobs_gym.envs.game import GameName
@@ -16,13 +17,20 @@ from pinnobs_gym.leaderboard.floor import is_floor
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.jobs.trainings import place_of, training_of
 from pinnobs_gym.leaderboard.published.columns import packed
-from pinnobs_gym.leaderboard.published.manifest import Manifest, PublishedRows, PublishedTraining
+from pinnobs_gym.leaderboard.published.manifest import (
+    CURVES,
+    Manifest,
+    PublishedFile,
+    PublishedRows,
+    PublishedTraining,
+)
 from pinnobs_gym.leaderboard.published.on_record import record_hash
 from pinnobs_gym.leaderboard.published.trained import Training
+from pinnobs_gym.scoring.curves import folder_of, merged, read, save
 from pinnobs_gym.scoring.evaluation import make_estimator
 from pinnobs_gym.scoring.provenance import estimator_code, estimator_hash, now, versions
 from pinnobs_gym.scoring.recency import LastUse
-from pinnobs_gym.scoring.rows import Row, Stored, game_of
+from pinnobs_gym.scoring.rows import Row, Stored, game_of, seed_of
 
 LARGEST = 10_000_000
 """Largest number of bytes of all published files."""
@@ -35,7 +43,7 @@ class _Packed:
     """A file that is ready to be written."""
 
     entry: Any
-    """Its `PublishedRows` or `PublishedTraining`."""
+    """Its `PublishedRows`, `PublishedTraining` or `PublishedFile`."""
     data: bytes
 
 
@@ -62,7 +70,10 @@ def pack(
             f"{len(stored.failures)} job(s) failed, such as {row['estimator']} on "
             f"{', '.join(game_of(row))}: {row['error']}; nothing is published"
         )
-    files = [*_rows_files(stored, {job.game.name for job in jobs}), *_trained_files(jobs, seeds[0])]
+    rows_files = list(_rows_files(stored, {job.game.name for job in jobs}))
+    floors = {file.entry.game for file in rows_files if file.entry.floor}
+    curves_files = list(_curves_files(stored, floors, jobs[0].folder))
+    files = [*rows_files, *_trained_files(jobs, seeds[0]), *curves_files]
     _check_size(files, largest)
     for file in files:
         with replacing(to / file.entry.file) as temporary:
@@ -75,10 +86,11 @@ def pack(
         training_seeds=seeds,
         rows=tuple(entry for entry in entries if isinstance(entry, PublishedRows)),
         trained=tuple(entry for entry in entries if isinstance(entry, PublishedTraining)),
+        curves=tuple(file.entry for file in curves_files),
     )
     manifest.write()
     kept = {to / entry.file for entry in entries}
-    for path in [*to.glob("rows/*.xz"), *to.glob("trained/*.xz")]:
+    for path in [*to.glob("rows/*.xz"), *to.glob("trained/*.xz"), *to.glob(f"{CURVES}/**/*.npz")]:
         if path not in kept:  # of what was published before
             path.unlink()
     return manifest
@@ -113,6 +125,28 @@ def _rows_file(game: GameName, runs: Sequence[Sequence[Row]], floor: bool) -> _P
 
 def _line(rows: Sequence[Row]) -> bytes:
     return json_line({"rows": len(rows), "columns": packed(rows)})
+
+
+def _curves_files(stored: Stored, games: set[GameName], folder: Path) -> Iterator[_Packed]:
+    """Yield the errors over time of the floors of some games, without the Cramér-Rao reference, a
+    file for each floor."""
+    own = folder_of(folder / "rows.jsonl")
+    for game in sorted(games):
+        known = read(own, game)
+        runs: dict[tuple[str, str], list[Row]] = defaultdict(list)
+        for row in stored.rows:
+            if is_floor(row) and game_of(row) == game:
+                runs[row["game_hash"], row["estimator_hash"]].append(row)
+        for hashes, rows in runs.items():
+            whole = merged(known.get(hashes, []), map(seed_of, rows))
+            if whole is None:
+                continue
+            with TemporaryDirectory() as temporary:
+                save(Path(temporary), rows[0], replace(whole, reference=None))
+                (path,) = Path(temporary).rglob("*.npz")
+                data, file = path.read_bytes(), f"{CURVES}/{path.relative_to(temporary).as_posix()}"
+            facts = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+            yield _Packed(PublishedFile(file=file, **facts, **game._asdict()), data)
 
 
 def _trained_files(jobs: Sequence[Job], seed: int) -> Iterator[_Packed]:

@@ -5,14 +5,15 @@ import json
 import lzma
 import math
 
+import numpy as np
 import pytest
 from made_rows import rows_of
 
 from pinnobs_gym.leaderboard.published.columns import packed, rounded, unpacked
 from pinnobs_gym.leaderboard.published.manifest import Manifest
 from pinnobs_gym.leaderboard.published.packing import pack
-from pinnobs_gym.leaderboard.published.reading import rows_in
-from pinnobs_gym.scoring import rows
+from pinnobs_gym.leaderboard.published.reading import published_floors, rows_in
+from pinnobs_gym.scoring import curves, rows
 from pinnobs_gym.scoring.metrics import DIVERGED
 
 SEEDS = (0, 1)
@@ -23,7 +24,7 @@ def test_published_rows_are_those_that_were_played_up_to_rounding(made):
     played = rows.load(made.rows)
     published = rows_in(made.manifest, made.manifest.rows)
     assert {rows.key(row) for row in published} == {rows.key(row) for row in played.rows}
-    assert len(published) == len(played.rows) == 4 + 4 + 2 * 4 + 2
+    assert len(published) == len(played.rows) == 4 + 4 + 2 * 4 + 2 + 2 * 2
     both = rows.merge([("a", played), ("b", rows.Stored(published, []))])
     assert both.rows == played.rows
 
@@ -31,13 +32,30 @@ def test_published_rows_are_those_that_were_played_up_to_rounding(made):
 def test_the_list_has_the_hash_and_the_size_of_every_file(made):
     listed = json.loads((made.folder / "published.json").read_text())
     files = {path for path in made.folder.rglob("*") if path.is_file()}
-    assert len(files) == 1 + len(listed["rows"]) + len(listed["trained"])
-    for entry in listed["rows"] + listed["trained"]:
+    entries = listed["rows"] + listed["trained"] + listed["curves"]
+    assert len(files) == 1 + len(entries)
+    for entry in entries:
         data = (made.folder / entry["file"]).read_bytes()
         assert hashlib.sha256(data).hexdigest() == entry["sha256"]
         assert len(data) == entry["size"]
     assert listed["training_seeds"] == [0, 1]
     assert {"python", "torch", "numpy"} < listed["versions"].keys()
+
+
+def test_floors_are_published_with_their_errors_over_time(made):
+    games = [entry.game for entry in made.manifest.rows if entry.floor]
+    found = published_floors(games, made.folder)
+    assert sorted((row["estimator"], row["episode"]) for row in found) == [
+        (name, f"seed:{seed}")
+        for name in ("exact_bayes", "exact_bayes_smoother")
+        for seed in (0, 1)
+    ]
+    assert published_floors([], made.folder) == []
+    played = curves.read(curves.folder_of(made.rows), games[0])
+    published = curves.read(made.folder / "curves", games[0])
+    assert published.keys() == {(row["game_hash"], row["estimator_hash"]) for row in found}
+    for hashes, (own,) in published.items():
+        np.testing.assert_array_equal(own.error, curves.merged(played[hashes], [0, 1]).error)
 
 
 def test_trained_files_are_those_of_the_first_training_seed(made):
@@ -83,7 +101,7 @@ def test_what_was_published_before_is_removed_at_the_end(made, copy):
     (copy / "rows" / "old.xz").write_bytes(b"")
     pack(made.jobs, rows.load(made.rows), copy, SEEDS)
     assert not (copy / "rows" / "old.xz").exists()
-    assert {path.name for path in copy.iterdir()} == {"published.json", "rows", "trained"}
+    assert {path.name for path in copy.iterdir()} == {"published.json", "rows", "trained", "curves"}
 
 
 def test_a_missing_trained_file_is_told(made, copy):
