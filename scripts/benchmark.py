@@ -1,8 +1,8 @@
 """Print measured figures, one JSON line each: group, figure, value, unit, asked, holds, date.
 
-    python scripts/benchmark.py [core ...] [--repeats 5] >> runs/benchmark.jsonl
+    python scripts/benchmark.py [core ...] [--repeats 5] > docs/figures/core.jsonl
 
-`scripts/readme.py` makes tables from such a file, with the last line of each figure.
+`scripts/readme.py` makes tables from such files, one of each group.
 
 Speeds are ratios to a named peer, measured alternately in one run: one thread, CPU time, the median
 of the repeats. Figures that miss their bound are printed like the others; this is not a test. A

@@ -16,18 +16,12 @@ from pinnobs_gym.leaderboard.grid import markdown_table
 HEADER = ("figure", "measured", "asked")
 
 
-def read(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """Read the figures of a file by group, with the last line of each figure."""
-    if not path.exists():
-        return {}
-    figures: dict[tuple[str, str], dict[str, Any]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        figure = json.loads(line)
-        figures[figure["group"], figure["figure"]] = figure
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for (group, _), figure in figures.items():
-        groups.setdefault(group, []).append(figure)
-    return dict(sorted(groups.items()))
+def read(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """Read the figures of a folder by group, a file ``GROUP.jsonl`` each."""
+    return {
+        path.stem: [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        for path in sorted(folder.glob("*.jsonl"))
+    }
 
 
 def cells(figures: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
@@ -45,7 +39,8 @@ def page(groups: dict[str, list[dict[str, Any]]]) -> str:
     parts = ["# Measured figures", _intro(groups)]
     for group, figures in groups.items():
         what = (_module(group).__doc__ or "").strip()
-        parts += [f"## {group}", what, markdown_table(HEADER, cells(figures))]
+        when = f"Measured on {_dates(figures)}."
+        parts += [f"## {group}", what, when, markdown_table(HEADER, cells(figures))]
     return "\n\n".join(parts) + "\n"
 
 
@@ -69,12 +64,17 @@ def readme_section(groups: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def _intro(groups: dict[str, list[dict[str, Any]]]) -> str:
-    dates = sorted({figure["date"] for figures in groups.values() for figure in figures})
-    when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    when = _dates([figure for figures in groups.values() for figure in figures])
     return (
         f"Measured on {when} by `python scripts/benchmark.py`, one thread, CPU time "
         f"(Python {platform.python_version()}, {processor()})."
     )
+
+
+def _dates(figures: Sequence[dict[str, Any]]) -> str:
+    """Return when some figures were measured: a date, or the first and the last."""
+    dates = sorted({figure["date"] for figure in figures})
+    return dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
 
 
 def _module(group: str) -> Any:

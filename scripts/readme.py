@@ -3,7 +3,7 @@
     python scripts/readme.py [--rows-file published]
         [--conditions-file runs/conditions/rows.jsonl]
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
-        [--figures-file runs/benchmark.jsonl]
+        [--figures docs/figures]
 
 The leaderboard, of the published rows, goes to the README, the other tables to docs/results.md, and
 all measured figures to docs/benchmarks.md. Sections without stored scores are left unchanged.
@@ -112,7 +112,7 @@ def main(
     paper_file: Path = ROOT / "runs/paper/results.jsonl",
     conditions_file: Path = ROOT / "runs/conditions/rows.jsonl",
     comparison_file: Path = ROOT / "runs/paper/comparison.md",
-    figures_file: Path = ROOT / "runs/benchmark.jsonl",
+    figures: Path = ROOT / "docs/figures",
 ) -> int:
     """Rewrite the picture and the tables.
 
@@ -121,16 +121,16 @@ def main(
         paper_file: the results of reproduce_paper.py.
         conditions_file: scores under every condition.
         comparison_file: the table that reproduce_paper.py comparison wrote.
-        figures_file: output of benchmark.py.
+        figures: folder of the output of benchmark.py, a file of each group.
     """
     scored = load_rows([rows_file]).rows
     section = paper.readme_section(paper.read(paper_file), TABLES.values())
-    figures = measured.read(figures_file)
+    found = measured.read(figures)
     compared = comparison_file.read_text(encoding="utf-8") if comparison_file.exists() else ""
     everywhere = rows.read(conditions_file)
-    if not (scored or everywhere or section or compared or figures):
+    if not (scored or everywhere or section or compared or found):
         print(
-            f"nothing in {rows_file}, {paper_file} or {figures_file}; run make publish, "
+            f"nothing in {rows_file}, {paper_file} or {figures}; run make publish, "
             "reproduce_paper.py or benchmark.py",
             file=sys.stderr,
         )
@@ -142,12 +142,12 @@ def main(
         "conditions": under_conditions(everywhere) if everywhere else "",
         "paper": section,
         "comparison": compared.partition("\n\n")[2].strip(),  # under the page's own heading
-        "figures": measured.readme_section(figures) if figures else "",
+        "figures": measured.readme_section(found) if found else "",
     }
     _rewrite(ROOT / "docs" / "results.md", sections)
-    if figures:
+    if found:
         with replacing(ROOT / "docs" / "benchmarks.md") as temporary:
-            temporary.write_text(measured.page(figures), encoding="utf-8")
+            temporary.write_text(measured.page(found), encoding="utf-8")
     return 0
 
 

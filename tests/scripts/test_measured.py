@@ -13,17 +13,16 @@ def groups(tmp_path):
         return dict(zip(fields, (group, figure, value, "x", asked, holds, date), strict=True))
 
     lines = [
-        line("slow", 0.5, ">= 1", False, date="2026-01-01"),
-        line("slow", 1.5, ">= 1", True),
+        line("slow", 1.5, ">= 1", True, date="2026-01-01"),
         line("missed", 2, ">= 3", False),
         line("free", 4),
     ]
-    path = tmp_path / "figures.jsonl"
+    path = tmp_path / "core.jsonl"
     path.write_text("".join(json.dumps(each) + "\n" for each in lines))
-    return measured.read(path)
+    return measured.read(tmp_path)
 
 
-def test_the_last_line_of_a_figure_counts(groups):
+def test_a_file_has_the_figures_of_its_group(groups):
     assert [(f["figure"], f["value"]) for f in groups["core"]] == [
         ("slow", 1.5),
         ("missed", 2),
@@ -34,7 +33,7 @@ def test_the_last_line_of_a_figure_counts(groups):
 def test_the_readme_says_what_holds_and_what_is_missed(groups):
     section = measured.readme_section(groups)
     assert "| `core` | 1 of 2 | missed: 2 x, asked >= 3 |" in section
-    assert "Measured on 2026-01-02 by" in section
+    assert "Measured on 2026-01-01 to 2026-01-02 by" in section
 
 
 def test_the_page_has_every_figure(groups):
@@ -43,5 +42,5 @@ def test_the_page_has_every_figure(groups):
     assert "| free | 4 x |  |" in page
 
 
-def test_no_file_is_no_figures(tmp_path):
+def test_no_folder_is_no_figures(tmp_path):
     assert measured.read(tmp_path / "none") == {}
