@@ -65,7 +65,7 @@ class Publish:
             return status
         stored = rows.load(self.out / "rows.jsonl")
         packed = pack(jobs, stored, self.to, self.training_seeds)
-        size = sum(file.size for file in (*packed.rows, *packed.trained))
+        size = sum(file.size for file in (*packed.rows, *packed.trained, *packed.curves))
         console.print(
             f"published: {sum(entry.rows for entry in packed.rows)} rows of {len(packed.rows)} "
             f"games and {len(packed.trained)} trained files, {size / 1e6:.2f} MB, in {self.to}",

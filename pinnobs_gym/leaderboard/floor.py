@@ -90,15 +90,16 @@ def floors(rows: Sequence[Row], shipped: Sequence[Row] = ()) -> Floors:
     """Return the floors of the games of some rows.
 
     Of several floors of an episode the most precise counts: exact Bayes before a particle
-    reference, then the larger effective sample size or the smaller Monte-Carlo error. A floor of
-    another ``game_hash`` than the estimators' rows of its game is left out with a note.
+    reference, then the larger effective sample size or the smaller Monte-Carlo error. Of those in
+    ``rows`` that different code computed, only the latest count. A floor of another ``game_hash``
+    than the estimators' rows of its game is left out with a note.
 
     Args:
         rows: scored episodes of estimators and floors; those of a game have one ``game_hash``
             (`pinnobs_gym.leaderboard.distinct`).
         shipped: further rows of floors; those of games that are not in ``rows`` do not count.
     """
-    own = [row for row in rows if is_floor(row)]
+    own = _of_latest_code([row for row in rows if is_floor(row)])
     hashes = {game_of(row): row["game_hash"] for row in [*own, *contending(rows)]}
     known = [row for row in [*own, *shipped] if game_of(row) in hashes]
     older: Counter[tuple[GameName, str]] = Counter()
@@ -116,6 +117,21 @@ def floors(rows: Sequence[Row], shipped: Sequence[Row] = ()) -> Floors:
         for (game, other), count in sorted(older.items())
     )
     return Floors({key: Floor(rows) for key, rows in chosen.items()}, notes)
+
+
+def _of_latest_code(rows: Sequence[Row]) -> list[Row]:
+    """Return the floors that were computed by the code of the latest one of their game, track and
+    kind: those of earlier code may be precise and wrong."""
+    latest: dict[tuple[GameName, str, bool], tuple[str, str]] = {}
+    for row in rows:
+        kind = game_of(row), row["track"], is_particles(row)
+        version = row["date"], row["estimator_code"]
+        latest[kind] = max(latest.get(kind, version), version)
+    return [
+        row
+        for row in rows
+        if row["estimator_code"] == latest[game_of(row), row["track"], is_particles(row)][1]
+    ]
 
 
 def _precision(row: Row) -> tuple[bool, float, float]:
@@ -149,7 +165,8 @@ def over_floor(parts: Mapping[str, tuple[Sequence[Row], Floor]], window: str) ->
 
     Returns:
         None if a system has fewer than `FEWEST_COMMON` episodes that the floor and all trainings
-        have, or a floor of zero; also without systems.
+        have, a floor of zero or, in the steady window, a floor that lies between states which no
+        output tells apart; also without systems.
     """
     pairs = {system: _paired(*own, window) for system, own in parts.items()}
     found = {system: pair for system, pair in pairs.items() if pair is not None}
@@ -167,8 +184,15 @@ def over_floor(parts: Mapping[str, tuple[Sequence[Row], Floor]], window: str) ->
 
 def _paired(rows: Sequence[Row], floor: Floor, window: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the errors (training seeds, episodes) of the episodes that the floor and all trainings
-    have, and the floor (episodes,); None if there are too few or the floor is zero."""
+    have, and the floor (episodes,); None if there are too few, the floor is zero, or it bounds
+    nothing."""
     name = _SCORES[window]
+    if window == "steady" and any(
+        not np.isclose(row[name], row["nrmse_steady"], rtol=ROUNDING) for row in floor.rows.values()
+    ):
+        # The mean over states that no output tells apart has the least error from the true one, but
+        # not from the nearest of them.
+        return None
     least = {episode: row[name] for episode, row in floor.rows.items() if np.isfinite(row[name])}
     if len(least) < FEWEST_COMMON:
         return None

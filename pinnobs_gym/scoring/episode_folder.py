@@ -6,6 +6,7 @@ from which estimates that are brought back are scored (`pinnobs_gym.scoring.subm
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -25,6 +26,8 @@ from pinnobs_gym.scoring.provenance import game_hash
 
 GAME_FILE = "game.json"
 """The file that identifies the game and its episodes."""
+_HASHES = "sha256"
+"""The entry of this file that has the hash of each table."""
 
 
 def write_folder(
@@ -54,6 +57,7 @@ def write_folder(
         _write_tables(made, issue, progress)
         for name, text in texts.items():
             (made / name).write_text(text, encoding="utf-8", newline="\n")
+        facts |= {_HASHES: {name: _sha256(made / name) for name in issue.tables}}
         text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
         (made / GAME_FILE).write_text(text + "\n", encoding="utf-8", newline="\n")
     return True
@@ -64,7 +68,7 @@ def is_there(folder: Path, facts: Mapping[str, Any]) -> bool:
     not exist.
 
     Raises:
-        ValueError: in one line, if it holds anything else.
+        ValueError: in one line, if it holds anything else, or a table is not as it was written.
     """
     if not folder.exists():
         return False
@@ -76,13 +80,28 @@ def is_there(folder: Path, facts: Mapping[str, Any]) -> bool:
         found = _read_facts(folder)
     except ValueError:
         raise ValueError(f"folder {folder} holds other files; expected a new folder") from None
+    hashes = found.pop(_HASHES, None)
     if found != json.loads(json.dumps(facts)):
         differing = [name for name in facts if found.get(name) != facts[name]]
         raise ValueError(
             f"folder {folder} holds other records ({', '.join(differing[:3]) or 'more'} differ); "
             "expected a new folder"
         )
+    for name in found["tables"]:
+        if not isinstance(hashes, dict) or hashes.get(name) != _sha256(folder / name):
+            raise ValueError(
+                f"{folder / name} is missing or not as it was written; expected a new folder"
+            )
     return True
+
+
+def _sha256(path: Path) -> str | None:
+    """Return the hash of a file; None if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None
 
 
 @contextmanager

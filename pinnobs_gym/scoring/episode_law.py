@@ -15,8 +15,8 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import truth
 
 _LEAST = 1e-12
-"""Smallest variance of a component of the initial state, relative to the largest in scaled units,
-that counts as more than rounding."""
+"""Smallest variance that counts as more than rounding: of a component of the initial state relative
+to the largest in scaled units, and of a combination of outputs relative to their own."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,10 @@ class EpisodeLaw:
                 of `trajectories` then.
 
         Raises:
-            ValueError: in one line, if its likelihood is not known: with process noise, without
-                output noise, from a fixed initial state or a list of them, with angles among the
-                states, or under a condition whose plants cannot be listed.
+            ValueError: in one line, if its likelihood is not known: with process noise, with an
+                output or a combination of outputs without noise, from a fixed initial state or a
+                list of them, with angles among the states, or under a condition whose plants cannot
+                be listed.
         """
         name, system = type(source.system).__name__, source.system
         if source.noise.stochastic and not process_noise:
@@ -52,8 +53,15 @@ class EpisodeLaw:
         law = cls(source, source.condition.plants(system))
         source.start.log_density(source.start.mean)  # raises if there is none
         R = law._R
-        if not (np.diagonal(R, axis1=1, axis2=2) > 0).all():
+        std = np.sqrt(np.diagonal(R, axis1=1, axis2=2))
+        if not (std > 0).all():
             raise ValueError(f"{name} has an output without noise, which has no likelihood")
+        correlations = R / (std[:, :, None] * std[:, None])
+        if np.linalg.eigvalsh(correlations).min() < _LEAST:
+            raise ValueError(
+                f"{name} has a combination of outputs without noise, which has no likelihood; "
+                "expected a covariance of the output noise that is positive definite"
+            )
         if law._errors and (R * np.eye(system.ny) != R).any():
             raise ValueError(f"{name} has correlated output noise and outliers; expected one")
         return law
@@ -66,9 +74,13 @@ class EpisodeLaw:
 
     @cached_property
     def _R(self) -> np.ndarray:
-        """Covariances of the output noise, shape (num_samples, ny, ny)."""
+        """Covariances of the noise of the outputs in the order in which they are received, shape
+        (num_samples, ny, ny)."""
         noise, times = self.source.noise, self.source.times[:-1]
-        return np.array([noise.R(float(t))[..., 0] for t in times])
+        sent = np.array([noise.R(float(t))[..., 0] for t in times])
+        received = self.source.condition.arrival(sent)
+        # Where none is received, no covariance counts.
+        return np.where(np.isnan(received), sent, received)
 
     @cached_property
     def _errors(self) -> tuple[tuple[float, np.ndarray], ...]:

@@ -200,7 +200,8 @@ class _Sampler:
             earlier = x0[self._plant == i]
             mixture = Mixture.fitted(earlier[:, free], weight / weight.sum(), self.rng)
             number = max(1, round(share[i] * count))
-            drawn = np.tile(law.source.start.mean, (number, 1))
+            # Components that do not vary are those of any draw; conditions may have scaled them.
+            drawn = np.tile(x0[0], (number, 1))
             drawn[:, free] = mixture.draw(number, self.rng)
             log_prior = law.log_prior(drawn)
             allowed = np.isfinite(log_prior)

@@ -168,6 +168,8 @@ class ParticleReference(Floor):
         return _LATEST[key]
 
 
+FLOORS = tuple(cls.name for cls in (ExactBayes, ExactBayesSmoother, ParticleReference))
+"""The names of floors in rows."""
 _LATEST: dict[Any, Any] = {}
 """The result for the latest record."""
 

@@ -21,10 +21,12 @@ from pinnobs_gym.estimation.estimator import Estimates, OfflineEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.episode_table import Cells, read_cells
 from pinnobs_gym.scoring.evaluation import Evaluated, Results, game_fields, score_episodes
+from pinnobs_gym.scoring.floor import FLOORS
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.provenance import versions
 from pinnobs_gym.scoring.row_format import NAME_EXPECTED, SUBMITTED, Row, is_name
 from pinnobs_gym.scoring.sample_cells import finite_or_lost, match_samples, not_negative
+from pinnobs_gym.scoring.tuned import SUFFIX
 from pinnobs_gym.simulation.code_hash import content, digest
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.training.trainer import TRAINING_SEED
@@ -117,9 +119,11 @@ def check_name(name: str) -> None:
     """Check the name of a submission.
 
     Raises:
-        ValueError: in one line, if it cannot stand in rows, or is that of an estimator here.
+        ValueError: in one line, if it cannot stand in rows, or is that of an estimator here, tuned
+            or not, or of a floor.
     """
-    if name.partition(" (")[0] in ESTIMATORS.sources:
+    plain = name.partition(" (")[0].removesuffix(SUFFIX)
+    if plain in ESTIMATORS.sources or plain in FLOORS:
         raise ValueError(f"name={name!r} is that of an estimator of this package; expected another")
     if not is_name(name):
         raise ValueError(f"name={name!r}; expected {NAME_EXPECTED}")

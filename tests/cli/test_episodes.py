@@ -19,6 +19,7 @@ from pinnobs_gym.cli.model_code import equations_text, matlab_model
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring.metrics import SCORES
+from pinnobs_gym.scoring.submitted import check_name
 from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems import SYSTEMS
 
@@ -87,6 +88,23 @@ def test_records_are_those_of_the_game_with_all_digits_and_without_the_truth(fol
         assert said in text
     assert "u1(t) = u1_amplitude*cos(t*u_frequency)" in text
     assert ("30 % of the outputs missing" in text) == (condition == "dropout30")
+
+
+def test_records_that_are_not_as_they_were_written_are_not_taken_for_them(folder, capsys):
+    command = ("episodes", "--system", "ReverseDuffing", "--episodes", 1, "-o", "records")
+    assert run(*command) == 0
+    table = folder / "records/records.csv"
+    for damage in (lambda: table.write_text("episode,t,y1\n"), table.unlink):
+        damage()
+        capsys.readouterr()
+        assert run(*command) == 2
+        assert error(capsys).startswith("records/records.csv is missing or not as it was written")
+
+
+@pytest.mark.parametrize("name", ["ekf", "ekf, tuned", "ukf (fast)", "exact_bayes"])
+def test_a_submission_has_a_name_of_its_own(name):
+    with pytest.raises(ValueError, match="is that of an estimator of this package"):
+        check_name(name)
 
 
 def test_every_system_has_a_folder_and_the_same_again_is_said(folder, capsys):

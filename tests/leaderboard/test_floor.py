@@ -114,7 +114,7 @@ def test_intervals_cover_the_ratio(seeds, spread, width):
             for k in range(50)
         ]
         below = {
-            f"{k}": {"episode": f"{k}", "nrmse_steady_modulo": value}
+            f"{k}": {"episode": f"{k}", "nrmse_steady": value, "nrmse_steady_modulo": value}
             for k, value in enumerate(np.exp(least / 2))
         }
         found = over_floor({"": (rows, Floor(below))}, "steady")
@@ -204,6 +204,24 @@ def test_of_several_floors_of_an_episode_the_most_precise_counts():
     own = found.by_game[GAME, FLOOR].rows
     assert [own[f"seed:{i}"]["nrmse"] for i in (0, 11, 12)] == [0.1, 0.1, 0.2]
     assert found.notes == ()
+
+
+def test_of_floors_of_several_codes_the_latest_counts():
+    """A mended floor is used even if the wrong one had more effective draws."""
+    wrong = exact([0.1] * 12, effective_sample_size=5000.0, estimator_code="a", date="2026-01-01")
+    mended = exact([0.3] * 12, estimator_code="b", date="2026-01-02")
+    for rows in ([*wrong, *mended], [*mended, *wrong]):
+        found = floor.floors(rows).by_game[GAME, FLOOR].rows
+        assert {row["nrmse"] for row in found.values()} == {0.3}
+
+
+def test_a_mean_between_states_that_no_output_tells_apart_bounds_no_error_modulo_these():
+    """Of x = 1 or -1 the mean 0 has the least error from the truth, 1; but an estimate of 1 has the
+    error 0 modulo the sign, so that a ratio to that of 0 says nothing."""
+    between = [row | {"nrmse_steady_modulo": 0.9} for row in exact([1.0] * 12)]
+    (table,) = main_of([*rows_of("ukf", [0.2] * 12), *between]).tables
+    assert table.entries[0].standing.over_floor_steady is None
+    assert table.entries[0].standing.over_floor_transient is not None
 
 
 def test_the_note_says_how_precise_the_floor_is():

@@ -26,6 +26,7 @@ from pinnobs_gym.scoring.exact_bayes import LEAST_ESS, exact_bayes
 from pinnobs_gym.scoring.floor import floors_of, run_floor, too_few
 from pinnobs_gym.scoring.particle_reference import particle_reference
 from pinnobs_gym.scoring.proposals import Mixture
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.start_law import Gaussian
 from pinnobs_gym.simulation.system import Setup, stack
 
@@ -247,9 +248,69 @@ def test_the_particle_reference_is_the_kalman_filter_within_its_error():
     )
 
 
+class Quieter(Noise):
+    """Correlated output noise whose standard deviation is a fifth from 0.3 s on."""
+
+    def G(self, t):
+        return super().G(t) * (0.2 if t > 0.25 else 1.0)
+
+
+@dataclass(frozen=True)
+class Fading(Started):
+    """With noise that depends on time."""
+
+    setups = {"benchmark": replace(Started.setups["benchmark"], noise_std=((0.4, 0.0), (0.3, 0.3)))}
+
+    def noise(self, noise_std=None, process_noise=None):
+        usual = super().noise(noise_std, process_noise)
+        return Quieter(usual.process, usual.output, usual.samples)
+
+
+def test_delayed_outputs_have_the_noise_of_when_they_were_measured():
+    """Against least squares of the outputs measured three samples earlier, each weighted by the
+    noise of its time, on the exact solution exp(At)x₀."""
+    source = EpisodeSource(Fading, condition="delay3")
+    record = record_of(source, 2)
+    found = exact_bayes(EpisodeLaw.of(source), record).filtered
+    for row in range(2):
+        information, weighted = np.linalg.inv(COV), np.linalg.solve(COV, MEAN)
+        for k in range(record.num_samples):
+            if k >= 3:
+                C = H @ expm(A * source.times[k - 3])
+                R = source.noise.R(float(source.times[k - 3]))[..., 0]
+                information = information + C.T @ np.linalg.solve(R, C)
+                weighted = weighted + C.T @ np.linalg.solve(R, record.y[row, k])
+            moved = expm(A * source.times[k])
+            xhat = moved @ np.linalg.solve(information, weighted)
+            std = np.sqrt(np.diag(moved @ np.linalg.solve(information, moved.T)))
+            # Five standard errors of as many independent draws.
+            error = 5 / np.sqrt(found.ess[row, k])
+            assert (abs(found.mean[row, k] - xhat) < error * std).all()
+            np.testing.assert_allclose(np.diag(found.cov[row, k]), std**2, rtol=1.5 * error)
+
+
+@dataclass(frozen=True)
+class PartlyKnown(Linear):
+    """The linear plant, whose first state begins at 0.5."""
+
+    setups = {"benchmark": replace(Linear.setups["benchmark"], x0_low=(0.5, -1), x0_high=(0.5, 1))}
+
+
+def test_a_known_component_is_that_of_the_condition():
+    """Outside the set it is 1.5 times as large."""
+    source = EpisodeSource(PartlyKnown, condition="x0_outside")
+    found = exact_bayes(EpisodeLaw.of(source), record_of(source, 1))
+    assert found.smoothed.mean[0, 0, 0] == pytest.approx(0.75, abs=1e-12)
+    assert found.filtered.ess.min() >= LEAST_ESS
+
+
 @pytest.mark.parametrize(
     ("source", "told"),
     [
+        (
+            lambda: EpisodeSource(Linear, noise_std=((0.1, 0.0), (0.3, 0.0))),
+            "Linear has a combination of outputs without noise",
+        ),
         (lambda: EpisodeSource(Linear, noise_std=0.0), "without noise"),
         (lambda: EpisodeSource(Disturbed), "has process noise"),
         (lambda: EpisodeSource("ReverseDuffing", "paper"), "a known state"),
