@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pinnobs_gym.cli.console import console, print_table, progress
@@ -11,12 +11,12 @@ from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.against import Opponents, compare
 from pinnobs_gym.leaderboard.contenders import contenders
 from pinnobs_gym.leaderboard.floor import floors, is_floor
-from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.states_table import by_state
 from pinnobs_gym.leaderboard.tables import tables
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.evaluation import Evaluated
+from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_folder, log_summary
 from pinnobs_gym.training.log import Log
 
@@ -46,6 +46,7 @@ def report(
     out: Path,
     picture: bool = True,
     others: Opponents | None = None,
+    shipped: Sequence[Row] = (),
 ) -> None:
     """Print the tables of scored episodes, and log them for TensorBoard.
 
@@ -56,13 +57,13 @@ def report(
         picture: whether to log a picture of the first one, which takes as long as all else of one
             episode.
         others: scores among which they are shown, if any.
+        shipped: the published floors of the game.
     """
     rows = rows_file(out)
     if evaluated.reused:
         console.print(evaluated.reuse(rows), soft_wrap=True, highlight=False)
     if others is None:
         known = [row for row in rows_module.read(rows) if rows_module.game_of(row) == game.name]
-        shipped = published_floors([game.name])
         found = floors([*evaluated.rows, *filter(is_floor, known)], shipped)
         for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
             print_table(standings_table.layouts(table), f"pinnobs tables {rows} -o FILE writes all")

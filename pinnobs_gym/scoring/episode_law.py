@@ -110,7 +110,8 @@ class EpisodeLaw:
     def trajectories(
         self, plant: System, x0: np.ndarray, num_samples: int, u: np.ndarray
     ) -> np.ndarray:
-        """Return the states (num_samples, count, nx) of a plant from initial states (count, nx).
+        """Return the states (num_samples, count, nx) of a plant from initial states (count, nx),
+        NaN from those from which it leaves the finite numbers.
 
         Args:
             plant: one of the plants.
@@ -118,14 +119,27 @@ class EpisodeLaw:
             num_samples: number of samples from the first on.
             u: inputs of the episode, shape (at least num_samples, nu).
         """
-        source = self.source
-        times = source.times[:num_samples]
         if num_samples == 1:
             return x0[None]
         inputs = None
-        if source.system.draws_input:
+        if self.source.system.draws_input:
             inputs = np.repeat(u[:num_samples, None], len(x0), axis=1)
-        return truth(plant, x0, times, source.setup.truth_step, inputs=inputs)
+        times = self.source.times[:num_samples]
+        try:
+            return truth(plant, x0, times, self.step, inputs=inputs)
+        except FloatingPointError:
+            if len(x0) == 1:
+                return np.full((num_samples, *x0.shape), np.nan)
+            # The others of the batch are simulated apart from it.
+            halves = np.array_split(x0, 2)
+            parts = [self.trajectories(plant, half, num_samples, u) for half in halves]
+            return np.concatenate(parts, axis=1)
+
+    @property
+    def step(self) -> float:
+        """The simulation's longest step in s, as for whole episodes."""
+        times = self.source.times
+        return self.source.setup.truth_step or float(times[-1] - times[0]) / 100
 
     def log_likelihood(
         self, plant: System, x: np.ndarray, y: np.ndarray, u: np.ndarray, first: int = 0
@@ -139,33 +153,47 @@ class EpisodeLaw:
             y: received outputs of the episode, NaN where missing, shape (at least num_samples, ny).
             u: inputs, shape (at least num_samples, nu).
             first: index of the first sample; above 0 only where outputs arrive at once.
+
+        Raises:
+            ValueError: in one line, if the plant has no output at some finite state.
         """
         num_samples = len(x)
         part = slice(first, first + num_samples)
         times, u = self.source.times[part, None], u[:num_samples, None]
-        sent = plant.h(times, x, np.broadcast_to(u, (*x.shape[:2], u.shape[-1])))
+        with np.errstate(all="ignore"):  # of states that are not finite
+            sent = plant.h(times, x, np.broadcast_to(u, (*x.shape[:2], u.shape[-1])))
+        lost = ~np.isfinite(x).all(axis=-1)
+        if np.isnan(sent[~lost]).any():
+            name = type(plant).__name__
+            raise ValueError(f"{name}.h has no output at some states; expected one at all of them")
         received = self.source.condition.arrival(sent)
+        nothing = np.isnan(self.source.condition.arrival(np.zeros((num_samples, sent.shape[-1]))))
+        present = ~np.isnan(y[:num_samples]) & ~nothing
         off = residual(y[:num_samples, None], received, plant.output_period)
-        if self._errors:
-            return self._with_errors(off)
-        result = np.zeros(off.shape[:2])
-        present = ~np.isnan(y[:num_samples]) & ~np.isnan(received[:, 0])
-        R = self._R[part]
+        off = np.where(present[:, None] & ~lost[..., None], off, np.nan)
+        density = self._with_errors(off) if self._errors else self._gaussian(off, part)
+        return np.where(lost, -np.inf, density)
+
+    def _gaussian(self, off: np.ndarray, part: slice) -> np.ndarray:
+        """Return the log-likelihood (num_samples, count) of deviations (num_samples, count, ny) of
+        the outputs of some samples, NaN where there is none."""
+        R, known = self._R[part], np.where(np.isnan(off), 0.0, off)
         if (np.eye(R.shape[-1]) * R == R).all():
             # Independent outputs: the squares add.
             variances = np.diagonal(R, axis1=1, axis2=2)[:, None]
-            return -0.5 * np.where(present[:, None], off**2 / variances, 0.0).sum(axis=-1)
-        for k in range(num_samples):
-            have = present[k]
+            return -0.5 * (known**2 / variances).sum(axis=-1)
+        result = np.zeros(off.shape[:2])
+        for k in range(len(off)):
+            have = ~np.isnan(off[k]).all(axis=0)
             if have.any():
                 root = np.linalg.cholesky(R[k][np.ix_(have, have)])
-                white = np.linalg.solve(root, off[k][:, have].T)
+                white = np.linalg.solve(root, known[k][:, have].T)
                 result[k] = -0.5 * (white**2).sum(axis=0)
         return result
 
     def _with_errors(self, off: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood (num_samples, count) of deviations (num_samples, count, ny) of
-        outputs that have errors beyond their noise: per output, a mixture of Gaussians."""
+        """Return the same of outputs that have errors beyond their noise: per output, a mixture of
+        Gaussians."""
         variances = np.diagonal(self._R[: len(off)], axis1=1, axis2=2)[:, None]
         rest = 1 - sum(probability for probability, _ in self._errors)
         parts = []

@@ -103,8 +103,7 @@ class _Draws:
     def moments(self, weight: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
         """Return means (k, nx) and covariances (k, nx, nx) of the states at some samples, given
         weights (k, count) or (1, count)."""
-        used = np.any(weight > 0, axis=0)
-        x = np.where(used[:, None], self.x[part], 0.0)
+        x = np.where(np.isfinite(self.x[part]), self.x[part], 0.0)  # such states have no weight
         mean = np.matmul(weight[:, None], x)[:, 0]
         off = x - mean[:, None]
         return mean, np.matmul((weight[..., None] * off).transpose(0, 2, 1), off)

@@ -85,9 +85,8 @@ def _filtered(
             inputs = None
             if system.draws_input:
                 inputs = np.repeat(u[k - 1 : k + 1, None], len(x), axis=1)
-            step = source.setup.truth_step
-            x = disturbed_truth(system, noise, x, times[k - 1 : k + 1], drawn, step, None, inputs)
-            x = x[-1]
+            ends = times[k - 1 : k + 1]
+            x = disturbed_truth(system, noise, x, ends, drawn, law.step, None, inputs)[-1]
         # Weigh the particles by the outputs.
         likelihood = law.log_likelihood(system, x[None], y[k : k + 1], u[k : k + 1], first=k)[0]
         weight = np.exp(likelihood - likelihood.max())

@@ -28,7 +28,7 @@ from pinnobs_gym.scoring.particle_reference import particle_reference
 from pinnobs_gym.scoring.proposals import Mixture
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.start_law import Gaussian
-from pinnobs_gym.simulation.system import Setup, stack
+from pinnobs_gym.simulation.system import Setup, independent, stack
 
 MEAN, COV = (1.0, -2.0), ((0.5, -0.3), (-0.3, 0.4))
 
@@ -212,6 +212,49 @@ def test_its_covariance_is_that_of_its_errors_under_the_law(condition):
         error = episodes.x[:-1][k] - found.mean[:, k]
         square = np.einsum("bi,bij,bj->b", error, np.linalg.inv(found.cov[:, k]), error)
         assert 1.1 < square.mean() < 3.1
+
+
+@dataclass(frozen=True)
+class Escaping(Linear):
+    """A plant that leaves the finite numbers from states beyond 0.45, which none of the law is."""
+
+    setups = {
+        "benchmark": Setup(
+            x0_law=Gaussian((0.0, 0.0), independent(0.01, 0.01)),
+            duration=1.6,
+            dt=0.1,
+            noise_std=0.1,
+        )
+    }
+
+    def f(self, t, x, u):
+        return stack(x, 60 * x[..., 0] ** 3 - 0.2 * x[..., 0], -x[..., 1])
+
+
+def test_draws_from_which_the_plant_leaves_the_finite_numbers_have_no_weight():
+    source = EpisodeSource(Escaping)
+    law, u = EpisodeLaw.of(source), np.zeros((17, 0))
+    x = law.trajectories(law.plants[0], np.array([[0.01, 0.1], [2.0, 0.1], [-0.02, 0.0]]), 16, u)
+    assert np.isnan(x[:, 1]).all()
+    assert np.isfinite(x[:, ::2]).all()
+    density = law.log_likelihood(law.plants[0], x, np.zeros((16, 2)), u)
+    assert (density[:, 1] == -np.inf).all()
+    assert np.isfinite(density[:, ::2]).all()
+
+
+@dataclass(frozen=True)
+class Silent(Linear):
+    """Without an output at some states."""
+
+    def h(self, t, x, u):
+        return stack(x, np.where(x[..., 0] > 0, x[..., 0], np.nan), x[..., 1])
+
+
+def test_a_plant_that_withholds_outputs_by_its_state_is_refused():
+    law = EpisodeLaw.of(EpisodeSource(Linear))
+    x = np.array([[[0.5, 0.1], [-0.5, 0.1]]])
+    with pytest.raises(ValueError, match=r"Silent.h has no output at some states"):
+        law.log_likelihood(Silent(), x, np.zeros((1, 2)), np.zeros((1, 0)))
 
 
 def test_what_estimators_are_told_does_not_matter():

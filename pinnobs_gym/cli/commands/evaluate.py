@@ -16,7 +16,7 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.against import opponents
-from pinnobs_gym.leaderboard.published.reading import PUBLISHED
+from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
 from pinnobs_gym.leaderboard.published.trained import load_published
 from pinnobs_gym.scoring.evaluation import (
     Results,
@@ -77,11 +77,12 @@ class Evaluate:
         others = None
         if self.against is not None:
             others = opponents(self.against, game, seeds_of(self.seed, episodes))
+        shipped = published_floors([game.name])  # reject what is damaged before anything is run
         check_writable(self.out)
         seeds = seeds_of(self.seed, episodes)
         results = Results(rows_file(self.out), fresh=self.fresh)
         score = partial(run_episodes, game, estimator, seeds, results)
-        report(game, with_progress(episodes, score), self.out, self.episodes > 1, others)
+        report(game, with_progress(episodes, score), self.out, self.episodes > 1, others, shipped)
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)
             console.print(f"video: {self.video}", soft_wrap=True)

@@ -84,6 +84,8 @@ class Leaderboard:
         stored = rows.load(path)  # reject a damaged file before anything is run
         if stored.warning:
             console.print(stored.warning, style="yellow", soft_wrap=True)
+        games = {job.game.name for job in planned} | {rows.game_of(row) for row in stored.rows}
+        shipped = published_floors(games)  # reject what is damaged there, too
         jobs = [replace(job, fresh=self.fresh) for job in planned]
         to_run, left_out = plan.left(jobs, stored, self.retry_failed)
         earlier = {rows.key(row): row["date"] for row in stored.rows}
@@ -98,7 +100,7 @@ class Leaderboard:
         stored = rows.load(path)
         self._say_reuse(to_run, view.failed, earlier, stored)
         tensorboard.log_summaries(self.out, stored.rows)
-        self._report(stored, {job.game.name.condition for job in jobs})
+        self._report(stored, shipped, {job.game.name.condition for job in jobs})
         parts = {**view.seconds(), "tables": time.monotonic() - begun}
         times = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in parts.items())
         console.print(f"{'time:':14} {times}", soft_wrap=True, highlight=False)
@@ -160,9 +162,11 @@ class Leaderboard:
             raise ValueError(f"jobs={self.jobs}; expected at least 1")
         return Workers(self.jobs or PROCESSES)
 
-    def _report(self, stored: rows.Stored, conditions: set[str]) -> None:
-        """Print and write the results."""
-        results = board(stored, published_floors({rows.game_of(row) for row in stored.rows}))
+    def _report(
+        self, stored: rows.Stored, shipped: Sequence[rows.Row], conditions: set[str]
+    ) -> None:
+        """Print and write the results; ``shipped`` are the published floors."""
+        results = board(stored, shipped)
         path = self.out / "leaderboard.md"
         hint = f"{path} has all"
         found = chapters(results)

@@ -14,6 +14,7 @@ from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.files import check_writable
+from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.scoring.episode_folder import read_folder
 from pinnobs_gym.scoring.evaluation import Results
 from pinnobs_gym.scoring.submitted import (
@@ -54,9 +55,11 @@ class Score:
         game, seeds = read_folder(self.records or self.file.parent, self.system)
         estimates = read_estimates(self.file, game, seeds)
         submission = Submission(self.name, seeds, estimates, self.track, self.knows)
+        shipped = published_floors([game.name])
         check_writable(self.out)
         score = partial(score_submission, game, submission, Results(rows_file(self.out)))
-        report(game, with_progress(len(seeds), score), self.out, picture=len(seeds) > 1)
+        evaluated = with_progress(len(seeds), score)
+        report(game, evaluated, self.out, picture=len(seeds) > 1, shipped=shipped)
         console.print(
             f"track {submission.track!r}: whether the estimates are causal cannot be checked, so "
             "that they are ranked among submitted ones alone",
