@@ -162,7 +162,7 @@ class EpisodeLaw:
         times, u = self.source.times[part, None], u[:num_samples, None]
         with np.errstate(all="ignore"):  # of states that are not finite
             sent = plant.h(times, x, np.broadcast_to(u, (*x.shape[:2], u.shape[-1])))
-        lost = ~np.isfinite(x).all(axis=-1)
+        lost = ~np.all(np.isfinite(x), axis=-1)
         if np.isnan(sent[~lost]).any():
             name = type(plant).__name__
             raise ValueError(f"{name}.h has no output at some states; expected one at all of them")
@@ -184,7 +184,7 @@ class EpisodeLaw:
             return -0.5 * (known**2 / variances).sum(axis=-1)
         result = np.zeros(off.shape[:2])
         for k in range(len(off)):
-            have = ~np.isnan(off[k]).all(axis=0)
+            have = ~np.all(np.isnan(off[k]), axis=0)
             if have.any():
                 root = np.linalg.cholesky(R[k][np.ix_(have, have)])
                 white = np.linalg.solve(root, known[k][:, have].T)
