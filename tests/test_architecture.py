@@ -56,10 +56,11 @@ def test_importing_the_package_imports_no_system() -> None:
 
 @pytest.mark.parametrize("name", ESTIMATORS.sources)
 def test_an_estimator_is_resolved_alone(name: str) -> None:
-    """Neither the others nor what they need are imported."""
+    """Neither the others, but for those that it derives from, nor what they need are imported."""
     code = f"from pinnobs_gym.estimators import ESTIMATORS\nESTIMATORS.resolve({name!r})"
     source = ESTIMATORS.sources[name]
-    others = {each.module for each in ESTIMATORS.sources.values()} - {source.module}
+    own = {each.__module__ for each in ESTIMATORS.resolve(name).__mro__}
+    others = {each.module for each in ESTIMATORS.sources.values()} - {source.module, *own}
     learns = {"needs_training", "trains_on_record"} & set(source.constants)
     assert others
     assert not loaded(code, *(() if learns else HEAVY), *others)
@@ -69,6 +70,8 @@ def test_the_leaderboard_loads_no_statistics_before_they_are_computed() -> None:
     paths = [path.relative_to(ROOT.parent) for path in (ROOT / "leaderboard").rglob("*.py")]
     names = [".".join(path.with_suffix("").parts) for path in paths]
     assert {"pinnobs_gym.leaderboard.ranks", "pinnobs_gym.leaderboard.site.page"} < set(names)
+    # It plays networks, and is imported where there is one.
+    names.remove("pinnobs_gym.leaderboard.published.on_record")
     assert not loaded("\n".join(f"import {name}" for name in names), *HEAVY)
 
 

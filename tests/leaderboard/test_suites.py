@@ -11,6 +11,7 @@ from pinnobs_gym.leaderboard import suites
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.job import trained
 from pinnobs_gym.leaderboard.jobs.plan import jobs_of
+from pinnobs_gym.leaderboard.jobs.trainings import training_of
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.rows import Stored, seed_of
@@ -240,20 +241,20 @@ def test_of_two_trainings_at_the_same_time_the_first_counts(tmp_path, monkeypatc
     small = {"depth": 1, "width": 4, "iterations": 5}
     entry = (Entry("pinn_obs_replay", None, small),)
     (job,) = jobs_of(Suite(("Academic",), entry, ("nominal",)), tmp_path)
-    cls = ESTIMATORS.resolve("pinn_obs_replay")
+    training = training_of(job)
     train, found = train_by_name, []
 
     def slow(*arguments, **options):
         result = train(*arguments, **options)
         if not found:
             found.append(None)
-            trained(cls, job)  # as another process does meanwhile
+            trained(training, job)  # as another process does meanwhile
             (path,) = (tmp_path / "trained").iterdir()
             found.append((path, written(path)))
         return result
 
     monkeypatch.setattr("pinnobs_gym.leaderboard.jobs.job.train_by_name", slow)
-    trained(cls, job)
+    trained(training, job)
     path, before = found[1]
     assert list((tmp_path / "trained").iterdir()) == [path]
     assert written(path) == before

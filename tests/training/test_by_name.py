@@ -7,6 +7,7 @@ from pinnobs_gym import evaluate
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.pinn_gain import PinnGain
 from pinnobs_gym.leaderboard.jobs.job import Job, trained
+from pinnobs_gym.leaderboard.jobs.trainings import training_of
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.training.by_name import train_by_name, trainer_of
 from pinnobs_gym.training.trainer import first_episode
@@ -33,7 +34,7 @@ def test_a_leaderboard_trains_under_nominal_whatever_is_scored(tmp_path):
         job = Job(
             Game.of("ReverseDuffing", condition=condition), "pinn_gain", 1, 0, tmp_path, SMALL
         )
-        estimator = trained(PinnGain, job)
+        estimator = trained(training_of(job), job)
         assert estimator.trained.condition == "nominal"
         files |= set((tmp_path / "trained").iterdir())
     assert len(files) == 1

@@ -9,10 +9,8 @@ import numpy as np
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.pinn_obs import PinnObs, TrainedNetwork
 from pinnobs_gym.leaderboard.published.manifest import Manifest, PublishedTraining
-from pinnobs_gym.leaderboard.published.trained import opened
+from pinnobs_gym.leaderboard.published.trained import opened, record_hash
 from pinnobs_gym.scoring.evaluation import StandIn
-from pinnobs_gym.simulation.code_hash import content
-from pinnobs_gym.simulation.code_source import digest
 from pinnobs_gym.simulation.record import Record
 
 NEAR = 1e-6
@@ -29,11 +27,6 @@ class TrainedBefore(PinnObs):
 
     def fit(self, record: Record) -> list[TrainedNetwork]:
         return list(self.networks)
-
-
-def record_hash(record: Record) -> str:
-    """Return the hash of all that an estimator is given of an episode."""
-    return digest(content([record.t, record.y, record.u, record.prior.mean, record.prior.cov]))
 
 
 def stand_in(

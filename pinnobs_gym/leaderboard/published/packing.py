@@ -24,8 +24,7 @@ from pinnobs_gym.leaderboard.published.manifest import (
     PublishedRows,
     PublishedTraining,
 )
-from pinnobs_gym.leaderboard.published.on_record import record_hash
-from pinnobs_gym.leaderboard.published.trained import Training
+from pinnobs_gym.leaderboard.published.trained import Training, record_hash
 from pinnobs_gym.scoring.curves import folder_of, merged, read, save
 from pinnobs_gym.scoring.evaluation import make_estimator
 from pinnobs_gym.scoring.provenance import estimator_code, estimator_hash, now, versions

@@ -16,6 +16,9 @@ from pinnobs_gym.leaderboard.published.manifest import Manifest, PublishedTraini
 from pinnobs_gym.leaderboard.published.reading import present
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.provenance import canonical, settings_digest, training_code
+from pinnobs_gym.simulation.code_hash import content
+from pinnobs_gym.simulation.code_source import digest
+from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training import by_name
 
@@ -73,6 +76,11 @@ def opened(published: Manifest, entry: PublishedTraining) -> Iterator[Path]:
         path = Path(folder) / Path(entry.file).stem
         path.write_bytes(data)
         yield path
+
+
+def record_hash(record: Record) -> str:
+    """Return the hash of all that an estimator is given of an episode."""
+    return digest(content([record.t, record.y, record.u, record.prior.mean, record.prior.cov]))
 
 
 def load(name: str, system: str | type[System], setup: str = "benchmark") -> BaseEstimator:

@@ -258,7 +258,7 @@ def test_what_cannot_be_written_ends_the_run(tmp_path):
 def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "SEEN_AFTER", 0.1)
     origin = Origin(1, "client", str(tmp_path), tmp_path / "elsewhere" / ".running", children=False)
-    error, ends_all, _ = worker.attempt(5, Simple(tmp_path, 5), origin)
+    error, ends_all, *_ = worker.attempt(5, Simple(tmp_path, 5), origin)
     assert ends_all
     here = socket.gethostname()
     told = f"the worker on {here} does not see folder {tmp_path / 'elsewhere'} of client; expected"
