@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from pinnobs_gym.scoring.recency import LastUse, facts_of
 from pinnobs_gym.scoring.rows import Row, game_of
+from pinnobs_gym.scoring.tuned import TUNED
 
 _SHOWN = 6
 """Number of characters of a hash that are shown."""
@@ -76,7 +77,7 @@ def _of_present_games(rows: Sequence[Row], last_use: LastUse) -> tuple[list[Row]
 def _named_by_difference(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]:
     """Return rows whose estimators are renamed where several have one name; dates are those of the
     last use of each row's code."""
-    keys = [(name_of(row), json.dumps(facts_of(row), sort_keys=True)) for row in rows]
+    keys = [(name_of(row), json.dumps(_facts(row), sort_keys=True)) for row in rows]
     last: dict[tuple[str, str], str] = {}
     for key, date in zip(keys, dates, strict=True):
         last[key] = max(last.get(key, date), date)
@@ -90,6 +91,13 @@ def _named_by_difference(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]
         row | {"estimator": f"{row['estimator']} ({suffixes[key]})"} if key in suffixes else row
         for row, key in zip(rows, keys, strict=True)
     ]
+
+
+def _facts(row: Row) -> dict[str, Any]:
+    """Return what may differ between estimators of one name, over all games. The settings of a
+    tuned one are those of each system."""
+    facts = facts_of(row)
+    return {"code": facts["code"]} if TUNED in row["knows"] else facts
 
 
 def _difference(facts: Mapping[str, Any], plain: Mapping[str, Any]) -> str:

@@ -117,3 +117,22 @@ def test_no_two_lines_of_a_table_look_alike():
         "ekf (run c)": "1",
         "gain": "2 × 1",  # training seeds are one line
     }
+
+
+def test_tuned_settings_differ_between_systems_but_not_in_one():
+    """Of one system, those that were used last keep the name."""
+
+    def tuned(noise, **changes):
+        options = {"assumed_noise": noise}
+        own = {"options": options, "estimator_hash": f"hash{noise}", "knows": ["tuned"], **changes}
+        return rows_of("ekf, tuned", [1.0], **own)
+
+    other = {"env_id": "pinnobs/Y-v0"}
+    found = distinct([*tuned(0.1), *tuned(0.2, **other)]).rows
+    assert [row["estimator"] for row in found] == ["ekf, tuned", "ekf, tuned"]
+    found = distinct([*tuned(0.1, **NEW), *tuned(0.2), *tuned(0.2, **other)]).rows
+    assert [row["estimator"] for row in found] == [
+        "ekf, tuned",
+        "ekf, tuned (run hash0.)",
+        "ekf, tuned",
+    ]
