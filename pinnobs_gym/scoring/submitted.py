@@ -125,7 +125,7 @@ def check_name(name: str) -> None:
     plain = name.partition(" (")[0].removesuffix(SUFFIX)
     if plain in ESTIMATORS.sources or plain in FLOORS:
         raise ValueError(f"name={name!r} is that of an estimator of this package; expected another")
-    if not is_name(name):
+    if not (is_name(name) and name.isprintable()):
         raise ValueError(f"name={name!r}; expected {NAME_EXPECTED}")
 
 

@@ -11,6 +11,7 @@ from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.run_view import Kind, RunView
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files import check_writable
+from pinnobs_gym.leaderboard.floor import is_floor
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs
 from pinnobs_gym.scoring import rows
@@ -57,11 +58,17 @@ class FloorCommand:
             floors_of(game)  # raises for a game without a floor, before anything is computed
         check_writable(self.out)
         path = self.out / "rows.jsonl"
-        rows.load(path)  # reject a damaged file before anything is computed
+        earlier = {rows.key(row): row["date"] for row in rows.read(path)}  # reject a damaged file
         jobs = list(floor_jobs(games, seeds, self.out.absolute(), self.fresh))
         failed = compute(jobs, self.jobs)
         wanted = {game.name for game in games}
-        few = too_few([row for row in rows.read(path) if rows.game_of(row) in wanted])
+        found = [row for row in rows.read(path) if rows.game_of(row) in wanted and is_floor(row)]
+        taken = sum(earlier.get(rows.key(row)) == row["date"] for row in found)
+        if taken:
+            console.print(
+                f"{taken} of {len(found)} rows were in {path}", soft_wrap=True, highlight=False
+            )
+        few = too_few(found)
         if few:
             console.print(
                 f"{len(few)} episodes have an effective sample size below {LEAST_ESS:.0f}; "
