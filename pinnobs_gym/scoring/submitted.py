@@ -126,7 +126,7 @@ def check_name(name: str) -> None:
     if plain in ESTIMATORS.sources or plain in FLOORS:
         raise ValueError(f"name={name!r} is that of an estimator of this package; expected another")
     if not (is_name(name) and name.isprintable()):
-        raise ValueError(f"name={name!r}; expected {NAME_EXPECTED}")
+        raise ValueError(f"name={name!r}; expected {NAME_EXPECTED}, printable")
 
 
 def read_estimates(path: Path, game: Game, seeds: range) -> Estimates:
