@@ -33,6 +33,18 @@ def registries_as_they_were():
         del gym.registry[name]
 
 
+@pytest.fixture(scope="session")
+def no_results(tmp_path_factory):
+    """An empty folder of published results."""
+    return tmp_path_factory.mktemp("published")
+
+
+@pytest.fixture(autouse=True)
+def nothing_published(monkeypatch, no_results):
+    """What a test finds does not depend on the results that ship with the package."""
+    monkeypatch.setattr("pinnobs_gym.leaderboard.published.manifest.FOLDER", no_results)
+
+
 @pytest.fixture
 def ticking(monkeypatch):
     """CPU time goes on by 0.01 s whenever it is looked at, on a machine of any speed."""
