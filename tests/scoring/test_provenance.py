@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from copied import Copied
 from edited import EDITS, FILES, write
 from stored_rows import row
 
@@ -83,14 +84,6 @@ def test_settings_noise_and_model_are_part_of_the_estimator():
     assert estimator_hash(EKF(system)) == estimator_hash(
         EKF(system, (0.02,), [[0.0, 0.0], [0.0, 0.0]])
     )
-
-
-class Copied:
-    def reset(self, xhat0, P0):
-        self.xhat = xhat0
-
-    def update(self, t, y, u):
-        return self.xhat
 
 
 def test_without_a_source_nothing_is_ever_the_same():

@@ -139,6 +139,8 @@
         heads.forEach((other) => other.removeAttribute("aria-sort"));
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
         const compare = (a, b) => {
+          const [f, g] = [a, b].map((row) => row.classList.contains("floor"));
+          if (f !== g) return f - g;  // the floor stays at the end
           const [s, t] = [textOf(a, i), textOf(b, i)];
           if (!s || !t) return !s - !t;
           const [m, n] = [numberOf(s), numberOf(t)];

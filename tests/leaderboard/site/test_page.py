@@ -326,8 +326,8 @@ def test_nothing_moves_when_charts_are_drawn(opened, width):
     assert page.evaluate(spilled) == []  # and nothing is cut off
 
 
-def column(page, table, i):
-    cells = page.locator(f"{table} tbody tr > :nth-child({i})").all()
+def column(page, table, i, rows="tr:not(.floor)"):
+    cells = page.locator(f"{table} tbody {rows} > :nth-child({i})").all()
     return [cell.inner_text().strip() for cell in cells]
 
 
@@ -350,6 +350,9 @@ def test_columns_sort_both_ways(opened):
     page.locator(f"{table} thead button").nth(1).click()
     names = column(page, table, 2)
     assert names == ["ekf", "open_loop", "rts_smoother"]
+    everyone = column(page, table, 2, rows="tr")
+    assert everyone[: len(names)] == names  # the floor stays at the end
+    assert len(everyone) > len(names)
     assert sorted(before) == sorted(column(page, table, 3))
 
 
