@@ -21,8 +21,6 @@ PARTICLES = "particle_reference"
 """Name in rows of the floor of plants with process noise; the other is exact Bayes."""
 FEWEST_COMMON = 10
 """Fewest episodes with a floor that a ratio is given for."""
-FEWEST_EFFECTIVE = 500
-"""Smallest effective sample size of a floor that counts as exact."""
 _SCORES = {"steady": "nrmse_steady_modulo", "transient": "nrmse_transient"}
 """The score of each window that is compared with the floor's."""
 _SHOWN = 6

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.contenders import WINDOWS, Contender, among
 from pinnobs_gym.leaderboard.floor import (
-    FEWEST_EFFECTIVE,
     NO_FLOORS,
     TRACKS,
     Floors,
@@ -18,6 +17,7 @@ from pinnobs_gym.leaderboard.floor import (
 from pinnobs_gym.leaderboard.numerals import number
 from pinnobs_gym.leaderboard.places import FEWEST, Places, places
 from pinnobs_gym.leaderboard.standings import Standing, is_identifiable, standing
+from pinnobs_gym.scoring.exact_bayes import LEAST_ESS
 from pinnobs_gym.scoring.rows import Row, game_of
 
 
@@ -119,10 +119,8 @@ def _floor_note(rows: Sequence[Row]) -> str:
     sizes = [row["effective_sample_size"] for row in exact if row.get("effective_sample_size")]
     if exact:
         least = min(sizes, default=0.0)
-        few = f", fewer than the {FEWEST_EFFECTIVE} that make it exact"
-        counted = (
-            f"at least {number(least)} effective draws{few if least < FEWEST_EFFECTIVE else ''}"
-        )
+        few = f", fewer than the {LEAST_ESS:.0f} that make it exact"
+        counted = f"at least {number(least)} effective draws{few if least < LEAST_ESS else ''}"
         parts.append(f"Floor: exact Bayes, with {counted if sizes else 'unknown precision'}.")
     particles = [row for row in rows if is_particles(row)]
     errors = [row["monte_carlo"] for row in particles if row.get("monte_carlo") is not None]

@@ -16,11 +16,11 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.board import board
-from pinnobs_gym.leaderboard.floor import FEWEST_EFFECTIVE
 from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring import rows as stored_rows
 from pinnobs_gym.scoring.evaluation import evaluate, make_estimator
+from pinnobs_gym.scoring.exact_bayes import LEAST_ESS
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.rows import Row, Stored
 from pinnobs_gym.systems import SYSTEMS
@@ -151,7 +151,7 @@ def over_floor(rows: Sequence[Row], shipped: Sequence[Row] = ()) -> Iterator[Fig
         sizes = [size for row in known if (size := row.get("effective_sample_size")) is not None]
         if sizes:
             what = f"{game}: smallest effective sample size of {len(sizes)} episodes"
-            yield at_least(what, min(sizes), "", FEWEST_EFFECTIVE)
+            yield at_least(what, min(sizes), "", LEAST_ESS)
         errors = [error for row in known if (error := row.get("monte_carlo")) is not None]
         if errors:
             what = f"{game}: largest Monte-Carlo error of {len(errors)} episodes"
