@@ -13,10 +13,14 @@ from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, residual
-from pinnobs_gym.simulation.start_law import Box, StartLaw, check_covariance
+from pinnobs_gym.simulation.start_law import Box, Gaussian, StartLaw, check_covariance
 
 Array: TypeAlias = Any
 """An array of any library of the array API standard, such as numpy.ndarray or torch.Tensor."""
+_FROM_DT: Any = None
+"""A duration that follows from the time between samples."""
+_USUAL_STEPS = 100
+"""Its number of steps."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class Setup:
     The prior that estimators are given is N(x̂₀, P₀). By default x̂₀ and P₀ are the mean and the
     covariance of the law of the initial states
     (`pinnobs_gym.simulation.initial_set.prior_moments`). A fixed initial state has no such law; its
-    setup must give both.
+    setup must give both. If a setup gives both and no law, the initial states follow the prior.
     """
 
     x0_low: Sequence[float] | None = None
@@ -57,8 +61,8 @@ class Setup:
     x0_law: StartLaw | None = None
     """The law of initial states in place of a box, such as
     `pinnobs_gym.simulation.start_law.Gaussian` or `Points`; see `start`."""
-    duration: float
-    """Length of an episode in s."""
+    duration: float = _FROM_DT
+    """Length of an episode in s; a hundred times ``dt`` if not given."""
     dt: float
     """Time between samples in s."""
     noise_std: Level = 0.0
@@ -88,6 +92,8 @@ class Setup:
     """Physical parameters that replace the system's defaults."""
 
     def __post_init__(self) -> None:
+        if self.duration is _FROM_DT and is_number(self.dt):
+            object.__setattr__(self, "duration", _USUAL_STEPS * self.dt)
         for name in ("dt", "duration", "transient", "truth_step"):
             value = getattr(self, name)
             if name in ("transient", "truth_step") and value is None:
@@ -114,9 +120,15 @@ class Setup:
         for name in ("x0_low", "x0_high", "xhat0"):
             _check_finite(getattr(self, name), name)
         corners = [name for name in ("x0_low", "x0_high") if getattr(self, name) is not None]
-        if len(corners) != (0 if self.x0_law else 2):
+        if not corners and self.x0_law is None and self.xhat0 is not None and self.P0 is not None:
+            check_covariance(self.P0, "P0")
+            mean = vector(self.xhat0, len(self.P0), "xhat0")
+            object.__setattr__(self, "x0_law", Gaussian(tuple(mean.tolist()), self.P0))
+        elif len(corners) != (0 if self.x0_law else 2):
             given = ", ".join([*corners, *(["x0_law"] if self.x0_law else [])]) or "neither"
-            raise ValueError(f"x0_low and x0_high, or x0_law, are expected; given: {given}")
+            raise ValueError(
+                f"x0_low and x0_high, or x0_law, or xhat0 and P0 are expected; given: {given}"
+            )
         if not self.x0_law and np.any(np.asarray(self.x0_low) > np.asarray(self.x0_high)):
             raise ValueError(f"x0_low={self.x0_low} is above x0_high={self.x0_high}")
         if self.P0 is not None:

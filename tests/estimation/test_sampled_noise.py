@@ -11,7 +11,8 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.particle import ParticleFilter
-from pinnobs_gym.simulation.record import Prior, Record, read_log
+from pinnobs_gym.logs.reading import read_log
+from pinnobs_gym.simulation.record import Prior, Record
 
 
 class ByHand(Linear):
@@ -107,7 +108,7 @@ def log(tmp_path, text):
     path = tmp_path / "log.csv"
     path.write_text(text)
     record = linear_record(1)
-    return read_log(path, ByHand(), record.prior)[1]
+    return read_log(path, ByHand(), record.prior).record
 
 
 def test_a_log_gives_levels_by_sample(tmp_path):

@@ -10,9 +10,10 @@ from linear import Linear, linear_record
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.ukf import UKF
+from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.motion import MOST_STEPS
-from pinnobs_gym.simulation.record import Prior, read_log
+from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
 
@@ -88,7 +89,7 @@ def test_a_log_names_the_line_of_the_jump(tmp_path):
     prior = Prior.of(Linear(), SETUP, 1)
     with pytest.raises(ValueError, match=f"^log {re.escape(str(path))}, line 5: {text}$"):
         read_log(path, Linear(), prior)
-    assert read_log(path, Exact(), prior)[1].num_samples == 4
+    assert read_log(path, Exact(), prior).record.num_samples == 4
 
 
 def test_the_truth_takes_no_endless_number_of_steps():

@@ -11,10 +11,11 @@ from linear import FeedThrough, record_of
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.simulation.augmented import augmented
 from pinnobs_gym.simulation.augmented_system import Unknown
 from pinnobs_gym.simulation.model import model_step, model_step_moments
-from pinnobs_gym.simulation.record import Prior, Record, read_log
+from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, matrix, stack
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from trainers.pinn_obs.points import points_of
@@ -110,9 +111,9 @@ def test_an_empty_input_keeps_its_last_value(tmp_path):
     path.write_text("t,y1,u1\n0,1,0.5\n1,2,\n2,,nan\n3,1,-1\n4,1,\n")
     system = Cart()
     prior = Prior.of(system, system.setups["benchmark"], 1)
-    model, record = read_log(path, system, prior)
-    assert model.measured_input
-    assert record.u[0, :, 0].tolist() == [0.5, 0.5, 0.5, -1.0, -1.0]
+    log = read_log(path, system, prior)
+    assert log.system.measured_input
+    assert log.record.u[0, :, 0].tolist() == [0.5, 0.5, 0.5, -1.0, -1.0]
     path.write_text("t,y1,u1\n0,1,\n1,2,3\n")
     with pytest.raises(ValueError, match="line 2: u1 is empty; expected a number in the first row"):
         read_log(path, system, prior)

@@ -1,6 +1,7 @@
 """Laws of initial states, against their moments, and against what estimators make of them."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from pinnobs_gym.scoring.episode_law import EpisodeLaw
 from pinnobs_gym.simulation.augmented import Unknown, augmented
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.start_law import Box, Gaussian, Joint, Points
-from pinnobs_gym.simulation.system import Setup, initial_states
+from pinnobs_gym.simulation.system import Setup, independent, initial_states
 from trainers.kkl.labels import initial_states as training_states
 
 MEAN, COV = (1.0, -2.0), ((0.5, -0.3), (-0.3, 0.4))
@@ -216,3 +217,24 @@ def test_what_is_no_law_is_one_clear_line(make, message):
 def test_a_law_of_another_size_is_refused():
     with pytest.raises(TypeError, match=r"x0_law has states of 1 number\(s\); expected 2"):
         system_with(Gaussian((0.0,), ((1.0,),))).validate()
+
+
+def test_a_setup_for_logs_needs_no_box_and_no_duration():
+    """Initial states then follow the prior, in an episode of a hundred steps."""
+    setup = Setup(dt=0.1, noise_std=0.2, xhat0=(1.0, -2.0), P0=independent(3.0, 0.5))
+    assert (setup.duration, setup.num_steps) == (10.0, 100)
+    assert setup.start(2) == Gaussian((1.0, -2.0), independent(3.0, 0.5))
+    one = replace(setup, xhat0=(4.0, 4.0))  # another prior, of the same initial states
+    assert one.start(2) == setup.start(2)
+
+    source = EpisodeSource(type("Logged", (Linear,), {"setups": {"benchmark": setup}}))
+    x0 = source.draw(source.streams(range(2000))).x0
+    np.testing.assert_allclose(x0.mean(axis=0), (1, -2), atol=0.25)
+    np.testing.assert_allclose(x0.std(axis=0), (3, 0.5), rtol=0.1)
+    assert len(source.record(source.play(source.draw(source.streams([0])))).t) == 100
+
+
+@pytest.mark.parametrize("given", [{}, {"xhat0": (0.0,)}, {"P0": ((1.0,),)}, {"x0_low": (0.0,)}])
+def test_a_setup_needs_initial_states_or_a_prior(given):
+    with pytest.raises(ValueError, match="x0_low and x0_high, or x0_law, or xhat0 and P0 are exp"):
+        Setup(dt=0.1, **given)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.output import write_estimates, write_figure
+from pinnobs_gym.cli.own_model import own_model
 from pinnobs_gym.envs.figures import state_figure
-from pinnobs_gym.envs.registration import env_id
-from pinnobs_gym.estimation.plausible import doubts
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
-from pinnobs_gym.simulation.noise import Level
-from pinnobs_gym.simulation.record import Prior, read_log
-from pinnobs_gym.simulation.system import independent
-from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.logs.judgement import doubts
+from pinnobs_gym.logs.reading import read_log
+from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
@@ -46,19 +44,15 @@ class Estimate:
 
     def run(self) -> int:
         """Estimate, and write the results."""
-        env_id(self.system)  # checks and registers the user's own system
-        cls = SYSTEMS.resolve(self.system)
-        noise_std = _level(self.noise_std) if self.noise_std else None
-        system, setup = cls.configured(noise_std=noise_std)
-        if self.process_noise:
-            setup = replace(setup, process_noise=_level(self.process_noise))
-            system.noise(setup.noise_std, setup.process_noise)
-        if self.xhat0:
-            setup = replace(setup, xhat0=self.xhat0)
-        if self.P0_std:
-            setup = replace(setup, P0=independent(*self.P0_std))
-        prior = Prior.of(system, setup, 1)
-        system, record = read_log(self.log, system, prior)
+        system, setup = own_model(
+            self.system,
+            noise_std=self.noise_std,
+            process_noise=self.process_noise,
+            xhat0=self.xhat0,
+            P0_std=self.P0_std,
+        )
+        log = read_log(self.log, system, Prior.of(system, setup, 1))
+        system, record = log.system, log.record
         kind = ESTIMATORS.resolve(self.estimator)
         if kind.needs_training is not None:
             raise ValueError(
@@ -86,11 +80,6 @@ class Estimate:
         console.print(f"{record.num_samples} samples; at t = {time}: {last}")
         console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
         return 0
-
-
-def _level(values: tuple[float, ...]) -> Level:
-    """Return the standard deviations of a noise; a single one is that of all components."""
-    return values[0] if len(values) == 1 else values
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -8,8 +8,8 @@ from linear import Linear, linear_record
 from scipy.stats import binomtest, chi2
 
 from pinnobs_gym.estimation.estimator import Estimates
-from pinnobs_gym.estimation.plausible import _chance, _nis_ratios, doubts
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.logs.judgement import _chance, _nis_ratios, doubts
 
 
 def long_record(num_samples=200):

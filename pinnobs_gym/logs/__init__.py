@@ -1,0 +1,1 @@
+"""Sensor logs: their reading, what they say of a model, and the fit of its parameters."""
