@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.augmented import augmented
     from pinnobs_gym.simulation.augmented_system import Unknown
-    from pinnobs_gym.simulation.system import Setup, System, stack
+    from pinnobs_gym.simulation.system import Setup, System, independent, stack
     from pinnobs_gym.simulation.table import table
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "__version__",
     "augmented",
     "evaluate",
+    "independent",
     "load",
     "read_rows",
     "register",
@@ -45,6 +46,7 @@ _HOMES = {
     "State": "estimation.estimator",
     "Setup": "simulation.system",
     "System": "simulation.system",
+    "independent": "simulation.system",
     "Unknown": "simulation.augmented_system",
     "augmented": "simulation.augmented",
     "stack": "simulation.system",

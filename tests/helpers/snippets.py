@@ -1,6 +1,7 @@
 """Code blocks of Markdown files, and how tests run them."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,37 @@ def blocks(path, *kinds):
     return [(kind, text) for kind, text in found if kind in kinds]
 
 
+def cells(path):
+    """The cells of a page that is executed when the documentation is built, in order: (options,
+    text)."""
+    text = path.read_text(encoding="utf-8")
+    return re.findall(
+        r"^```\{code-cell\} ipython3\n((?::[^\n]*\n)*)\n?(.*?)^```", text, re.M | re.S
+    )
+
+
+def run_cells(path, folder):
+    """Run a page's cells in one process, in which they share their names. Returns what they print.
+
+    Of the notations of notebooks, cells may have ``%%writefile name.py``, lines ``!pinnobs ...``
+    and ``%matplotlib inline``."""
+    parts = []
+    for _, text in cells(path):
+        first, _, rest = text.partition("\n")
+        if first.startswith("%%writefile "):
+            (folder / first.split()[1]).write_text(rest, encoding="utf-8")
+            continue
+        text = text.replace("%matplotlib inline\n", "").replace("\\\n", " ")
+        parts.append(re.sub(r"^!pinnobs (.*)$", _called, text, flags=re.M))
+    whole = "from pinnobs_gym.cli import main\n" + "\n".join(parts)
+    return run_python(whole, folder) if parts else ""
+
+
+def _called(line):
+    """A line of Python that does what a line of a shell does."""
+    return f"assert main({shlex.split(line.group(1))!r}) == 0, {line.group(1)!r}"
+
+
 def run_python(text, folder):
     """Run a block by itself. Returns what it printed."""
     (folder / "snippet.py").write_text(text, encoding="utf-8")
@@ -23,8 +55,11 @@ def run_python(text, folder):
 
 
 def run_page(path, folder):
-    """Run a file's blocks of Python and lines of ``pinnobs``, in order, in one process. A block
-    that begins with a comment ``# name.py`` is a module that later ones may import."""
+    """Run a file's cells, if it has some, or its blocks of Python and lines of ``pinnobs``, in
+    order, in one process. A block that begins with a comment ``# name.py`` is a module that later
+    ones may import."""
+    if cells(path):
+        return run_cells(path, folder)
     parts = []
     for kind, text in blocks(path, "python", "sh"):
         if kind == "sh":
