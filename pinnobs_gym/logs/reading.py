@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +32,13 @@ class Log:
     """The samples."""
     lines: np.ndarray
     """The line of each sample in the file, shape (num_samples,)."""
+    notes: tuple[str, ...] = ()
+    """Lines to tell the user, such as the columns that are not used."""
+    start: datetime | None = None
+    """The instant of the first sample, t = 0, of a file with dates; None for numbers."""
 
 
-def read_log(path: str | Path, system: System, prior: Prior) -> Log:
+def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[str] = ()) -> Log:
     """Read a log from a CSV file with columns t (s), y1, y2, ... and, if the system has inputs,
     u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output, or an
     input that keeps its last value. Columns y1_std, y2_std, ... hold the standard deviation of an
