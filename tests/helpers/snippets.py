@@ -29,18 +29,16 @@ def cells(path):
 def run_cells(path, folder):
     """Run a page's cells in one process, in which they share their names. Returns what they print.
 
-    Of the notations of notebooks, cells may have ``%%writefile name.py``, lines ``!pinnobs ...``
-    and ``%matplotlib inline``."""
+    Of the notations of notebooks, cells may have ``%%writefile name.py`` and lines
+    ``!pinnobs ...``."""
     parts = []
     for _, text in cells(path):
         first, _, rest = text.partition("\n")
         if first.startswith("%%writefile "):
             (folder / first.split()[1]).write_text(rest, encoding="utf-8")
             continue
-        text = text.replace("%matplotlib inline\n", "").replace("\\\n", " ")
         parts.append(re.sub(r"^!pinnobs (.*)$", _called, text, flags=re.M))
-    whole = "from pinnobs_gym.cli import main\n" + "\n".join(parts)
-    return run_python(whole, folder) if parts else ""
+    return run_python("from pinnobs_gym.cli import main\n" + "\n".join(parts), folder)
 
 
 def _called(line):
@@ -55,11 +53,8 @@ def run_python(text, folder):
 
 
 def run_page(path, folder):
-    """Run a file's cells, if it has some, or its blocks of Python and lines of ``pinnobs``, in
-    order, in one process. A block that begins with a comment ``# name.py`` is a module that later
-    ones may import."""
-    if cells(path):
-        return run_cells(path, folder)
+    """Run a file's blocks of Python and lines of ``pinnobs``, in order, in one process. A block
+    that begins with a comment ``# name.py`` is a module that later ones may import."""
     parts = []
     for kind, text in blocks(path, "python", "sh"):
         if kind == "sh":
