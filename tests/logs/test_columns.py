@@ -140,7 +140,7 @@ def test_decimal_commas_are_noted(tmp_path):
     ],
 )
 def test_mistakes_are_one_line(tmp_path, text, columns, message):
-    with pytest.raises(ValueError, match="^(log|columns) ") as caught:
+    with pytest.raises(ValueError, match=r"^(log|columns) ") as caught:
         read(tmp_path, text, *columns)
     said = str(caught.value).replace(str(tmp_path / "log.csv"), "PATH")
     assert message in said

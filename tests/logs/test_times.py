@@ -49,7 +49,7 @@ def read(tmp_path, times, *columns, cls=Linear):
 
 
 def refusal(tmp_path, times, *columns, cls=Linear):
-    with pytest.raises(ValueError, match="^log ") as caught:
+    with pytest.raises(ValueError, match=r"^log ") as caught:
         read(tmp_path, times, *columns, cls=cls)
     assert "\n" not in str(caught.value)
     return str(caught.value).removeprefix(f"log {tmp_path / 'log.csv'}")
