@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 
 from pinnobs_gym.logs.formulas import Formula, parsed
-from pinnobs_gym.logs.table import Table, listed, shown
+from pinnobs_gym.logs.table import Table, listed, quoted, shown
 from pinnobs_gym.simulation.system import System
 
 _TIME = ("time", "stamp", "clock", "sec", "millis", "zeit")
@@ -79,11 +79,11 @@ def _assigned(system: str, known: Mapping[str, str], columns: Sequence[str]) -> 
         name, equals, text = assignment.partition("=")
         name = name.strip()
         if not equals or name not in known:
-            close = get_close_matches(name, known, 1)
+            close = get_close_matches(name, known, 1) if name not in known else []
             perhaps = f"; did you mean {close[0]}?" if close else ""
             raise ValueError(
-                f"columns {shown(assignment)}: {shown(name)} is not read for {system}; expected "
-                f"target=formula, with a target of {listed(list(known))}{perhaps}"
+                f"columns {shown(assignment)}: expected target=formula, for {system} with a target "
+                f"of {listed(list(known))}{perhaps}"
             )
         if known[name] in given:
             raise ValueError(f"columns {shown(assignment)}: {known[name]} is given twice")
@@ -114,9 +114,10 @@ def _of(
         return given[quantity]
     names = [name for name in dict.fromkeys(table.header) if known.get(name) == quantity]
     if len(names) > 1:
+        choice = quoted(f"{quantity}={_written(names[0])}")
         raise ValueError(
             f"log {table.path} has columns {' and '.join(names)}, both of which are {quantity}; "
-            f"expected one of them, or --columns {quantity}={_written(names[0])} to choose it"
+            f"expected one of them, or --columns {choice} to choose"
         )
     return Formula.column(names[0]) if names else None
 
@@ -140,7 +141,7 @@ def _missing(
     for quantity in missing:
         close = _likely(quantity, own.get(quantity, quantity), left)
         left = [name for name in left if name != close]
-        pairs.append(f"{quantity}={_written(close) if close else '...'}")
+        pairs.append(quoted(f"{quantity}={_written(close) if close else '...'}"))
     return (
         f"log {table.path} has no column {', '.join(map(label, missing))}; "
         f"{type(system).__name__} needs {', '.join(map(label, needed))}, and the header has "

@@ -65,9 +65,8 @@ def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[s
     table = read_table(Path(path))
     formulas = chosen(system, table, columns)
     t, start = read_times(table, formulas["t"])
-    told = any(each.partition("=")[0].strip() == "t" for each in columns)
-    right = start is not None or (told and (not formulas["t"].plain or formulas["t"].text == "t"))
-    check_times(system, table, t, None if right else formulas["t"])
+    insisted = _insisted(formulas["t"], columns)
+    check_times(system, table, t, None if insisted else formulas["t"])
     values = {name: _values(table, name, f) for name, f in formulas.items() if name != "t"}
     outputs = [values[f"y{i + 1}"] for i in range(system.ny)]
     y = np.stack(outputs, axis=-1)[None]
@@ -89,6 +88,12 @@ def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[s
         _notes(table, formulas, t, start),
         start,
     )
+
+
+def _insisted(formula: Formula, columns: Sequence[str]) -> bool:
+    """Return whether the times' unit is as the user says: by arithmetic, or by ``t=t``."""
+    given = any(each.partition("=")[0].strip() == "t" for each in columns)
+    return given and (not formula.plain or formula.columns == ("t",))
 
 
 def _values(table: Table, quantity: str, formula: Formula) -> np.ndarray:
@@ -133,7 +138,7 @@ def _notes(
     """Return what the user is to know of a log that was read."""
     notes = []
     if start is not None:
-        notes.append(f"log {table.path}: t = {t[0]:g} s is {start.isoformat()}")
+        notes.append(f"log {table.path}: t = {t[0]:g} is {start.isoformat()}")
     used = {name: None for formula in formulas.values() for name in formula.columns}
     commas = [name for name in used if table.decimal_commas(name)]
     if commas:

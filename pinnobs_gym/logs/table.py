@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,6 +148,11 @@ def shown(text: str) -> str:
     """Return the representation of a text, of which only the beginning is shown if it is long."""
     text = text.strip()
     return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
+
+def quoted(argument: str) -> str:
+    """Return an argument as it is written on a command line, of any system."""
+    return argument if re.fullmatch(r"[\w=./+-]+", argument) else f'"{argument}"'
 
 
 def listed(names: Sequence[str]) -> str:

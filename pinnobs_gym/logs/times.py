@@ -8,7 +8,7 @@ from datetime import datetime
 import numpy as np
 
 from pinnobs_gym.logs.formulas import Formula
-from pinnobs_gym.logs.table import Table, shown
+from pinnobs_gym.logs.table import Table, quoted, shown
 from pinnobs_gym.simulation.motion import check_steps
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
@@ -98,7 +98,7 @@ def check_times(system: System, table: Table, t: np.ndarray, formula: Formula | 
         system: the model.
         table: the log, for the lines of messages.
         t: the times (num_samples,).
-        formula: the times' formula, for the advice to change it; None if their unit is certain.
+        formula: the times' formula, whose unit is judged; None if the user insists on it.
 
     Raises:
         ValueError: in one line that names the file, and where there is one the line.
@@ -121,10 +121,7 @@ def check_times(system: System, table: Table, t: np.ndarray, formula: Formula | 
 
 
 def _check_unit(system: System, table: Table, t: np.ndarray, formula: Formula) -> None:
-    """Raise ValueError if the times seem to be in another unit than the model's, such as ms.
-
-    A formula with arithmetic, or ``t=t`` where it is given, is taken as what is meant.
-    """
+    """Raise ValueError if the times seem to be in another unit than the model's, such as ms."""
     if len(t) <= _FEWEST:
         return
     step, dt = float(np.median(np.diff(t))), system.setups["benchmark"].dt
@@ -133,12 +130,13 @@ def _check_unit(system: System, table: Table, t: np.ndarray, formula: Formula) -
         return
     unit = "" if system.discrete else " s"
     own = formula.text.strip()
-    same = "t=t" if own == "t" else f"t={own}*1"
+    same = quoted("t=t" if own == "t" else f"t={own}*1")
     factor = f"/1e{3 * power}" if system.discrete and power > 0 else f"*1e{-3 * power}"
+    other = quoted(f"t={own}{factor}")
     raise ValueError(
         f"log {table.path}: t grows by {step:.6g}{unit} from sample to sample (median), about "
         f"1e{3 * power} times the dt={dt:g}{unit} of {type(system).__name__}, as if it were in "
-        f"another unit; give --columns t={own}{factor}, or {same} if it is right"
+        f"another unit; give --columns {other}, or {same} if it is right"
     )
 
 

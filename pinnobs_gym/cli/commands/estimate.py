@@ -75,6 +75,11 @@ class Estimate:
                 f"estimator {self.estimator!r} is trained beforehand; give its file, --trained "
                 "FILE, or take one that is not, or trains on the record"
             )
+        if self.trained is not None and kind.needs_training is None:
+            raise ValueError(
+                f"estimator {self.estimator!r} is not one that is trained first; name that of the "
+                "file, --estimator NAME"
+            )
         if self.trained is not None and self.set:
             raise ValueError("--trained and --set; expected one of them")
         outs = _outs(self.out, self.log)
@@ -140,7 +145,8 @@ def _estimate(log: Log, estimator: BaseEstimator, out: Path) -> None:
         for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
     )
     time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
-    console.print(f"{log.path.name}: {record.num_samples} samples; at t = {time}: {last}")
+    counted = f"{log.path.name}: {record.num_samples} samples"
+    console.print(f"{counted}; at t = {time}: {last}", soft_wrap=True)
     if isinstance(system, Augmented):
         for line in _found(system, log, estimates):
             console.print(line, soft_wrap=True)
