@@ -138,9 +138,13 @@ def _miscounted(
     path: Path, number: int, cells: list[str], header: list[str], separator: str
 ) -> str:
     """Return the message for a line of too few or too many cells."""
-    text = f"log {path}, line {number}: {len(cells)} cells; expected {len(header)}"
-    if separator == "," and len(cells) == 2 * len(header):
-        text += ", separated by commas, with decimal points (or by semicolons, with decimal commas)"
+    text = (
+        f"log {path}, line {number}: {len(cells)} cells; expected {len(header)}, as in the header"
+    )
+    if len(header) == 1:
+        text += f", which is {shown(header[0])}"
+    if separator == "," and len(cells) > len(header) > 1:
+        text += "; numbers with decimal commas need semicolons between them"
     return text
 
 

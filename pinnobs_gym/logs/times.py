@@ -18,8 +18,8 @@ _LONGEST_GAP = 1e8
 _STEPS_IN_GAP = 1000
 """Number of usual steps in a gap, at least, that is taken for such a jump."""
 _FACTOR = 3
-"""Factor by which a median step may differ from a power of a thousand times the setup's ``dt``,
-to be taken for a wrong unit."""
+"""Factor by which a median step may differ from the setup's ``dt`` in another unit, a power of a
+thousand smaller or larger, to be taken for a wrong unit."""
 _FEWEST = 2
 """Number of steps from which on the unit of the times is judged."""
 _FRACTION = re.compile(r"(.*\d\d:?\d\d:?\d\d)[.,](\d+)(.*)")
@@ -125,8 +125,11 @@ def _check_unit(system: System, table: Table, t: np.ndarray, formula: Formula) -
     if len(t) <= _FEWEST:
         return
     step, dt = float(np.median(np.diff(t))), system.setups["benchmark"].dt
-    power = round(np.log10(step / dt) / 3)
-    if power == 0 or abs(np.log10(step / dt) - 3 * power) > np.log10(_FACTOR):
+    ratio = step / dt
+    power = round(np.log10(ratio) / 3)
+    near = abs(np.log10(ratio) - 3 * power) <= np.log10(_FACTOR)
+    # Any step that is far too long is told: the model takes very many of its own through it.
+    if not (ratio * _FACTOR >= 1000 or (power < 0 and near)):
         return
     unit = "" if system.discrete else " s"
     own = formula.text.strip()
@@ -134,8 +137,8 @@ def _check_unit(system: System, table: Table, t: np.ndarray, formula: Formula) -
     factor = f"/1e{3 * power}" if system.discrete and power > 0 else f"*1e{-3 * power}"
     other = quoted(f"t={own}{factor}")
     raise ValueError(
-        f"log {table.path}: t grows by {step:.6g}{unit} from sample to sample (median), about "
-        f"1e{3 * power} times the dt={dt:g}{unit} of {type(system).__name__}, as if it were in "
+        f"log {table.path}: t grows by {step:.6g}{unit} from sample to sample (median), "
+        f"{ratio:.4g} times the dt={dt:g}{unit} of {type(system).__name__}, as if it were in "
         f"another unit; give --columns {other}, or {same} if it is right"
     )
 

@@ -135,7 +135,11 @@ def test_decimal_commas_are_noted(tmp_path):
         (PLAIN, ["t=1/t"], "line 2: t=1/t is inf; expected a finite number"),
         ("t,a,b,u1\n0,1,x,1\n", ["y1=a", "y2=b"], "line 2: b='x' is not a finite number"),
         ("t;y1;y2;u1\n0;3,5;20;1\n1;3.5;20;1\n", [], "line 2: y1='3,5' is not a finite number"),
-        ("t,y1,y2,u1\n0,3,5,20,5,1,0,1\n", [], "8 cells; expected 4, separated by commas, with"),
+        (
+            "t,y1,y2,u1\n0,3,5,20,5,1,0,1\n",
+            [],
+            "8 cells; expected 4, as in the header; numbers with decimal",
+        ),
         ('t,y1,y2,u1\n"0,5",1,1,1\n', [], "line 2: t='0,5' is not a finite number"),
     ],
 )
