@@ -12,7 +12,7 @@ import numpy as np
 from pinnobs_gym.logs.columns import chosen, unused
 from pinnobs_gym.logs.formulas import Formula
 from pinnobs_gym.logs.table import Table, listed, read_table, shown
-from pinnobs_gym.logs.times import check_times, read_times
+from pinnobs_gym.logs.times import check_times, read_times, without_rounding
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
 
@@ -65,6 +65,7 @@ def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[s
     table = read_table(Path(path))
     formulas = chosen(system, table, columns)
     t, start = read_times(table, formulas["t"])
+    t = without_rounding(t) if system.discrete else t
     insisted = _insisted(formulas["t"], columns)
     check_times(system, table, t, None if insisted else formulas["t"])
     values = {name: _values(table, name, f) for name, f in formulas.items() if name != "t"}

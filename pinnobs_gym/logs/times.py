@@ -23,6 +23,8 @@ thousand smaller or larger, to be taken for a wrong unit."""
 _FEWEST = 2
 """Number of steps from which on the unit of the times is judged."""
 _FRACTION = re.compile(r"(.*\d\d:?\d\d:?\d\d)[.,](\d+)(.*)")
+_ROUNDING = 1e-9
+"""Largest distance from a whole number, relative to it, that counts as rounding."""
 
 
 def read_times(table: Table, formula: Formula) -> tuple[np.ndarray, datetime | None]:
@@ -88,6 +90,13 @@ def _seconds(table: Table, name: str, cells: list[str]) -> tuple[np.ndarray, dat
     seconds = np.array([(instant - whole[0]).total_seconds() for instant in whole])
     start = whole[0].replace(microsecond=min(999_999, round(part[0] * 1e6)))
     return seconds + (part - part[0]), start
+
+
+def without_rounding(t: np.ndarray) -> np.ndarray:
+    """Return times (num_samples,) in steps of a map, of which those that are whole numbers but for
+    the rounding of a formula, such as 0.3/0.1, are whole."""
+    whole = np.round(t)
+    return np.where(abs(t - whole) <= _ROUNDING * np.maximum(abs(whole), 1), whole, t)
 
 
 def check_times(system: System, table: Table, t: np.ndarray, formula: Formula | None) -> None:

@@ -191,6 +191,12 @@ def test_long_gaps_of_slow_plants_are_none(tmp_path):
     assert len(read(tmp_path, [0, 0.1, 1e7, 1e7 + 0.1], cls=Exact).record.t) == 4
 
 
+def test_a_formula_of_the_times_of_a_map_may_round(tmp_path):
+    times = [round(0.1 * k, 1) for k in range(30)]
+    assert times[3] / 0.1 != 3
+    assert read(tmp_path, times, "t=t/0.1", cls=Counted).record.t.tolist() == list(range(30))
+
+
 def test_times_of_a_map_are_whole_numbers(tmp_path):
     said = refusal(tmp_path, [0, 1, 2.5], cls=Counted)
     assert ", line 4: t=2.5; Counted is a map, whose times count steps; expected a whole" in said
