@@ -58,6 +58,7 @@ def minimised(
     *,
     most: int,
     least_gain: float,
+    longest: float = np.inf,
 ) -> tuple[np.ndarray, Quadratic]:
     """Return the point of least cost near v (n,), and the cost about it, by the Levenberg-Marquardt
     method (Nocedal & Wright 2006, section 10.3), whose steps are kept within bounds.
@@ -68,6 +69,7 @@ def minimised(
         inside: the points that are allowed; all if None.
         most: largest number of evaluations after the first.
         least_gain: predicted decrease of the cost at which the search ends.
+        longest: largest change of a component in one step.
     """
     best, damping = evaluate(v), _DAMPING[0]
     if not np.isfinite(best.cost):
@@ -78,7 +80,10 @@ def minimised(
         size = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled = best.information / np.outer(size, size)
         damped = scaled + (damping + 1e-14) * np.eye(len(v))
-        trial = v + np.linalg.solve(damped, best.right / size) / size
+        step = np.linalg.solve(damped, best.right / size) / size
+        if abs(step).max() > longest:
+            step *= longest / abs(step).max()
+        trial = v + step
         if inside is not None:
             trial = inside.nearest(trial, damped * np.outer(size, size))
         step = trial - v

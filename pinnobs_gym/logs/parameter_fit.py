@@ -75,17 +75,18 @@ def fit_parameters(
     problem = _Problem(logs, setup, parameters)
     found: list[tuple[float, np.ndarray]] = []
     for factor in _FACTORS:
-        d = (parameters.values(parameters.start * (factor - 1) / parameters.scale) - parameters.start)
-        v = problem.first(d / parameters.scale)
-        for number, share in enumerate(shares := problem.shares()):
-            progress(f"part {number + 1} of {len(shares)}, start times {factor:g}")
-            v, at = problem.searched(v, share)
-        found.append((at.cost, v))
-        if at.cost <= _EXPLAINED * problem.freedom or not parameters.start.any():
+        start = parameters.start
+        d = (np.clip(factor * start, parameters.low, parameters.high) - start) / parameters.scale
+        found.append(
+            problem.grown(d, lambda text, f=factor: progress(f"{text}, start times {f:g}"))
+        )
+        if found[-1][0] <= _EXPLAINED * problem.freedom or not start.any():
             break
     cost, v = min(found, key=lambda each: each[0])
     if not np.isfinite(cost):
-        values = ", ".join(f"{n}={x:g}" for n, x in zip(parameters.names, parameters.start))
+        values = ", ".join(
+            f"{n}={x:g}" for n, x in zip(parameters.names, parameters.start, strict=True)
+        )
         raise ValueError(f"the model's outputs are not finite from {values}; give another start")
     return problem.result(v)
 
@@ -103,7 +104,7 @@ class _Problem:
         for log in logs:
             ask(log.system, "model")
         self._runs = [Sensitivity(log, setup, parameters) for log in logs]
-        self._measured = [np.flatnonzero(~np.isnan(l.record.y[0]).all(axis=1)) for l in logs]
+        self._measured = [np.flatnonzero(~np.isnan(log.record.y[0]).all(axis=1)) for log in logs]
         outputs = sum(int(np.count_nonzero(~np.isnan(log.record.y))) for log in logs)
         self.freedom = outputs - self._p
         """Number of outputs less that of parameters."""
@@ -139,6 +140,15 @@ class _Problem:
         while shares[0] * most > _SHORTEST:
             shares.insert(0, shares[0] / 2)
         return shares
+
+    def grown(self, d: np.ndarray, progress: Callable[[str], object]) -> tuple[float, np.ndarray]:
+        """Return the least cost that is found from parameters d (p,), and its unknowns."""
+        v, cost, shares = self.first(d), np.inf, self.shares()
+        for number, share in enumerate(shares):
+            progress(f"part {number + 1} of {len(shares)}")
+            v, at = self.searched(v, share)
+            cost = at.cost
+        return cost, v
 
     def searched(self, v: np.ndarray, share: float) -> tuple[np.ndarray, Quadratic]:
         """Return the best v near one for the first share of the logs, and the cost about it."""

@@ -33,6 +33,8 @@ class Trajectory:
     slopes: np.ndarray
     """Derivatives of the outputs by initial state and parameters, in the units of the whitened
     residuals, shape (num_samples, ny, nx + number of parameters)."""
+    std: np.ndarray
+    """Standard deviations of the output noise, shape (num_samples, ny)."""
 
 
 def simulated(system: System, t: np.ndarray, u: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -94,7 +96,11 @@ class Sensitivity:
         self._y, self._u = record.y[0], record.u.swapaxes(0, 1)
         self._missing = np.isnan(self._y)
         self._W = whitening(noise, record.t, self._y)
-        self._scale = np.r_[vector(system.scale, system.nx, "scale"), np.ones(len(parameters.names))]
+        variance = np.einsum("kii->ki", np.linalg.inv(self._W.swapaxes(1, 2) @ self._W))
+        self._std = np.broadcast_to(np.sqrt(variance), self._y.shape)
+        self._scale = np.r_[
+            vector(system.scale, system.nx, "scale"), np.ones(len(parameters.names))
+        ]
         self._step = _STIFF_STEP if system.stiff else _STEP
         self._low, self._high = limits(system, parameters)
 
@@ -116,7 +122,9 @@ class Sensitivity:
         slopes = change.swapaxes(1, 2) / width.diagonal()
         slopes[missing] = 0.0
         W = self._W[:length] if len(self._W) > 1 else self._W
-        return Trajectory(yhat[:, 0], off, (W @ off[..., None])[..., 0], W @ slopes)
+        return Trajectory(
+            yhat[:, 0], off, (W @ off[..., None])[..., 0], W @ slopes, self._std[:length]
+        )
 
     def _rows(self, point: np.ndarray) -> np.ndarray:
         """Return the points of all rows, (1 + 2n, n), within the bounds."""
@@ -142,4 +150,6 @@ def limits(system: System, parameters: Parameters) -> tuple[np.ndarray, np.ndarr
     if box is not None:
         low, high = box.low, box.high
     start, scale = parameters.start, parameters.scale
-    return np.r_[low, (parameters.low - start) / scale], np.r_[high, (parameters.high - start) / scale]
+    return np.r_[low, (parameters.low - start) / scale], np.r_[
+        high, (parameters.high - start) / scale
+    ]

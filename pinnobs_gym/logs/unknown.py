@@ -50,7 +50,9 @@ def unknown_parameters(system: System, texts: Sequence[str]) -> Parameters:
         known = system.parameters
         if name not in known:
             listed = ", ".join(known) or "none"
-            raise ValueError(f"unknown parameter {name!r} of {type(system).__name__}; it has {listed}")
+            raise ValueError(
+                f"unknown parameter {name!r} of {type(system).__name__}; it has {listed}"
+            )
         if name in found:
             raise ValueError(f"parameter {name!r} is given twice; expected once")
         if not is_number(known[name]):
@@ -62,7 +64,9 @@ def unknown_parameters(system: System, texts: Sequence[str]) -> Parameters:
     if not np.isfinite(start).all():
         wrong = list(found)[int(np.argmin(np.isfinite(start)))]
         raise ValueError(f"parameter {wrong}={found[wrong][0]}; expected a finite start")
-    constants = {n: Unknown(float(a), float(s)) for n, a, s in zip(found, start, scale, strict=True)}
+    constants = {
+        n: Unknown(float(a), float(s)) for n, a, s in zip(found, start, scale, strict=True)
+    }
     if constants:
         augmented(system, parameters=constants)  # refuses what cannot differ between rows
     return Parameters(tuple(found), start, scale, low, high)
@@ -78,7 +82,7 @@ def _numbers(text: str, values: str) -> tuple[float, float, float]:
         numbers += [-np.inf, np.inf]
     if len(numbers) != 3 or not numbers[1] <= numbers[0] <= numbers[2] or numbers[1] == numbers[2]:
         raise ValueError(
-            f"parameter {text!r}; expected name, name=START or name=START,LOW,HIGH with numbers and "
+            f"parameter {text!r}; expected name, name=START or name=START,LOW,HIGH with numbers "
             "LOW <= START <= HIGH"
         )
     return numbers[0], numbers[1], numbers[2]
