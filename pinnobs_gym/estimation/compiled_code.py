@@ -66,7 +66,16 @@ def noise_at(noise: Noise, t: np.ndarray) -> np.ndarray:
     given noise that is constant but for that by sample."""
     if noise.samples is None:
         return noise.R(0.0)[None]
+    if _is_same(noise.samples, t):
+        return noise.R(float(t[0]))[None]
     return np.stack(np.broadcast_arrays(*(noise.R(float(each)) for each in t)))
+
+
+def _is_same(samples: SampledLevel, t: np.ndarray) -> bool:
+    """Return whether the noise by sample is the same at all times t (s), each that of a sample."""
+    std, first = samples.std, samples.std[:, :1]
+    same = (std == first) | (np.isnan(std) & np.isnan(first))
+    return bool(same.all() and np.isin(t, samples.t).all())
 
 
 def rows_of_numbers(estimator: BaseEstimator, made: PlantLibrary) -> int:

@@ -1,0 +1,184 @@
+"""`fit ...`: find a model's parameters, or its noise, from sensor logs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pinnobs_gym.cli.console import console, print_table
+from pinnobs_gym.cli.fit_figure import fit_figure
+from pinnobs_gym.cli.options import parse
+from pinnobs_gym.cli.output import write_figure
+from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.files import check_writable, replacing
+from pinnobs_gym.leaderboard.grid import Column, Grid
+from pinnobs_gym.logs.fit import Fit as Fitted
+from pinnobs_gym.logs.fit import Found, fit
+from pinnobs_gym.logs.reading import read_log
+from pinnobs_gym.logs.unknown import unknown_parameters
+from pinnobs_gym.simulation.record import Prior
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Find a model's parameters, its noise, or both, from sensor logs (see `pinnobs estimate`)."""
+
+    system: str
+    """Name or module:Class of the model."""
+    log: tuple[Path, ...]
+    """CSV files. Each has an initial state of its own; the parameters are those of all."""
+    parameters: tuple[str, ...] = ()
+    """The unknown parameters, each as k, k=START or k=START,LOW,HIGH; the search begins at the
+    model's own value if none is given, and -inf or inf is no bound."""
+    noise: bool = False
+    """Find the noise, too: a standard deviation for each output, and the size of the model's
+    process noise."""
+    xhat0: tuple[float, ...] | None = None
+    """Initial estimate; the benchmark's if not given."""
+    P0_std: tuple[float, ...] | None = None
+    """Its standard deviations; the benchmark's if not given."""
+    noise_std: tuple[float, ...] = ()
+    """Standard deviations of the output noise; the benchmark's if not given."""
+    process_noise: tuple[float, ...] = ()
+    """Standard deviations of the process noise after one second (of a map: after one step), in
+    state units per √s: one for all states or one for each; the benchmark's if not given."""
+    picture: Path = Path("fit.png")
+    """File of the figure: measured and fitted outputs, and residuals."""
+    out: Path | None = None
+    """A JSON file of what was found; none if not given."""
+
+    def run(self) -> int:
+        """Fit, print what was found and write the figure."""
+        system, setup = own_model(
+            self.system,
+            noise_std=self.noise_std,
+            process_noise=self.process_noise,
+            xhat0=self.xhat0,
+            P0_std=self.P0_std,
+        )
+        if not self.parameters and not self.noise:
+            listed = ", ".join(system.parameters) or "none"
+            raise ValueError(
+                "nothing to find; give --parameters, --noise or both (parameters of "
+                f"{type(system).__name__}: {listed})"
+            )
+        self._check_files()
+        parameters = unknown_parameters(system, self.parameters)
+        logs = [read_log(path, system, Prior.of(system, setup, 1)) for path in self.log]
+        with console.status("fit") as status:
+            made = fit(
+                logs, setup, parameters, self.noise, lambda text: status.update(f"fit: {text}")
+            )
+        self._print(made, sum(int(np.count_nonzero(~np.isnan(log.record.y))) for log in logs))
+        write_figure(self.picture, fit_figure(logs, made))
+        console.print(f"picture: {self.picture}", soft_wrap=True)
+        if self.out is not None:
+            with replacing(self.out) as temporary:
+                temporary.write_text(json.dumps(facts(made), indent=1) + "\n", encoding="utf-8")
+            console.print(f"values: {self.out}", soft_wrap=True)
+        return 0
+
+    def _check_files(self) -> None:
+        logs = [path.resolve() for path in self.log]
+        if not logs:
+            raise ValueError("no log is given; expected --log FILE ...")
+        twice = next((path for i, path in enumerate(logs) if path in logs[:i]), None)
+        if twice is not None:
+            raise ValueError(f"log {twice.name} is given twice; expected once")
+        for name, path in (("picture", self.picture), ("out", self.out)):
+            if path is not None and path.resolve() in logs:
+                raise ValueError(f"{name}={path} would overwrite a log")
+            if path is not None:
+                check_writable(path.parent)
+        if not self.picture.suffix:
+            raise ValueError(f"picture={self.picture}; expected a name such as fit.png")
+
+    def _print(self, made: Fitted, outputs: int) -> None:
+        names = self.log[0].name if len(self.log) == 1 else f"{len(self.log)} logs"
+        console.print(f"{names}: {outputs} outputs, {made.method}", soft_wrap=True)
+        print_table([[table(made.found)]])
+        for name, own in zip(made.system.output_names, made.residuals, strict=True):
+            if math.isfinite(own.ratio):
+                console.print(
+                    f"residuals of {name}: {own.ratio:.3g} of the expected size, correlation "
+                    f"{own.serial:.2f} from one sample to the next",
+                    soft_wrap=True,
+                )
+        for warning in made.warnings:
+            console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
+        for line in to_paste(made):
+            console.print(line, soft_wrap=True)
+
+
+def table(found: Sequence[Found]) -> Grid:
+    """Return the table of what was found."""
+    columns = (
+        Column("", numeric=False),
+        Column("unit", numeric=False),
+        Column("value"),
+        Column("standard error"),
+    )
+    lines = []
+    for each in found:
+        digits = 6
+        if 0 < each.std < math.inf and each.value:  # two digits of the standard error
+            digits = max(
+                2, 2 + math.floor(math.log10(abs(each.value))) - math.floor(math.log10(each.std))
+            )
+        error = "at its bound" if math.isnan(each.std) else f"{each.std:.2g}"
+        error = "not determined" if math.isinf(each.std) else error
+        lines.append((each.name, each.unit, f"{each.value:.{digits}g}", error))
+    return Grid("", columns, tuple(lines))
+
+
+def to_paste(made: Fitted) -> list[str]:
+    """Return lines with what was found, as code and as options of commands."""
+    lines, parameters = [], made.system.parameters
+    named = [f"{each.name}={each.value:.8g}" for each in made.found if each.name in parameters]
+    if named:
+        lines.append(f"in Python: {type(made.system).__name__}({', '.join(named)})")
+    if made.noise is not None:
+        told = " ".join(f"{value:.4g}" for value in made.noise.noise_std)
+        L = made.noise.process_noise
+        diagonal = L.shape[0] == L.shape[1] and np.count_nonzero(L) == np.count_nonzero(np.diag(L))
+        if diagonal:
+            std = {each.name: each.std for each in made.found}
+            known = [std.get(f"process noise of {name}", 0.0) for name in made.system.state_names]
+            process = " ".join(
+                f"{value if error < value else 0:.4g}"
+                for value, error in zip(np.diag(L), known, strict=True)
+            )
+            lines.append(f"as options: --noise-std {told} --process-noise {process}")
+        else:
+            lines.append(f"as options: --noise-std {told}")
+            lines.append(f"Setup.process_noise: {np.round(L, 12).tolist()}")
+    return lines
+
+
+def facts(made: Fitted) -> dict[str, object]:
+    """Return what was found as plain values; a standard error that is none is None."""
+    found = {
+        each.name: {
+            "value": each.value,
+            "standard_error": each.std if math.isfinite(each.std) else None,
+            "unit": each.unit,
+        }
+        for each in made.found
+    }
+    return {
+        "system": type(made.system).__name__,
+        "method": made.method,
+        "found": found,
+        "correlation": made.correlation.tolist(),
+        "warnings": list(made.warnings),
+    }
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command and return its exit status."""
+    return parse(Fit, "fit", arguments).run()

@@ -1,0 +1,129 @@
+"""What speaks against the fit of a model to logs, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pinnobs_gym.logs.noise_fit import NoiseFit
+from pinnobs_gym.logs.precision import Precision, Residuals
+from pinnobs_gym.logs.unknown import Parameters
+from pinnobs_gym.simulation.system import System
+
+_CLOSE = 0.95
+"""Correlation of two estimates, in size, from which on it is told."""
+_USUAL = (0.5, 2.0)
+"""Range of the residuals over their expected standard deviation."""
+_SERIAL = 0.3
+"""Correlation of residuals from one sample to the next, in size, from which on it is told."""
+_LEAST_GAIN = 1.35
+"""Gain in log-likelihood below which process noise is not told from none: twice this is the 95 %
+quantile of its law if there is none, half a χ² of one degree (Self & Liang 1987, case 5)."""
+
+
+def doubts_of_parameters(parameters: Parameters, d: np.ndarray, known: Precision) -> list[str]:
+    """Return which parameters the logs do not tell, a line each.
+
+    Args:
+        parameters: the unknown ones.
+        d: their values in units of their scale, less the start, shape (p,).
+        known: how well they are known, in units of their scale.
+    """
+    names, values, std = parameters.names, parameters.values(d), known.std[: len(d)]
+    lines = []
+    lost = [name for name, error in zip(names, std, strict=True) if np.isinf(error)]
+    if len(lost) == 1:
+        lines.append(f"the outputs do not depend on {lost[0]}: it is not determined")
+    elif lost:
+        lines.append(
+            f"the outputs depend on {', '.join(lost)} in a combination only: they are not "
+            "determined apart; fit fewer of them"
+        )
+    for i, name in enumerate(names):
+        error = std[i] * parameters.scale[i]
+        if np.isfinite(error) and error >= max(abs(values[i]), parameters.scale[i]):
+            lines.append(
+                f"{name} is not determined: its standard error, {error:.2g}, is as large as the "
+                "value"
+            )
+        if np.isnan(error):
+            lines.append(f"{name} is at its bound, {values[i]:.6g}; the logs want it beyond")
+        for j in range(i):
+            r = known.correlation[i, j]
+            if abs(r) > _CLOSE:
+                lines.append(
+                    f"{names[j]} and {name} are hardly told apart: their errors have the "
+                    f"correlation {r:.3f}"
+                )
+    return lines
+
+
+def doubts_of_residuals(
+    system: System, residuals: Sequence[Residuals], larger: float | None
+) -> list[str]:
+    """Return whether the fit does not explain the logs, a line for each output.
+
+    Args:
+        system: the model.
+        residuals: what those of each output say.
+        larger: the factor by which standard errors were enlarged; None if they are those of noise
+            that was found, or of a filter.
+    """
+    lines = []
+    for name, own in zip(system.output_names, residuals, strict=True):
+        if own.ratio > _USUAL[1]:
+            grown = "" if larger is None else f"; standard errors are enlarged {larger:.2g} times"
+            lines.append(
+                f"the residuals of {name} are {own.ratio:.2g} times the noise that is told: the "
+                f"model does not explain the log, or its noise is told too small{grown}"
+            )
+        elif own.ratio < _USUAL[0]:
+            lines.append(
+                f"the residuals of {name} are {own.ratio:.2g} times the noise that is told, which "
+                "is too large; standard errors are those of the told noise"
+            )
+        if abs(own.serial) > _SERIAL:
+            factor = np.sqrt((1 + min(own.serial, 0.999)) / (1 - min(own.serial, 0.999)))
+            advice = "; try --noise, which takes what the model leaves out as process noise"
+            lines.append(
+                f"the residuals of {name} are correlated, {own.serial:.2f} from one sample to the "
+                "next: the model leaves something out"
+                + (
+                    f", and standard errors are about {factor:.2g} times too small"
+                    if own.serial > 0
+                    else ""
+                )
+                + (advice if larger is not None else "")
+            )
+    return lines
+
+
+def doubts_of_noise(system: System, made: NoiseFit, std: np.ndarray) -> list[str]:
+    """Return what the logs do not tell of the noise, a line each, given the standard errors of the
+    logarithms of the noise of outputs and of the process noise, (n,)."""
+    outputs, process = std[: len(made.outputs)], std[len(made.outputs) :]
+    unsure = [
+        f"noise of {system.output_names[j]}"
+        for j, error in zip(made.outputs, outputs, strict=True)
+        if not error < 1
+    ]
+    lines = []
+    if made.gain_of_process_noise < _LEAST_GAIN:
+        lines.append(
+            "the logs do not tell the process noise from zero: without it, the log-likelihood is "
+            f"{max(0.0, made.gain_of_process_noise):.2g} less; tell none, --process-noise 0"
+        )
+    elif made.usual:
+        names = zip(system.state_names, process, strict=True)
+        unsure += [f"process noise of {name}" for name, error in names if not error < 1]
+    elif not process[0] < 1:
+        unsure.append("process noise")
+    if unsure:
+        lines.append(f"not determined, and perhaps zero: {', '.join(unsure)}")
+    if made.usual:
+        lines.append(
+            "the model tells no process noise; noise of each state was found by itself, which "
+            "stands for whatever the model leaves out"
+        )
+    return lines

@@ -1,0 +1,98 @@
+"""The minimisation of a sum of squares, or of a likelihood, of which the slope is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinnobs_gym.estimation.projection import multipliers
+from pinnobs_gym.simulation.bounds import StateBox
+
+_ROUNDING = 1e-12
+"""Largest relative increase of the cost that counts as none."""
+_DAMPING = (1e-4, 1e10)
+"""The damping at first, and that with which the search is given up."""
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """A cost about a point: ``cost`` − 2·``right``ᵀd + dᵀ·``information``·d after a step d. A
+    difference of 1 in the cost is one standard error."""
+
+    cost: float
+    """The cost at the point; infinite where the model is not defined."""
+    right: np.ndarray
+    """Half of the downward slope, shape (n,)."""
+    information: np.ndarray
+    """Half of the curvature, symmetric and positive semidefinite, shape (n, n)."""
+
+
+@dataclass(frozen=True)
+class Inside:
+    """The points v (n,) for which w = offset + Tv is within bounds."""
+
+    offset: np.ndarray
+    """Shape (n,)."""
+    T: np.ndarray
+    """Shape (n, n)."""
+    box: StateBox
+    """The bounds of w."""
+
+    def nearest(self, v: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """Return the point within the bounds at which a quadratic cost with the minimum v, and with
+        the curvature ``information`` (n, n), positive definite, is least."""
+        w = self.offset + self.T @ v
+        if not self.box.outside(w) or not np.isfinite(w).all():
+            return v
+        C = np.linalg.solve(information, self.T.T)
+        force = multipliers(w[None], (self.T @ C)[None], self.box)[0]
+        return v - C @ force
+
+
+def minimised(
+    evaluate: Callable[[np.ndarray], Quadratic],
+    v: np.ndarray,
+    inside: Inside | None = None,
+    *,
+    most: int,
+    least_gain: float,
+    longest: float = np.inf,
+) -> tuple[np.ndarray, Quadratic]:
+    """Return the point of least cost near v (n,), and the cost about it, by the Levenberg-Marquardt
+    method (Nocedal & Wright 2006, section 10.3), whose steps are kept within bounds.
+
+    Args:
+        evaluate: returns the cost about a point.
+        v: where the search begins.
+        inside: the points that are allowed; all if None.
+        most: largest number of evaluations after the first.
+        least_gain: predicted decrease of the cost at which the search ends.
+        longest: largest change of a component in one step.
+    """
+    best, damping = evaluate(v), _DAMPING[0]
+    if not np.isfinite(best.cost):
+        return v, best
+    for _ in range(most):
+        # Marquardt's scaling; a direction that changes nothing keeps a unit of its own.
+        diagonal = np.diagonal(best.information)
+        size = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        scaled = best.information / np.outer(size, size)
+        damped = scaled + (damping + 1e-14) * np.eye(len(v))
+        step = np.linalg.solve(damped, best.right / size) / size
+        if abs(step).max() > longest:
+            step *= longest / abs(step).max()
+        trial = v + step
+        if inside is not None:
+            trial = inside.nearest(trial, damped * np.outer(size, size))
+        step = trial - v
+        gain = float(step @ best.right)
+        at = evaluate(trial)
+        if at.cost <= best.cost + _ROUNDING * abs(best.cost):
+            v, best, damping = trial, at, damping / 10
+        else:
+            damping *= 10
+        if gain <= least_gain or damping > _DAMPING[1]:
+            break
+    return v, best
