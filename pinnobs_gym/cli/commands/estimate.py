@@ -8,12 +8,12 @@ from pathlib import Path
 
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
-from pinnobs_gym.cli.output import write_estimates, write_figure
+from pinnobs_gym.cli.output import print_judgement, write_estimates, write_figure
 from pinnobs_gym.cli.own_model import own_model
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
-from pinnobs_gym.logs.judgement import doubts
+from pinnobs_gym.logs.judgement import judge
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.simulation.record import Prior
 
@@ -41,6 +41,9 @@ class Estimate:
     state units per √s: one for all states or one for each; the benchmark's if not given."""
     out: Path = Path("estimates.csv")
     """File of the estimates; a figure is written beside it, with the suffix .png."""
+    strict: bool = False
+    """End with status 1 if the judgement of the log has a warning; files are written all the
+    same."""
 
     def run(self) -> int:
         """Estimate, and write the results."""
@@ -65,8 +68,8 @@ class Estimate:
         check_writable(self.out.parent)
         estimator = kind.for_setup(system, setup, **settings_of(kind, self.set))
         estimates = estimator.run(record)
-        for doubt in doubts(system, record, estimates):
-            console.print(f"warning: {doubt}", style="yellow", soft_wrap=True)
+        judgement = judge(system, setup, record, estimates)
+        print_judgement(judgement)
         write_estimates(self.out, system, record, estimates)
         P = None if estimates.P is None else estimates.P[0]
         title = f"{self.log.name}: {type(system).__name__}, {estimator.label}"
@@ -79,7 +82,7 @@ class Estimate:
         time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
         console.print(f"{record.num_samples} samples; at t = {time}: {last}")
         console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
-        return 0
+        return 1 if self.strict and judgement.warnings else 0
 
 
 def run(arguments: Sequence[str]) -> int:
