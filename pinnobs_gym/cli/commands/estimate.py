@@ -160,8 +160,10 @@ def _estimate(log: Log, estimator: BaseEstimator, setup: Setup, out: Path) -> bo
 
 def _found(system: Augmented, log: Log, estimates: Estimates) -> list[str]:
     """Return a line for each unknown constant: its last estimate and what was known of it."""
-    prior, lines = log.record.prior, []
-    for i in range(system.plant.nx, system.nx):
+    prior, lines, plant = log.record.prior, [], system.plant
+    while isinstance(plant, Augmented):
+        plant = plant.plant
+    for i in range(plant.nx, system.nx):
         name = system.state_names[i]
         unit = f" {system.units[name]}" if name in system.units else ""
         mean, std = prior.mean[0, i], np.sqrt(prior.cov[0, i, i])
