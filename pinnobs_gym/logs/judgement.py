@@ -2,84 +2,151 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.logs.facts import FEWEST, common_facts, innovation_facts, state_fact
+from pinnobs_gym.logs.innovation_tests import (
+    Size,
+    correlation_of,
+    drift_of,
+    outliers_of,
+    size_of,
+)
+from pinnobs_gym.logs.input_tests import driven_by
+from pinnobs_gym.logs.meanings import warnings_of
+from pinnobs_gym.logs.normalised import Normalised, normalised
+from pinnobs_gym.logs.unseen import Seen, seen
+from pinnobs_gym.logs.verdicts import OutputTests
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.system import Setup, System, vector
 
 _FAR = 1e3
 """Distance of an estimate from the prior's mean, in scales, from which on it counts as diverged."""
-_USUAL = (0.5, 2.0)
-"""Range of the median normalised innovation squared, relative to its expectation."""
-_CHANCE = 1e-4
-"""Probability below which a median beyond that range is not taken for chance."""
+_UNLIKELY = 6.0
+"""Standard deviations from which on the first innovation of an output speaks against the prior."""
 
 
-def doubts(system: System, record: Record, estimates: Estimates) -> list[str]:
-    """Return what speaks against the estimates of a record's first row, a line each.
+@dataclass(frozen=True)
+class Judgement:
+    """What a log says of the estimates made from it."""
 
-    The normalised innovation squared (NIS) eᵀS⁻¹e of a sample with n outputs follows χ² with n
-    degrees of freedom if the model and its noise are right (Bar-Shalom, Li & Kirubarajan 2001,
-    section 5.4.2). Each sample's is divided by the median of its χ², of which the median over the
-    samples is judged: it does not depend on the start or on a few outliers. Half of the samples are
-    then expected below one, a number that is binomial.
+    facts: tuple[str, ...]
+    """Lines that are always shown: sizes and correlations of innovations, steps of t, states that
+    the outputs tell, missing outputs."""
+    warnings: tuple[str, ...]
+    """What speaks against the estimates, a line each: what is seen, what it means, what to try."""
+
+
+def judge(system: System, setup: Setup, record: Record, estimates: Estimates) -> Judgement:
+    """Judge the estimates of a record's first row.
+
+    The innovations of a filter whose model and noise are right are white and as large as their
+    covariances say (Bar-Shalom, Li & Kirubarajan 2001, section 5.4), which
+    `pinnobs_gym.logs.innovation_tests` tests for each output. Of estimates without innovation
+    covariances, residuals are judged, see `pinnobs_gym.logs.normalised.normalised`. The start of
+    the log is left out, except for the first innovation of each output, which tells of the prior.
+    A log of few samples is not judged.
 
     Args:
         system: the model.
+        setup: its noise, as the estimator was told, and its time between samples.
         record: the samples.
-        estimates: of an estimator; without innovations and their covariances they are only compared
-            with the scale.
+        estimates: of an estimator.
     """
+    if not np.isfinite(estimates.xhat[0]).all():
+        return Judgement(common_facts(system, setup, record), (_not_finite(record, estimates),))
+    found = normalised(system, setup, record, estimates)
+    tests, together = _tests(system, record, found)
+    told = seen(system, setup, record, estimates)
+    facts = [*innovation_facts(found, tests, together), *common_facts(system, setup, record)]
+    warnings = [*_diverged(system, record, estimates), *warnings_of(tests, together)]
+    warnings += _first(system, record, found)
+    if told is not None:
+        facts.append(state_fact(system, told))
+        warnings += _unseen(system, told, estimates)
+    return Judgement(tuple(facts), tuple(warnings))
+
+
+def _tests(
+    system: System, record: Record, found: Normalised
+) -> tuple[list[OutputTests], Size | None]:
+    """Return the tests of the outputs that have enough samples, and the size of all together."""
+    tests = []
+    for i, name in enumerate(system.output_names):
+        rows = np.flatnonzero(np.isfinite(found.values[:, i]))
+        rows = rows[rows >= found.start]
+        if len(rows) < FEWEST:
+            continue
+        values, t = found.values[rows, i], record.t[rows]
+        outliers = outliers_of(values)
+        tests.append(
+            OutputTests(
+                name,
+                size_of(values**2, np.ones(len(values))),
+                correlation_of(values, t),
+                drift_of(values),
+                outliers,
+                (float(t[outliers.first]), float(t[outliers.last])),
+                driven_by(values, rows, record.u[0], system.input_names),
+                bool(found.small_tells[i]),
+                bool(found.white[i]),
+                found.of_filter,
+            )
+        )
+    if found.squares is None or len(tests) < 2:
+        return tests, None
+    rows = np.flatnonzero(np.isfinite(found.squares))
+    rows = rows[rows >= found.start]
+    if len(rows) < FEWEST:
+        return tests, None
+    degrees = np.isfinite(found.values[rows]).sum(axis=1)
+    return tests, size_of(found.squares[rows], degrees)
+
+
+def _unseen(system: System, told: Seen, estimates: Estimates) -> list[str]:
+    names = [name for name, each in zip(system.state_names, told.matters, strict=True) if each]
+    if not names or estimates.P is None:
+        return []
+    return [
+        f"{', '.join(names)}: the variance never fell below that without outputs; these outputs "
+        "tell nothing of it, and its estimate is the model's alone; measure more, or fix it with a "
+        "small --P0-std"
+    ]
+
+
+def _first(system: System, record: Record, found: Normalised) -> list[str]:
+    """Return what the first innovation of each output says of the prior."""
+    if not found.of_filter:
+        return []
+    parts = []
+    for i, name in enumerate(system.output_names):
+        rows = np.flatnonzero(np.isfinite(found.values[:, i]))
+        if len(rows) and abs(found.values[rows[0], i]) > _UNLIKELY:
+            y = record.y[0, rows[0], i]
+            parts.append(f"{name} = {y:.4g} ({abs(found.values[rows[0], i]):.2g} times)")
+    if not parts:
+        return []
+    return [
+        f"the first {', '.join(parts)} is that many standard deviations from what the start says; "
+        "check --xhat0, --P0-std and the unit of the output"
+    ]
+
+
+def _diverged(system: System, record: Record, estimates: Estimates) -> list[str]:
     xhat = estimates.xhat[0]
-    if not np.isfinite(xhat).all():
-        return ["the estimates leave the finite numbers"]
-    lines = []
     far = abs(xhat - record.prior.mean[0]) / vector(system.scale, system.nx, "scale")
     k, i = np.unravel_index(np.argmax(far), far.shape)
-    if far[k, i] > _FAR:
-        lines.append(
-            f"{system.state_names[i]} is estimated as {xhat[k, i]:.6g}, {far[k, i]:.2g} times its "
-            "scale away from the start; the estimator has probably diverged"
-        )
-    if (ratios := _nis_ratios(record, estimates)) is None or not len(ratios):
-        return lines
-    median, low = float(np.median(ratios)), _USUAL[0]
-    if not low <= median <= _USUAL[1] and _chance(ratios) < _CHANCE:
-        size, advice = ("large", "small") if median > 1 else ("small", "large")
-        lines.append(
-            f"the innovations are too {size} for their covariances, by a factor of {median:.2g} in "
-            f"the median of their squares; the model does not explain this log, or its noise is "
-            f"told too {advice}: the standard deviations cannot be trusted"
-        )
-    return lines
+    if far[k, i] <= _FAR:
+        return []
+    return [
+        f"{system.state_names[i]} is estimated as {xhat[k, i]:.6g}, {far[k, i]:.2g} times its "
+        "scale away from the start; the estimator has probably diverged"
+    ]
 
 
-def _nis_ratios(record: Record, estimates: Estimates) -> np.ndarray | None:
-    """Return the NIS of each sample of the first row that has outputs, over its median; None if the
-    estimator reports no innovations, or covariances that are none."""
-    from scipy.special import gammaincinv  # takes long to import
-
-    if estimates.innovation is None or estimates.S is None:
-        return None
-    innovation, S = estimates.innovation[0], estimates.S[0]
-    present = ~np.isnan(record.y[0])
-    ratios = []
-    for pattern in np.unique(present[present.any(axis=1)], axis=0):
-        rows = (present == pattern).all(axis=1)
-        e, own = innovation[rows][:, pattern], S[rows][:, pattern][:, :, pattern]
-        try:
-            squares = np.einsum("ki,ki->k", e, np.linalg.solve(own, e[..., None])[..., 0])
-        except np.linalg.LinAlgError:
-            return None
-        ratios.append(squares / (2 * gammaincinv(pattern.sum() / 2, 0.5)))
-    return np.concatenate([np.empty(0), *ratios])
-
-
-def _chance(ratios: np.ndarray) -> float:
-    """Return the probability that as many of the samples, or more, are on one side of their
-    median."""
-    from scipy.special import bdtr  # takes long to import
-
-    fewer = min(int((ratios > 1).sum()), int((ratios <= 1).sum()))
-    return min(1.0, 2 * float(bdtr(fewer, len(ratios), 0.5)))
+def _not_finite(record: Record, estimates: Estimates) -> str:
+    k = int(np.flatnonzero(~np.isfinite(estimates.xhat[0]).all(axis=1))[0])
+    return f"the estimates leave the finite numbers at t = {record.t[k]:.6g}"

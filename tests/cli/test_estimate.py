@@ -252,7 +252,10 @@ def test_least_squares_finds_the_same_constant(folder):
     assert found == pytest.approx([4.4, 4.4], abs=0.06)
 
 
-@pytest.mark.parametrize("name", ["kkl_supervised", "kkl_pinn", "kkl_autoencoder", "pinn_gain"])
+@pytest.mark.parametrize(
+    "name",
+    ["kkl_supervised", "kkl_pinn", "kkl_autoencoder", "pinn_gain", "pinn_obs_replay", "sb3"],
+)
 def test_a_trained_estimator_on_a_log_is_as_on_the_record(folder, shipped, name):
     game = Game.of("ReverseDuffing")
     record = game.record([0])

@@ -141,7 +141,7 @@ def test_a_flag_and_its_opposite():
     [
         ("evaluate --system Academic --set huber=1 --set huber=2", "'huber' is given twice"),
         ("evaluate --system Academic --set gate=x", "'gate=x'; expected None or a number"),
-        ("estimate --system Academic --log a.csv --log b.csv", "--log is given twice"),
+        ("estimate --system Academic --log a.csv --out b.csv --out c.csv", "--out is given twice"),
         (
             "evaluate --system Academic --estimator pinn_obs --set transfer=banana",
             "setting 'transfer=banana'; expected True or False",

@@ -10,13 +10,13 @@ import numpy as np
 
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
-from pinnobs_gym.cli.output import write_estimates, write_figure
+from pinnobs_gym.cli.output import print_judgement, write_estimates, write_figure
 from pinnobs_gym.cli.own_model import own_model
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
-from pinnobs_gym.logs.judgement import doubts
+from pinnobs_gym.logs.judgement import judge
 from pinnobs_gym.logs.reading import Log, read_log
 from pinnobs_gym.simulation.augmented_system import Augmented
 from pinnobs_gym.simulation.record import Prior
@@ -58,6 +58,8 @@ class Estimate:
     out: Path = Path("estimates.csv")
     """File of the estimates, of several logs estimates-LOG.csv; t is in s, from the first sample on
     if the log has dates. A figure is written beside it, with the suffix .png."""
+    strict: bool = False
+    """End with status 1 if the judgement of a log has a warning; files are written all the same."""
 
     def run(self) -> int:
         """Estimate each log, and write the results."""
@@ -87,9 +89,10 @@ class Estimate:
         logs = [read_log(path, system, prior, self.columns) for path in self.log]
         estimators = [self._estimator(kind, log, setup) for log in logs]
         check_writable(self.out.parent)
+        doubted = False
         for log, estimator, out in zip(logs, estimators, outs, strict=True):
-            _estimate(log, estimator, out)
-        return 0
+            doubted |= _estimate(log, estimator, setup, out)
+        return 1 if self.strict and doubted else 0
 
     def _estimator(self, kind: type[BaseEstimator], log: Log, setup: Setup) -> BaseEstimator:
         """Return the estimator of a log."""
@@ -126,14 +129,15 @@ def _outs(out: Path, logs: Sequence[Path]) -> list[Path]:
     return outs
 
 
-def _estimate(log: Log, estimator: BaseEstimator, out: Path) -> None:
-    """Estimate the states of a log; write them with a figure, and print the last ones."""
+def _estimate(log: Log, estimator: BaseEstimator, setup: Setup, out: Path) -> bool:
+    """Estimate the states of a log; write them with a figure, and print the last ones. Returns
+    whether the judgement of the log has a warning."""
     system, record = log.system, log.record
     for note in log.notes:
         console.print(note, soft_wrap=True, highlight=False)
     estimates = estimator.run(record)
-    for doubt in doubts(system, record, estimates):
-        console.print(f"warning: {doubt}", style="yellow", soft_wrap=True)
+    judgement = judge(system, setup, record, estimates)
+    print_judgement(judgement)
     write_estimates(out, system, record, estimates)
     P = None if estimates.P is None else estimates.P[0]
     title = f"{log.path.name}: {type(system).__name__}, {estimator.label}"
@@ -151,12 +155,15 @@ def _estimate(log: Log, estimator: BaseEstimator, out: Path) -> None:
         for line in _found(system, log, estimates):
             console.print(line, soft_wrap=True)
     console.print(f"estimates: {out}; picture: {picture}", soft_wrap=True)
+    return bool(judgement.warnings)
 
 
 def _found(system: Augmented, log: Log, estimates: Estimates) -> list[str]:
     """Return a line for each unknown constant: its last estimate and what was known of it."""
-    prior, lines = log.record.prior, []
-    for i in range(system.plant.nx, system.nx):
+    prior, lines, plant = log.record.prior, [], system.plant
+    while isinstance(plant, Augmented):
+        plant = plant.plant
+    for i in range(plant.nx, system.nx):
         name = system.state_names[i]
         unit = f" {system.units[name]}" if name in system.units else ""
         mean, std = prior.mean[0, i], np.sqrt(prior.cov[0, i, i])

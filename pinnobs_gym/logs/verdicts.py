@@ -1,0 +1,91 @@
+"""What the tests of an output's innovations say together.
+
+A warning takes a probability below `CHANCE`, so that a right log is not blamed by chance, and an
+effect that matters, so that a long log of a nearly right model is not blamed either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pinnobs_gym.logs.innovation_tests import Correlation, Drift, Outliers, Size
+from pinnobs_gym.logs.input_tests import Driven
+
+CHANCE = 1e-4
+"""Probability, over all outputs, below which something is not taken for chance."""
+USUAL = (0.5, 2.0)
+"""Range of the median of normalised squares over their expectation that is usual."""
+CORRELATED = 0.3
+"""Size of a correlation, of neighbours or with an input, from which on it matters."""
+DRIFTING = 3.0
+"""Variance of means of blocks, over that of white values, from which on it matters."""
+MANY = 0.01
+"""Share of values beyond the bound of outliers from which on it matters."""
+SINGLE = 3.0
+"""Number of samples over which such values come together below which they are single wrong outputs,
+with what each does to the next estimates."""
+
+
+@dataclass(frozen=True)
+class OutputTests:
+    """The tests of one output."""
+
+    name: str
+    """Its name."""
+    size: Size
+    """That of its innovations or residuals."""
+    correlation: Correlation
+    """That of each with the next."""
+    drift: Drift
+    """That of means of blocks."""
+    outliers: Outliers
+    """Those among them."""
+    when: tuple[float, float]
+    """Times of the first and the last outlier."""
+    driven: Driven
+    """How well an input tells the values."""
+    small_tells: bool
+    """Whether values that are too small speak against the noise."""
+    white: bool
+    """Whether values of a right model are uncorrelated."""
+    of_filter: bool
+    """Whether these are innovations with covariances; otherwise residuals."""
+
+    def verdict(self, chance: float) -> str:
+        """Return what is wrong, a key of `pinnobs_gym.logs.meanings.MEANINGS`; an empty text if
+        nothing is.
+
+        Args:
+            chance: probability below which something is not taken for chance.
+        """
+        size, r, out = self.size, self.correlation, self.outliers
+        alike = self.white and r.chance < chance and r.value > CORRELATED
+        alike |= self.white and self.drift.chance < chance and self.drift.ratio > DRIFTING
+        opposite = self.of_filter and r.chance < chance and r.value < -CORRELATED
+        # Values that are alike are few independent ones, but already told by their likeness.
+        told = alike or size.chance < chance
+        large, small = told and size.median > USUAL[1], told and size.median < USUAL[0]
+        small &= self.small_tells
+        far = out.chance < chance and out.share > MANY
+        if far and out.memory < SINGLE and size.median < USUAL[1] ** 2 and not (large and alike):
+            return "outliers"
+        if large:
+            return ("unexplained" if alike else "noisy") if self.of_filter else "not reproduced"
+        if small:
+            return "smooth" if alike else "hasty" if opposite else "quiet"
+        if alike:
+            return "slow"
+        if self.follows_input(chance):
+            return "driven"
+        return "hasty" if opposite else "bursts" if far and self.of_filter else ""
+
+    def follows_input(self, chance: float) -> bool:
+        """Return whether an input tells the innovations; see `verdict`."""
+        driven = self.driven
+        return self.of_filter and driven.chance < chance and driven.value > CORRELATED
+
+    @property
+    def badness(self) -> float:
+        """How far the size is from the expected one, as a factor of at least 1."""
+        median = self.size.median
+        return max(median, 1 / median) if median > 0 else float("inf")

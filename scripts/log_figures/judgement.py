@@ -1,0 +1,298 @@
+"""Right logs and wrong ones, and whether the judgement of a log tells them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from benchmarks import Figure, at_least, at_most
+from benchmarks.plants.battery import Battery
+from benchmarks.plants.logs import Pendulum
+from benchmarks.plants.radar import Radar
+
+from log_figures.judged_plants import Cart, DrivenCar, Swing, Tank
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.logs.judgement import Judgement, judge
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import Setup, System
+from pinnobs_gym.systems.academic import Academic
+from pinnobs_gym.systems.harmonic_oscillator import HarmonicOscillator
+from pinnobs_gym.systems.induction_motor import InductionMotor
+from pinnobs_gym.systems.modified_academic import ModifiedAcademic
+from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
+from pinnobs_gym.systems.satellite import Satellite
+
+SEEDS = range(10)
+"""Seeds of the logs of each kind."""
+DURATION: dict[type[System], float] = {Battery: 1500.0}
+"""Durations in s of plants whose episodes are longer than needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Logs, and what an engineer tells of them."""
+
+    system: System
+    """The model."""
+    setup: Setup
+    """Its noise."""
+    record: Record
+    """A log in each row."""
+    x: np.ndarray
+    """The true states, shape (batch, num_samples, nx)."""
+
+
+Change = Callable[[Told, np.random.Generator], Told]
+"""What is wrong with logs."""
+
+
+@lru_cache(maxsize=32)
+def right(cls: type[System], seeds: Sequence[int] = SEEDS) -> Told:
+    """Return right logs of a plant."""
+    source = EpisodeSource(cls, duration=DURATION.get(cls))
+    episodes = source.play(source.draw(source.streams(seeds)))
+    record = source.record(episodes)
+    return Told(
+        source.system, source.setup, record, episodes.x[: record.num_samples].swapaxes(0, 1)
+    )
+
+
+def judged(told: Told, estimator: str = "ekf") -> list[Judgement]:
+    """Return the judgement of each log."""
+    made = ESTIMATORS.resolve(estimator).for_setup(told.system, told.setup).run(told.record)
+    found = []
+    for row in range(told.record.batch):
+        rows = slice(row, row + 1)
+        arrays = {name: value[rows] for name, value in vars(made).items() if value is not None}
+        own = Estimates(**arrays)
+        found.append(judge(told.system, told.setup, told.record.rows(rows), own))
+    return found
+
+
+def _outputs(told: Told, i: int | slice, values: np.ndarray) -> Told:
+    y = told.record.y.copy()
+    y[..., i] = values
+    return replace(told, record=replace(told.record, y=y))
+
+
+def times(i: int, factor: float) -> Change:
+    """An output in another unit, or of the other sign."""
+    return lambda told, rng: _outputs(told, i, factor * told.record.y[..., i])
+
+
+def swapped(told: Told, rng: np.random.Generator) -> Told:
+    """The first two outputs in each other's column."""
+    return _outputs(told, slice(0, 2), told.record.y[..., 1::-1])
+
+
+def other_state(j: int) -> Change:
+    """A sensor of another state in the first output's place."""
+
+    def change(told: Told, rng: np.random.Generator) -> Told:
+        noise = 0.02 * rng.standard_normal(told.x.shape[:2])
+        return _outputs(told, 0, told.x[..., j] + noise)
+
+    return change
+
+
+def output_noise(factor: float) -> Change:
+    """An output noise that is told larger or smaller than it is."""
+
+    def change(told: Told, rng: np.random.Generator) -> Told:
+        level = factor * np.asarray(told.setup.noise_std, dtype=float)
+        return replace(told, setup=replace(told.setup, noise_std=level.tolist()))
+
+    return change
+
+
+def process_noise(factor: float) -> Change:
+    """A process noise that is told larger or smaller than it is."""
+
+    def change(told: Told, rng: np.random.Generator) -> Told:
+        level = factor * np.asarray(told.setup.process_noise, dtype=float)
+        return replace(told, setup=replace(told.setup, process_noise=level.tolist()))
+
+    return change
+
+
+def outliers(told: Told, rng: np.random.Generator) -> Told:
+    """Outputs of which 5 % have an error of ten standard deviations."""
+    y = told.record.y
+    level = np.broadcast_to(np.asarray(told.setup.noise_std, dtype=float), y.shape[-1])
+    wrong = (rng.random(y.shape) < 0.05) * rng.standard_normal(y.shape)
+    return _outputs(told, slice(None), y + 10 * level * wrong)
+
+
+def late(samples: int, outputs: slice = slice(None)) -> Change:
+    """Outputs that are stamped some samples late."""
+
+    def change(told: Told, rng: np.random.Generator) -> Told:
+        y = told.record.y[..., outputs]
+        blank = np.full_like(y[:, :samples], np.nan)
+        return _outputs(told, outputs, np.concatenate([blank, y[:, :-samples]], axis=1))
+
+    return change
+
+
+def without_input(i: int, factor: float = 0.0) -> Change:
+    """An input whose column is zero, or has the wrong sign or unit."""
+
+    def change(told: Told, rng: np.random.Generator) -> Told:
+        u = told.record.u.copy()
+        u[..., i] *= factor
+        system = replace(told.system, measured_input=True)
+        return replace(told, system=system, record=replace(told.record, u=u))
+
+    return change
+
+
+def parameters(**values: float) -> Change:
+    """A model with other parameters."""
+    return lambda told, rng: replace(told, system=replace(told.system, **values))
+
+
+def model(cls: type[System]) -> Change:
+    """A model of another structure."""
+    return lambda told, rng: replace(told, system=cls())
+
+
+def without(outputs: slice) -> Change:
+    """Sensors that are not there, so that a state cannot be seen."""
+    return lambda told, rng: _outputs(told, outputs, np.asarray(np.nan))
+
+
+RIGHT = (
+    Cart,
+    Tank,
+    DrivenCar,
+    Battery,
+    Radar,
+    Pendulum,
+    ReverseDuffing,
+    HarmonicOscillator,
+    Academic,
+    ModifiedAcademic,
+    Satellite,
+    InductionMotor,
+)
+"""Plants of which right logs are judged."""
+DEGREES = 180 / np.pi
+WRONG: dict[str, tuple[tuple[str, type[System], Change], ...]] = {
+    "unit": (
+        ("degrees for radians", Pendulum, times(0, DEGREES)),
+        ("radians for degrees", Pendulum, times(0, 1 / DEGREES)),
+        ("bearing in degrees", Radar, times(1, DEGREES)),
+        ("mV for V", Battery, times(0, 1e3)),
+        ("V for mV", Battery, times(0, 1e-3)),
+        ("mA for A", Battery, without_input(0, 1e3)),
+        ("cm for m", Tank, times(1, 100.0)),
+        ("km/h for m/s", DrivenCar, times(2, 3.6)),
+    ),
+    "sign": (
+        ("current", Battery, without_input(0, -1.0)),
+        ("turn", DrivenCar, without_input(0, -1.0)),
+        ("range", Radar, times(0, -1.0)),
+        ("force", Cart, without_input(0, -1.0)),
+        ("speed", Cart, times(1, -1.0)),
+        ("one current of the motor", InductionMotor, times(0, -1.0)),
+    ),
+    "wrong sensor": (
+        ("columns swapped, radar", Radar, swapped),
+        ("columns swapped, tanks", Tank, swapped),
+        ("columns swapped, cart", Cart, swapped),
+        ("north for east", DrivenCar, swapped),
+        ("columns swapped, motor", InductionMotor, swapped),
+        ("x2 for x1", ReverseDuffing, other_state(1)),
+        ("x3 for x1", Satellite, other_state(2)),
+        ("x2 for x1, modified", ModifiedAcademic, other_state(1)),
+    ),
+    "R told too small": tuple(
+        (f"{what}, {cls.__name__}", cls, output_noise(factor))
+        for cls in (Cart, Battery, Radar, ReverseDuffing, Satellite, Tank)
+        for what, factor in (("std / 10", 0.1), ("variance / 10", 0.1**0.5))
+    ),
+    "R told too large": tuple(
+        (f"{what}, {cls.__name__}", cls, output_noise(factor))
+        for cls in (Cart, Battery, Radar, ReverseDuffing, Satellite, Tank)
+        for what, factor in (("std x 10", 10.0), ("variance x 10", 10.0**0.5))
+    ),
+    "Q told too small": tuple(
+        (f"{what}, {cls.__name__}", cls, process_noise(factor))
+        for cls in (Cart, Radar, DrivenCar, Tank)
+        for what, factor in (("std / 10", 0.1), ("variance / 10", 0.1**0.5))
+    ),
+    "Q told too large": tuple(
+        (f"{what}, {cls.__name__}", cls, process_noise(factor))
+        for cls in (Cart, Radar, DrivenCar, Tank)
+        for what, factor in (("std x 10", 10.0), ("variance x 10", 10.0**0.5))
+    ),
+    "outliers": tuple(
+        (cls.__name__, cls, outliers)
+        for cls in (Cart, Battery, Radar, ReverseDuffing, Pendulum, InductionMotor, DrivenCar)
+    ),
+    "late clock": (
+        ("voltage, 5 s", Battery, late(5)),
+        ("all outputs, 3 samples", DrivenCar, late(3)),
+        ("speed, 3 samples", DrivenCar, late(3, slice(2, 3))),
+        ("bearing, 3 samples", Radar, late(3, slice(1, 2))),
+        ("5 ms, motor", InductionMotor, late(5)),
+        ("5 s, tanks", Tank, late(5)),
+        ("0.3 s, cart", Cart, late(3)),
+    ),
+    "missing input": (
+        ("current", Battery, without_input(0)),
+        ("gyroscope", DrivenCar, without_input(0)),
+        ("accelerometer", DrivenCar, without_input(1)),
+        ("force", Cart, without_input(0)),
+        ("inflow", Tank, without_input(0)),
+        ("voltage", InductionMotor, without_input(1)),
+    ),
+    "wrong plant": (
+        ("frequency 3 % off", Pendulum, parameters(w2=66.15)),
+        ("linear for a sine", Pendulum, model(Swing)),
+        ("R0 three times", Battery, parameters(R0=0.06)),
+        ("drain 30 % off", Tank, parameters(drain=0.26)),
+        ("friction three times", Cart, parameters(friction=0.9)),
+        ("stator resistance 30 % off", InductionMotor, parameters(R_s=0.234)),
+        ("modified for academic", Academic, model(ModifiedAcademic)),
+        ("oscillator for Duffing", ReverseDuffing, model(HarmonicOscillator)),
+    ),
+    "state not seen": (
+        ("position, from speed", Cart, without(slice(0, 1))),
+        ("position, from speed", DrivenCar, without(slice(0, 2))),
+    ),
+}
+"""What is told wrongly, by kind: name, plant and change."""
+
+
+def wrong(cls: type[System], change: Change) -> Told:
+    """Return wrong logs of a plant."""
+    told = change(right(cls), np.random.default_rng(1))
+    if told.system.nx != right(cls).system.nx:  # another model has another prior
+        system, setup = type(told.system).configured()
+        source = EpisodeSource(type(told.system))
+        empty = source.record(source.play(source.draw(source.streams(SEEDS))))
+        record = replace(told.record, prior=empty.prior)
+        return replace(told, system=system, setup=setup, record=record)
+    return told
+
+
+def figures(repeats: int) -> Iterator[Figure]:
+    """Measure how many right logs are blamed, and how many wrong ones are told, by kind."""
+    for estimator in ("ekf", "ukf"):
+        blamed = [bool(each.warnings) for cls in RIGHT for each in judged(right(cls), estimator)]
+        what = f"right logs of {len(RIGHT)} plants, {estimator}"
+        yield at_most(f"{what}: false alarms of {len(blamed)}", sum(blamed), "", 0)
+        for kind, cases in WRONG.items():
+            told = [
+                bool(each.warnings)
+                for _, cls, change in cases
+                for each in judged(wrong(cls, change), estimator)
+            ]
+            asked = 0.9 if kind != "Q told too large" else None
+            label = f"wrong logs, {kind}, {estimator}: told, of {len(told)}"
+            yield at_least(label, 100 * sum(told) / len(told), "%", asked and 100 * asked)
