@@ -60,7 +60,7 @@ def _values(system: System, name: str, value: Any, count: int) -> list[float]:
         if type(values) is not list:
             values = values if type(values) is tuple else (values,)
         total = sum(values)
-        if len(values) == count and isinstance(total, float):
+        if len(values) == count and (isinstance(total, float) or not count):
             # The sum of finite numbers is finite, unless some are huge.
             if total - total == 0.0:
                 return [*values]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -11,16 +12,17 @@ from pinnobs_gym.estimation.estimator import BaseEstimator, Estimator, State
 from pinnobs_gym.estimation.live_estimate import Estimate
 from pinnobs_gym.estimation.live_sample import Sample
 from pinnobs_gym.estimation.live_steps import ByNumpy, InBuffers, Point, Steps
+from pinnobs_gym.simulation.plant_form import first_row
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.start_law import check_covariance
 from pinnobs_gym.simulation.system import System, is_number, vector
 
 
 def check_online(estimator: Any) -> None:
-    """Check that an estimator is an online one.
+    """Check that an estimator is an online one of one plant.
 
     Raises:
-        ValueError: in one line, if it is offline, or changes in place.
+        ValueError: in one line, if it is offline, changes in place, or has parameters by row.
         TypeError: in one line, if it is no estimator.
     """
     if not isinstance(estimator, BaseEstimator):
@@ -35,6 +37,15 @@ def check_online(estimator: Any) -> None:
             f"{estimator.label} is an adapter of objects that change in place, so that no sample "
             "could be taken back; expected an Estimator"
         )
+    system = estimator.system
+    one = first_row(system)
+    for name in (f.name for f in fields(system)):
+        value = getattr(system, name)
+        if np.shape(value) != np.shape(getattr(one, name)):
+            raise ValueError(
+                f"{name} of {type(system).__name__} has {len(value)} values; expected that of one "
+                "plant"
+            )
 
 
 def check_settings(late: Any, ring: Any, longest_gap: Any) -> None:
@@ -48,7 +59,7 @@ def check_settings(late: Any, ring: Any, longest_gap: Any) -> None:
     if isinstance(ring, bool) or not isinstance(ring, int | np.integer) or ring < 1:
         raise ValueError(f"ring={ring!r}; expected a whole number of at least 1 sample")
     if not (is_number(longest_gap) and longest_gap > 0):
-        raise ValueError(f"longest_gap={longest_gap!r}; expected a positive number of seconds")
+        raise ValueError(f"longest_gap={longest_gap!r}; expected a positive number of s")
 
 
 def prior_of(system: System, xhat0: Any, P0: Any) -> Prior:
@@ -68,11 +79,7 @@ def prior_of(system: System, xhat0: Any, P0: Any) -> Prior:
 
 def prepare(estimator: Estimator, steps: Steps, begun: State, dt: float) -> None:
     """Try the first steps of an estimator, so that nothing is left to be imported, compiled or
-    designed at a sample. The outputs are those of the prior's mean, and missing ones.
-
-    Raises:
-        ValueError: in one line, if the model is not that of one plant.
-    """
+    designed at a sample. The outputs are those of the prior's mean, and missing ones."""
     system = estimator.system
     # Compiled code leaves some samples to NumPy.
     ways = [steps, ByNumpy(estimator)] if type(steps) is InBuffers else [steps]
@@ -83,11 +90,6 @@ def prepare(estimator: Estimator, steps: Steps, begun: State, dt: float) -> None
             u = np.asarray(system.input(np.array([t])))
             with np.errstate(all="ignore"):
                 y = np.asarray(system.h(t, begun.xhat, u))
-            if y.shape != (1, system.ny):
-                raise ValueError(
-                    f"{type(system).__name__} has parameters of {len(y)} rows; expected those of "
-                    "one plant"
-                )
             y = np.where(np.isfinite(y) & (not missing), y, np.nan)
             sample = Sample(t, y[0].tolist(), u[0].tolist())
             point = way(point, sample)
