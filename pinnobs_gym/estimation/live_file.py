@@ -69,7 +69,7 @@ def read(path: Path, estimator: Estimator) -> dict[str, Any]:
         orders = header["orders"]
         ordered = [arrays[f"array{i}"] for i in range(len(orders))]
         found = [
-            array.transpose(np.argsort(order)) if order else array
+            array.transpose(np.argsort(order).astype(int))  # an empty order is of floats
             for array, order in zip(ordered, orders, strict=True)
         ]
         content = Tree(estimator, found).value(header["content"])

@@ -40,11 +40,11 @@ def identity(estimator: Estimator) -> dict[str, Any]:
     own = {f.name: getattr(estimator, f.name) for f in fields(estimator) if f.name not in shared}
     found = {
         "estimator": type(estimator).__name__,
-        "settings": own,
-        "noise": {"output R": noise.R(0.0), "process L": noise.L(0.0), "by sample": noise.samples},
         "model": type(system).__name__,
         "parameters": system.parameters,
         "traits": {name: getattr(system, name) for name in _TRAITS},
+        "settings": own,
+        "noise": {"output R": noise.R(0.0), "process L": noise.L(0.0), "by sample": noise.samples},
         "equations": _equations(system),
     }
     return json.loads(json.dumps(_plain(found)))

@@ -103,4 +103,4 @@ def in_memory_order(array: np.ndarray) -> tuple[np.ndarray, list[int]]:
     """Return an array with its axes in the order in which memory has them, and that order. Sums are
     formed along it, so that another order would give other roundings."""
     order = np.argsort([-abs(stride) for stride in array.strides], kind="stable").tolist()
-    return np.ascontiguousarray(array.transpose(order)), order
+    return np.array(array.transpose(order), order="C"), order
