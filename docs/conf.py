@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # in the tutorial's kernel, too
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # in the kernels of executed pages, too
+# So are the commands of this installation.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 import pages
 
@@ -20,7 +22,8 @@ smartquotes = False  # the mark of x' is a prime
 
 myst_enable_extensions = ["dollarmath", "attrs_inline"]
 myst_heading_anchors = 3
-nb_execution_mode = "force"  # what the tutorial shows is what this package does
+nb_execution_mode = "force"  # what the tutorial and the guides show is what this package does
+nb_execution_in_temp = True  # where guides write their models, logs and pictures
 nb_execution_raise_on_error = True
 nb_execution_timeout = 120
 nb_merge_streams = True

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.augmented import augmented
     from pinnobs_gym.simulation.augmented_system import Unknown
-    from pinnobs_gym.simulation.system import Setup, System, stack
+    from pinnobs_gym.simulation.system import Setup, System, independent, stack
     from pinnobs_gym.simulation.table import table
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "__version__",
     "augmented",
     "evaluate",
+    "independent",
     "load",
     "read_rows",
     "register",
@@ -48,6 +49,7 @@ _HOMES = {
     "Live": "estimation.live",
     "Setup": "simulation.system",
     "System": "simulation.system",
+    "independent": "simulation.system",
     "Unknown": "simulation.augmented_system",
     "augmented": "simulation.augmented",
     "stack": "simulation.system",

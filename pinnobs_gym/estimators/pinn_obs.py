@@ -100,6 +100,8 @@ def estimates_of(rows: Sequence[TrainedNetwork], t: np.ndarray) -> Estimates:
 STEP = 0.7
 """Longest step of the replay, relative to the time constant of the gain; the Runge-Kutta method is
 stable up to 2.8."""
+OUTSIDE = 0.01
+"""Share of the training record by which the times of another may exceed its own."""
 _TAKES = EVERYTHING - {"maps", "stiff", "bounds"}
 """What a plant may have: the rate of change is needed, at points of a loss or by explicit steps."""
 MOST_STEPS = 200
@@ -140,6 +142,18 @@ class PinnObsReplay(LearnedEstimator, Estimator):
     needs_training = "pinn_obs"
     recipe = MappingProxyType({"preset": "transfer"})
     variants = (MappingProxyType({}), MappingProxyType({"preset": "plain"}))
+
+    def unfit(self, t: np.ndarray) -> str:
+        """Return which times are not among those of the training record: the gain is a function of
+        time, which a network does not continue."""
+        first, last = float(self.trained.t[0]), float(self.trained.t[-1])
+        margin = OUTSIDE * (last - first)
+        if first - margin <= t[0] and t[-1] <= last + margin:
+            return ""
+        return (
+            f"was trained on t={first:g} s to {last:g} s; the record has t={t[0]:g} s to "
+            f"{t[-1]:g} s, where its gain was not learned"
+        )
 
     def reset(self, prior: Prior) -> State:
         return State(prior.mean)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.envs.actions import AgentMemory, Form, form_of
+from pinnobs_gym.envs.actions import AgentMemory, EstimateForm, Form, form_of
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.learned.perceptron import perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
@@ -26,6 +26,8 @@ Layer = tuple[np.ndarray, np.ndarray]
 
 SETUP = ("xhat0", "P0", "dt", "duration", "noise_std")
 """Fields of the training's setup that the form of actions and features uses."""
+SAME_STEP = 0.05
+"""Largest relative difference of a step from that of the training."""
 TINY = 1e-8
 """Number that SB3's ``VecNormalize`` adds to the variance of features."""
 
@@ -148,6 +150,26 @@ e_k = y_k - h(t_k, \hat x_k^-, u_k) \\
     @cached_property
     def _form(self) -> Form:
         return self.trained.form(self.system, self.noise_std)
+
+    def unfit(self, t: np.ndarray) -> str:
+        """Return what differs from the training: the step, on which the meaning of actions depends,
+        or an end after T for a form that sees t/T."""
+        dt = float(self.trained.setup["dt"])
+        steps = np.diff(t)
+        wrong = np.flatnonzero(abs(steps - dt) > SAME_STEP * dt)
+        if len(wrong):
+            k = wrong[0]
+            return (
+                f"was trained on samples every {dt:g} s; the record has a step of {steps[k]:.6g} s "
+                f"at t={t[k]:g} s, and the agent acts once per sample"
+            )
+        lasts, longest = float(t[-1] - t[0]), self._form.duration
+        if isinstance(self._form, EstimateForm) and lasts > longest * (1 + SAME_STEP):
+            return (
+                f"was trained on episodes of {longest:g} s; the record lasts {lasts:g} s, and the "
+                f"agent (action mode {self.trained.action_mode}) sees how much of that is over"
+            )
+        return ""
 
     def reset(self, prior: Prior) -> State:
         return State(np.asarray(prior.mean, dtype=float))

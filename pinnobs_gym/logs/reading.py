@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
-from pinnobs_gym.simulation.motion import check_steps
+from pinnobs_gym.logs.columns import chosen, unused
+from pinnobs_gym.logs.formulas import Formula
+from pinnobs_gym.logs.table import Table, listed, read_table, shown
+from pinnobs_gym.logs.times import check_times, read_times, without_rounding
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
-
-_SHOWN = 60
-"""Number of characters of a text that a message shows."""
 
 
 @dataclass(frozen=True)
@@ -30,137 +29,121 @@ class Log:
     """The samples."""
     lines: np.ndarray
     """The line of each sample in the file, shape (num_samples,)."""
+    notes: tuple[str, ...] = ()
+    """Lines to tell the user, such as the columns that are not used."""
+    start: datetime | None = None
+    """The instant of the first sample, if the file has dates and times; None if it has numbers."""
 
 
-def read_log(path: str | Path, system: System, prior: Prior) -> Log:
-    """Read a log from a CSV file with columns t (s), y1, y2, ... and, if the system has inputs,
-    u1, u2, ... Sample times may be irregular. An empty cell or ``nan`` is a missing output, or an
-    input that keeps its last value. Columns y1_std, y2_std, ... hold the standard deviation of an
-    output's noise at each sample, where it is known. Other columns are ignored.
+def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[str] = ()) -> Log:
+    """Read a log from a CSV file with a header.
 
-    A file without columns u uses the input that the system's class defines, if it defines one.
+    Its columns are t (s, or steps of a map), the outputs as y1, y2, ... or by their own names, and,
+    if the system has inputs, these as u1, u2, ... or by their own names. Sample times may be
+    irregular. An empty cell or ``nan`` is a missing output, or an input that keeps its last value.
+    Columns y1_std or ``<output>_std`` hold the standard deviation of an output's noise at each
+    sample, where it is known. Other columns are not used, which a note says.
+
+    Times may be dates and times by ISO 8601, all with an offset from UTC or all without. They are
+    read as seconds since the first sample, with `Log.start` the instant of that.
+
+    A file without columns of inputs uses the input that the system's class defines, if it defines
+    one. Cells may be separated by semicolons or tabs, too, then also with decimal commas.
+
+    Args:
+        path: the file.
+        system: the model.
+        prior: the prior of the record.
+        columns: columns under other names or in other units, as ``target=formula``: such as
+            ``t=millis*1e-3``, ``y1=voltage`` or ``t={Time (s)}``; see
+            `pinnobs_gym.logs.formulas.Formula` and `pinnobs_gym.logs.columns.chosen`.
 
     Raises:
-        ValueError: in one line that names the file, the row and what was expected.
+        ValueError: in one line that names the file, the line and what was expected; also if times
+            seem to be in another unit than the model's.
     """
-    path = Path(path)
-    rows = _rows(path)
-    if not rows:
-        raise ValueError(f"log {path} is empty; expected a header and rows of numbers")
-    header = [name.strip() for name in rows[0][1]]
-    outputs = [f"y{i + 1}" for i in range(system.ny)]
-    inputs = [f"u{i + 1}" for i in range(system.nu)]
-    if type(system).input is not System.input and not set(inputs) & set(header):
-        inputs = []
-    missing = [name for name in ["t", *outputs, *inputs] if name not in header]
-    if missing:
-        raise ValueError(
-            f"log {path} has no column {', '.join(missing)}; {type(system).__name__} needs "
-            f"{', '.join(['t', *outputs, *inputs])}, and the header has {', '.join(header)}"
-        )
-    levels = [name for name in (f"{output}_std" for output in outputs) if name in header]
-    read = ["t", *outputs, *inputs, *levels]
-    twice = [name for name in read if header.count(name) > 1]
-    if twice:
-        raise ValueError(f"log {path} has column {twice[0]} twice")
-    columns = {name: header.index(name) for name in read}
-    table = {name: np.empty(len(rows) - 1) for name in columns}
-    for i, (number, row) in enumerate(rows[1:]):
-        if len(row) != len(header):
-            raise ValueError(f"log {path}, line {number}: {len(row)} cells; expected {len(header)}")
-        for name, column in columns.items():
-            table[name][i] = _number(row[column], name, f"log {path}, line {number}")
-    t = table["t"]
-    if not len(t):
-        raise ValueError(f"log {path} has a header but no rows")
-    wrong = np.flatnonzero(~(np.diff(t) > 0))
-    if len(wrong):
-        number, later, earlier = rows[wrong[0] + 2][0], t[wrong[0] + 1], t[wrong[0]]
-        raise ValueError(f"log {path}, line {number}: t={later} after {earlier}; t must increase")
-    _check_gaps(system, t, [f"log {path}, line {number}" for number, _ in rows[1:]])
-    y = np.stack([table[name] for name in outputs], axis=-1)[None]
+    table = read_table(Path(path))
+    formulas = chosen(system, table, columns)
+    t, start = read_times(table, formulas["t"])
+    t = without_rounding(t) if system.discrete else t
+    insisted = _insisted(formulas["t"], columns)
+    check_times(system, table, t, None if insisted else formulas["t"])
+    values = {name: _values(table, name, f) for name, f in formulas.items() if name != "t"}
+    outputs = [values[f"y{i + 1}"] for i in range(system.ny)]
+    y = np.stack(outputs, axis=-1)[None]
     if np.isnan(y).all():
-        raise ValueError(f"log {path} has no output at all: every cell of {outputs} is empty")
-    for name in inputs:
-        if np.isnan(table[name][0]):
-            raise ValueError(
-                f"log {path}, line {rows[1][0]}: {name} is empty; expected a number in the first "
-                "row, as an empty input keeps its last value"
-            )
-        table[name] = _kept(table[name])
-    u = np.stack([table[n] for n in inputs], axis=-1) if inputs else system.input(t)
+        names = [formulas[f"y{i + 1}"].text for i in range(system.ny)]
+        raise ValueError(f"log {path} has no output at all: every cell of {names} is empty")
+    measured = "u1" in values
+    u = _inputs(system, table, values) if measured else system.input(t)
     std = None
-    if levels:
+    if any(name.endswith("_std") for name in values):
         unknown = np.full(len(t), np.nan)
-        std = np.stack([table.get(f"{output}_std", unknown) for output in outputs], axis=-1)[None]
-    numbers = np.array([number for number, _ in rows[1:]])
-    model = replace(system, measured_input=bool(inputs))
-    return Log(path, model, Record(t, y, u[None], prior, std), numbers)
+        levels = [values.get(f"y{i + 1}_std", unknown) for i in range(system.ny)]
+        std = np.stack(levels, axis=-1)[None]
+    return Log(
+        table.path,
+        replace(system, measured_input=measured),
+        Record(t, y, np.asarray(u)[None], prior, std),
+        table.lines,
+        _notes(table, formulas, t, start),
+        start,
+    )
 
 
-def _check_gaps(system: System, t: np.ndarray, places: list[str]) -> None:
-    """Raise ValueError, with the place of the sample after it, if the model would take too many
-    steps through the longest gap between times t (num_samples,) in s."""
-    if len(t) < 2 or system.own_flow:
-        return
-    k = int(np.argmax(np.diff(t)))
-    longest = longest_step(system)
-    try:
-        check_steps(system, t[k], t[k + 1], float(t[k + 1] - t[k]) / longest, longest)
-    except ValueError as error:
-        raise ValueError(f"{places[k + 1]}: {error}") from None
+def _insisted(formula: Formula, columns: Sequence[str]) -> bool:
+    """Return whether the times' unit is as the user says: by arithmetic, or by ``t=t``."""
+    given = any(each.partition("=")[0].strip() == "t" for each in columns)
+    return given and (not formula.plain or formula.columns == ("t",))
 
 
-def _kept(values: np.ndarray) -> np.ndarray:
-    """Return the values (num_samples,) with the last number before it in place of each NaN."""
-    last = np.where(np.isnan(values), 0, np.arange(len(values)))
-    return values[np.maximum.accumulate(last)]
+def _values(table: Table, quantity: str, formula: Formula) -> np.ndarray:
+    """Return the values (num_samples,) of a quantity, NaN where a cell in its formula is empty."""
+    columns = {name: table.numbers(name) for name in formula.columns}
+    found = formula.values(columns, len(table.rows))
+    wrong = ~np.isfinite(found)
+    for values in columns.values():
+        wrong &= ~np.isnan(values)
+    expected = "a finite number"
+    if quantity.endswith("_std"):
+        wrong |= found <= 0
+        expected = "a number above 0, or no value"
+    if wrong.any():
+        k = int(np.flatnonzero(wrong)[0])
+        value = f"{found[k]:g}, from {shown(formula.text)}"
+        if formula.plain:
+            quantity = formula.columns[0]
+            value = shown(table.cells(quantity)[k])
+        raise ValueError(f"{table.place(k)}: {quantity}={value}; expected {expected}")
+    return found
 
 
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the cells of each line of a CSV file that is not blank, with the line's number.
-
-    Each line is parsed by itself, as no cell of a log extends over several lines: a quote that is
-    not closed is thus found in its own line, rather than at the end of the file.
-
-    Raises:
-        ValueError: in one line that names the file and the line.
-    """
-    rows = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            for number, line in enumerate(file, 1):
-                try:
-                    cells = next(csv.reader([line], strict=True))
-                except csv.Error as error:
-                    raise ValueError(
-                        f"log {path}, line {number}: {_shown(line)} is no line of a CSV file "
-                        f"({error}); expected every quote to be closed in its line"
-                    ) from None
-                if any(cell.strip() for cell in cells):
-                    rows.append((number, cells))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"cannot read log {path}: {error}") from None
-    return rows
+def _inputs(system: System, table: Table, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the inputs (num_samples, nu), with the last number before it in place of each NaN."""
+    columns = []
+    for i in range(system.nu):
+        u = values[f"u{i + 1}"]
+        if np.isnan(u[0]):
+            raise ValueError(
+                f"{table.place(0)}: u{i + 1} is empty; expected a number in the first row, as an "
+                "empty input keeps its last value"
+            )
+        last = np.where(np.isnan(u), 0, np.arange(len(u)))
+        columns.append(u[np.maximum.accumulate(last)])
+    return np.stack(columns, axis=-1)
 
 
-def _shown(text: str) -> str:
-    """Return the representation of a text, of which only the beginning is shown if it is long."""
-    text = text.strip()
-    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
-
-
-def _number(cell: str, name: str, where: str) -> float:
-    text = cell.strip()
-    missing = text == "" or text.lower() == "nan"
-    if missing and name != "t":
-        return math.nan
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{where}: {name}={_shown(cell)} is not a finite number")
-    if name.endswith("_std") and value <= 0:
-        raise ValueError(f"{where}: {name}={_shown(cell)}; expected a number above 0, or no value")
-    return value
+def _notes(
+    table: Table, formulas: Mapping[str, Formula], t: np.ndarray, start: datetime | None
+) -> tuple[str, ...]:
+    """Return what the user is to know of a log that was read."""
+    notes = []
+    if start is not None:
+        notes.append(f"log {table.path}: t = {t[0]:g} is {start.isoformat()}")
+    used = {name: None for formula in formulas.values() for name in formula.columns}
+    commas = [name for name in used if table.decimal_commas(name)]
+    if commas:
+        notes.append(f"log {table.path}: commas in numbers are read as decimal points")
+    if left := unused(table, formulas.values()):
+        notes.append(f"log {table.path}: columns that are not used: {listed(left)}")
+    return tuple(notes)

@@ -69,6 +69,17 @@ def augmented(
     return made()  # its class has defaults for all fields
 
 
+def with_constants(system: Augmented, setup: Setup) -> Setup:
+    """Return a setup of a system's plant as one of the system: with the means and variances of the
+    constants in the prior, and without process noise of the constants."""
+    pairs = [pair for kind in system.constants for pair in kind]
+    names = system.state_names[system.plant.nx :]
+    extras = {name: value for name, (_, value) in zip(names, pairs, strict=True)}
+    # The plant has its parameters, and the means of the unknown ones are those of the constants.
+    own = replace(setup, parameters={})
+    return _setup(system.plant, own, extras, [])
+
+
 def _check_constants(
     system: str, what: str, constants: Mapping[str, Unknown], known: tuple[str, ...]
 ) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.bounds import beyond, box
 from pinnobs_gym.simulation.residual import check_periods
-from pinnobs_gym.simulation.start_law import Box
+from pinnobs_gym.simulation.start_law import Box, Points
 from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number, vector
 
 _NAMES = ("state_names", "output_names", "input_names", "uncertain")
@@ -123,7 +123,8 @@ def _check_bounds(cls: type[System], nx: int) -> None:
 
 def check_starts(cls: type[System]) -> None:
     """Check that the initial states and the priors of all setups are within the bounds of the
-    states. Of a law other than a box, or one that `System.admissible` restricts, states are drawn.
+    states. Of a Gaussian law, states outside are drawn anew. Where `System.admissible` is
+    overridden, some of the states that it admits are drawn.
 
     Raises:
         TypeError: in one line, naming the class, the setup, the state and its bound.
@@ -133,9 +134,10 @@ def check_starts(cls: type[System]) -> None:
         if system.state_box is None:
             continue
         law = setup.start(system.nx)
-        x0 = initial_states(system, setup, _STARTS)
-        if isinstance(law, Box) and cls.admissible is System.admissible:
+        if isinstance(law, Box | Points) and cls.admissible is System.admissible:
             x0 = np.stack(law.corners)
+        else:
+            x0 = initial_states(system, setup, _STARTS)
         given = [("an initial state", x0)]
         for what, prior in (("the prior's mean", setup), ("the poor prior's", setup.poor_prior)):
             if prior is not None and prior.xhat0 is not None:

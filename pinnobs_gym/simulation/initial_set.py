@@ -50,7 +50,9 @@ def _law_moments(system: System, law: StartLaw) -> tuple[np.ndarray, np.ndarray]
         if not len(kept):
             raise ValueError(f"{type(system).__name__}: no state of {law.states} is admissible")
         law = Points(tuple(map(tuple, kept.tolist())))
-    elif type(system).admissible is not System.admissible and not law.fixed:
+    elif not law.fixed and (
+        type(system).admissible is not System.admissible or system.state_box is not None
+    ):
         return _drawn_moments(system, pickle.dumps(law))
     return law.mean, law.cov
 

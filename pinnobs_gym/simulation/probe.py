@@ -56,8 +56,8 @@ def probe(cls: type[System]) -> None:
         _check_noise(system, setup)
     inputs = _call(system, "input", (system.nu,), t=times)
     _call(system, "admissible", (), x=np.zeros((3, system.nx)) + setup.start(system.nx).mean)
-    states = initial_states(system, setup, 6)
     check_starts(cls)
+    states = initial_states(system, setup, 6)
     for batch in _BATCHES:
         count = int(np.prod(batch))
         x = states[:count].reshape(*batch, system.nx)

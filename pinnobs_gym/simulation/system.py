@@ -50,7 +50,8 @@ class Setup:
     The prior that estimators are given is N(x̂₀, P₀). By default x̂₀ and P₀ are the mean and the
     covariance of the law of the initial states
     (`pinnobs_gym.simulation.initial_set.prior_moments`). A fixed initial state has no such law; its
-    setup must give both. If a setup gives both and no law, the initial states follow the prior.
+    setup must give both. If a setup gives both and no law, the initial states follow the prior,
+    within the bounds of the states.
     """
 
     x0_low: Sequence[float] | None = None
@@ -356,9 +357,14 @@ class System(ABC):
         return flow_jacobian(self, t0, t1, x, u)
 
     def admissible(self, x0: Array) -> Array:
-        """Return which states (..., nx) of a setup's law are valid initial states: bool (...)."""
+        """Return which states (..., nx) of a setup's law are valid initial states: bool (...).
+        Unless overridden, those within `state_low` and `state_high`."""
         xp = array_namespace(x0)
-        return xp.all(xp.isfinite(x0), axis=-1)
+        finite, box = xp.all(xp.isfinite(x0), axis=-1), self.state_box
+        if box is None:
+            return finite
+        low, high = (xp.asarray(side, dtype=x0.dtype) for side in (box.low, box.high))
+        return finite & xp.all((x0 >= low) & (x0 <= high), axis=-1)
 
     def invariants(self, x: Array) -> Array | None:
         """Return quantities (..., k) that the undisturbed plant conserves, or None. Tests use

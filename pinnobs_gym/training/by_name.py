@@ -10,6 +10,8 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.system import Setup, System
 from pinnobs_gym.training.loop import train
 from pinnobs_gym.training.settings import TrainingConfig
 from pinnobs_gym.training.trainer import Trainer, first_episode
@@ -75,6 +77,27 @@ def load(cls: type[BaseEstimator], path: Path, game: Game) -> BaseEstimator:
         raise ValueError(f"estimator {name!r} is not one that is trained first")
     estimator: Any = cls.load(path, game.source.system)
     setup = game.source.setup
+    if "noise" not in cls.knows:
+        return estimator
+    return replace(estimator, noise_std=setup.noise_std, process_noise=setup.process_noise)
+
+
+def load_for_log(
+    cls: type[BaseEstimator], path: Path, system: System, setup: Setup, record: Record
+) -> BaseEstimator:
+    """Load a trained estimator for the record of a log; one that uses the noise gets that of the
+    setup.
+
+    Raises:
+        ValueError: in one line, as `load`, or if the estimator cannot be used at the times of the
+            record.
+    """
+    if not issubclass(cls, LearnedEstimator):
+        name = getattr(cls, "name", cls.__name__)
+        raise ValueError(f"estimator {name!r} is not one that is trained first")
+    estimator: Any = cls.load(path, system)
+    if reason := estimator.unfit(record.t):
+        raise ValueError(f"{path} {reason}")
     if "noise" not in cls.knows:
         return estimator
     return replace(estimator, noise_std=setup.noise_std, process_noise=setup.process_noise)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from snippets import ROOT, run_page
+from snippets import ROOT, cells, run_cells, run_page
 from waiting import PATIENCE
 
 from pinnobs_gym import Setup, System
@@ -25,6 +25,9 @@ from pinnobs_gym.systems import SYSTEMS
 DOCS = ROOT / "docs"
 WRITTEN = sorted(path for path in DOCS.rglob("*.md") if path.parts[len(DOCS.parts)] != "reference")
 GUIDES = sorted((DOCS / "guides").glob("*.md"))
+PLANTS = [path for path in GUIDES if any("%%writefile" in text for _, text in cells(path))]
+"""Guides to a kind of plant and its log. Other pages with cells train networks in them, and are run
+only when the documentation is built."""
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +159,21 @@ def test_links_of_written_pages_lead_to_files(generated):
 @pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.stem)
 def test_the_code_of_a_guide_runs(path, tmp_path):
     run_page(path, tmp_path)
+
+
+@pytest.mark.parametrize("path", PLANTS, ids=lambda path: path.stem)
+def test_the_cells_of_a_guide_run_and_take_few_lines(path, tmp_path):
+    """What a reader writes is the model and the calls; the cell that simulates a log is hidden."""
+    printed = run_cells(path, tmp_path)
+    assert "estimates: estimates.csv; picture: estimates.png" in printed
+    own = [text for options, text in cells(path) if "hide-input" not in options]
+    assert any("assert" in text for text in own)  # that the estimates are right
+    assert any('Image("estimates.png"' in text for text in own)
+    assert len([line for text in own for line in text.splitlines() if line.strip()]) < 60
+
+
+def test_there_are_guides_to_many_kinds_of_plants():
+    assert len(PLANTS) > 6
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Code blocks of Markdown files, and how tests run them."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,35 @@ def blocks(path, *kinds):
     """The blocks of these kinds in a file, in order: (kind, text)."""
     found = re.findall(r"^```(\w+)\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
     return [(kind, text) for kind, text in found if kind in kinds]
+
+
+def cells(path):
+    """The cells of a page that is executed when the documentation is built, in order: (options,
+    text)."""
+    text = path.read_text(encoding="utf-8")
+    return re.findall(
+        r"^```\{code-cell\} ipython3\n((?::[^\n]*\n)*)\n?(.*?)^```", text, re.M | re.S
+    )
+
+
+def run_cells(path, folder):
+    """Run a page's cells in one process, in which they share their names. Returns what they print.
+
+    Of the notations of notebooks, cells may have ``%%writefile name.py`` and lines
+    ``!pinnobs ...``."""
+    parts = []
+    for _, text in cells(path):
+        first, _, rest = text.partition("\n")
+        if first.startswith("%%writefile "):
+            (folder / first.split()[1]).write_text(rest, encoding="utf-8")
+            continue
+        parts.append(re.sub(r"^!pinnobs (.*)$", _called, text, flags=re.M))
+    return run_python("from pinnobs_gym.cli import main\n" + "\n".join(parts), folder)
+
+
+def _called(line):
+    """A line of Python that does what a line of a shell does."""
+    return f"assert main({shlex.split(line.group(1))!r}) == 0, {line.group(1)!r}"
 
 
 def run_python(text, folder):

@@ -234,6 +234,22 @@ def test_a_setup_for_logs_needs_no_box_and_no_duration():
     assert len(source.record(source.play(source.draw(source.streams([0])))).t) == 100
 
 
+def test_a_gaussian_law_is_restricted_to_the_bounds_of_the_states():
+    """To the half of a state that is not negative: the half-normal distribution."""
+    setup = Setup(dt=0.1, xhat0=(0.0, -2.0), P0=independent(3.0, 0.5))
+    own = {"state_low": (0.0, None), "setups": {"benchmark": setup}}
+    source, x0 = starts(type("Positive", (Linear,), own), 2000)
+    assert (x0[:, 0] >= 0).all()
+    np.testing.assert_allclose(x0.mean(axis=0), (3 * np.sqrt(2 / np.pi), -2), atol=0.2)
+    np.testing.assert_allclose(x0.std(axis=0), (3 * np.sqrt(1 - 2 / np.pi), 0.5), rtol=0.1)
+    np.testing.assert_array_equal(prior_moments(source.system, source.setup)[0], (0.0, -2.0))
+
+    law = {"benchmark": Setup(dt=0.1, duration=1.0, x0_law=setup.x0_law)}
+    mean, cov = prior_moments(*type("Positive", (Linear,), own | {"setups": law}).configured())
+    np.testing.assert_allclose(mean, (3 * np.sqrt(2 / np.pi), -2), atol=0.01)
+    np.testing.assert_allclose(cov, np.diag([9 * (1 - 2 / np.pi), 0.25]), atol=0.03)
+
+
 @pytest.mark.parametrize("given", [{}, {"xhat0": (0.0,)}, {"P0": ((1.0,),)}, {"x0_low": (0.0,)}])
 def test_a_setup_needs_initial_states_or_a_prior(given):
     with pytest.raises(ValueError, match="x0_low and x0_high, or x0_law, or xhat0 and P0 are exp"):

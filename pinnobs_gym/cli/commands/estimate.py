@@ -6,32 +6,48 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.output import write_estimates, write_figure
 from pinnobs_gym.cli.own_model import own_model
 from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.logs.judgement import doubts
-from pinnobs_gym.logs.reading import read_log
+from pinnobs_gym.logs.reading import Log, read_log
+from pinnobs_gym.simulation.augmented_system import Augmented
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import Setup
+from pinnobs_gym.training.by_name import load_for_log
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate the states from a sensor log: a CSV file with columns t, y1, ... and u1, ..."""
+    """Estimate the states from sensor logs: CSV files with columns t, y1, ... and u1, ..., or with
+    the outputs' and inputs' own names."""
 
     system: str
     """Name or module:Class of the model."""
-    log: Path
-    """The CSV file; sample times may be irregular, empty cells are missing outputs."""
+    log: tuple[Path, ...]
+    """The CSV files, each estimated by itself; sample times may be irregular, or dates and times by
+    ISO 8601, and empty cells are missing outputs."""
+    columns: tuple[str, ...] = ()
+    """Columns of other names or units, such as t=millis*1e-3 y1=voltage "u1={I (mA)}/1000"."""
     estimator: str = "ekf"
     """Name or module:Class of the estimator."""
+    trained: Path | None = None
+    """File of the trained estimator, from pinnobs train, for one that is trained beforehand."""
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as assumed_noise=0.1."""
+    also: tuple[str, ...] = ()
+    """Unknown constants to estimate as further states: a parameter (its value in the model, with a
+    tenth of it as standard deviation), or NAME=mean,std of a parameter, bias_OUTPUT or
+    disturbance_STATE."""
     xhat0: tuple[float, ...] | None = None
-    """Initial estimate; the benchmark's if not given."""
+    """Initial estimate of the system's own states; the benchmark's if not given."""
     P0_std: tuple[float, ...] | None = None
     """Its standard deviations; the benchmark's if not given."""
     noise_std: tuple[float, ...] = ()
@@ -40,46 +56,116 @@ class Estimate:
     """Standard deviations of the process noise after one second (of a map: after one step), in
     state units per √s: one for all states or one for each; the benchmark's if not given."""
     out: Path = Path("estimates.csv")
-    """File of the estimates; a figure is written beside it, with the suffix .png."""
+    """File of the estimates, of several logs estimates-LOG.csv; t is in s, from the first sample on
+    if the log has dates. A figure is written beside it, with the suffix .png."""
 
     def run(self) -> int:
-        """Estimate, and write the results."""
+        """Estimate each log, and write the results."""
         system, setup = own_model(
             self.system,
             noise_std=self.noise_std,
             process_noise=self.process_noise,
             xhat0=self.xhat0,
             P0_std=self.P0_std,
+            also=self.also,
         )
-        log = read_log(self.log, system, Prior.of(system, setup, 1))
-        system, record = log.system, log.record
         kind = ESTIMATORS.resolve(self.estimator)
-        if kind.needs_training is not None:
+        if self.trained is None and kind.needs_training is not None:
             raise ValueError(
-                f"estimator {self.estimator!r} is trained beforehand; for a log take one that is "
-                f"not, or trains on the record"
+                f"estimator {self.estimator!r} is trained beforehand; give its file, --trained "
+                "FILE, or take one that is not, or trains on the record"
             )
-        picture = self.out.with_suffix(".png")
-        if picture == self.out or self.log.resolve() in (self.out.resolve(), picture.resolve()):
-            raise ValueError(f"out={self.out} would overwrite the log or the picture; name a .csv")
+        if self.trained is not None and kind.needs_training is None:
+            raise ValueError(
+                f"estimator {self.estimator!r} is not one that is trained first; name that of the "
+                "file, --estimator NAME"
+            )
+        if self.trained is not None and self.set:
+            raise ValueError("--trained and --set; expected one of them")
+        outs = _outs(self.out, self.log)
+        prior = Prior.of(system, setup, 1)
+        logs = [read_log(path, system, prior, self.columns) for path in self.log]
+        estimators = [self._estimator(kind, log, setup) for log in logs]
         check_writable(self.out.parent)
-        estimator = kind.for_setup(system, setup, **settings_of(kind, self.set))
-        estimates = estimator.run(record)
-        for doubt in doubts(system, record, estimates):
-            console.print(f"warning: {doubt}", style="yellow", soft_wrap=True)
-        write_estimates(self.out, system, record, estimates)
-        P = None if estimates.P is None else estimates.P[0]
-        title = f"{self.log.name}: {type(system).__name__}, {estimator.label}"
-        figure = state_figure(system, record.t, estimates.xhat[0], y=record.y[0], P=P, title=title)
-        write_figure(picture, figure)
-        last = ", ".join(
-            f"{name} = {value:.6g}"
-            for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
-        )
-        time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
-        console.print(f"{record.num_samples} samples; at t = {time}: {last}")
-        console.print(f"estimates: {self.out}; picture: {picture}", soft_wrap=True)
+        for log, estimator, out in zip(logs, estimators, outs, strict=True):
+            _estimate(log, estimator, out)
         return 0
+
+    def _estimator(self, kind: type[BaseEstimator], log: Log, setup: Setup) -> BaseEstimator:
+        """Return the estimator of a log."""
+        if self.trained is not None:
+            return load_for_log(kind, self.trained, log.system, setup, log.record)
+        return kind.for_setup(log.system, setup, **settings_of(kind, self.set))
+
+
+def _outs(out: Path, logs: Sequence[Path]) -> list[Path]:
+    """Return the file of the estimates of each log.
+
+    Raises:
+        ValueError: in one line, if two are the same file, or one is a log or its own picture.
+    """
+    if not logs:
+        raise ValueError("no log; expected --log FILE")
+    outs = [out]
+    if len(logs) > 1:
+        outs = [out.with_name(f"{out.stem}-{log.stem}{out.suffix}") for log in logs]
+    written: dict[str, Path] = {}
+    for log, own in zip(logs, outs, strict=True):
+        if own.suffix == ".png" or not own.name:
+            raise ValueError(f"out={out} would overwrite the picture; name a .csv")
+        for each in (own, own.with_suffix(".png")):
+            if each.resolve() in [other.resolve() for other in logs]:
+                raise ValueError(f"out={out} would overwrite the log {each}; name another file")
+            place = str(each.resolve()).casefold()  # some systems do not tell capital letters
+            if place in written:
+                raise ValueError(
+                    f"logs {written[place]} and {log} would both be written to {each}; expected "
+                    "logs of different names"
+                )
+            written[place] = log
+    return outs
+
+
+def _estimate(log: Log, estimator: BaseEstimator, out: Path) -> None:
+    """Estimate the states of a log; write them with a figure, and print the last ones."""
+    system, record = log.system, log.record
+    for note in log.notes:
+        console.print(note, soft_wrap=True, highlight=False)
+    estimates = estimator.run(record)
+    for doubt in doubts(system, record, estimates):
+        console.print(f"warning: {doubt}", style="yellow", soft_wrap=True)
+    write_estimates(out, system, record, estimates)
+    P = None if estimates.P is None else estimates.P[0]
+    title = f"{log.path.name}: {type(system).__name__}, {estimator.label}"
+    figure = state_figure(system, record.t, estimates.xhat[0], y=record.y[0], P=P, title=title)
+    picture = out.with_suffix(".png")
+    write_figure(picture, figure)
+    last = ", ".join(
+        f"{name} = {value:.6g}"
+        for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
+    )
+    time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
+    counted = f"{log.path.name}: {record.num_samples} samples"
+    console.print(f"{counted}; at t = {time}: {last}", soft_wrap=True)
+    if isinstance(system, Augmented):
+        for line in _found(system, log, estimates):
+            console.print(line, soft_wrap=True)
+    console.print(f"estimates: {out}; picture: {picture}", soft_wrap=True)
+
+
+def _found(system: Augmented, log: Log, estimates: Estimates) -> list[str]:
+    """Return a line for each unknown constant: its last estimate and what was known of it."""
+    prior, lines = log.record.prior, []
+    for i in range(system.plant.nx, system.nx):
+        name = system.state_names[i]
+        unit = f" {system.units[name]}" if name in system.units else ""
+        mean, std = prior.mean[0, i], np.sqrt(prior.cov[0, i, i])
+        after = "" if estimates.P is None else f" ± {np.sqrt(max(estimates.P[0, -1, i, i], 0)):.2g}"
+        lines.append(
+            f"found: {name} = {estimates.xhat[0, -1, i]:.6g}{after}{unit} (before the log: "
+            f"{mean:.6g} ± {std:.2g})"
+        )
+    return lines
 
 
 def run(arguments: Sequence[str]) -> int:

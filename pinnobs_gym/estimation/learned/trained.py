@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_type_hints
 
+import numpy as np
+
 from pinnobs_gym.estimation.hints import as_tuple, check_field, field_hints
 from pinnobs_gym.estimation.learned.trained_file import (
     check_same,
@@ -157,6 +159,11 @@ class LearnedEstimator(ABC):
         made: Any = cls
         noise_std = trained.noise_std if "noise" in cls.knows else None
         return made(system, noise_std, trained=trained)
+
+    def unfit(self, t: np.ndarray) -> str:
+        """Return why the estimator cannot be used at sample times t (num_samples,) in s of another
+        record than that of its training; empty if it can, at any times unless overridden."""
+        return ""
 
     def save(self, path: str | Path) -> None:
         """Write the trained object to a file; see `Trained.save`."""
