@@ -13,6 +13,7 @@ from pinnobs_gym.envs.registration import register_envs, register_system
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.estimator import Estimator, State
+    from pinnobs_gym.estimation.live import Live
     from pinnobs_gym.leaderboard.published.trained import load
     from pinnobs_gym.scoring.evaluation import evaluate
     from pinnobs_gym.scoring.table import read_rows
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Estimator",
+    "Live",
     "Setup",
     "State",
     "System",
@@ -44,6 +46,7 @@ __version__: str
 _HOMES = {
     "Estimator": "estimation.estimator",
     "State": "estimation.estimator",
+    "Live": "estimation.live",
     "Setup": "simulation.system",
     "System": "simulation.system",
     "independent": "simulation.system",

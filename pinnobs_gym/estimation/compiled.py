@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import ctypes
 from ctypes import addressof
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import library_of, of_rows, plan_of, rows_of_numbers
+from pinnobs_gym.estimation.compiled_layout import Layout
 from pinnobs_gym.estimation.compiled_run import FIELDS, CompiledRun, call_with, state_of, with_rows
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.square_root import carried
@@ -27,22 +27,6 @@ if TYPE_CHECKING:
 _DOUBLE = np.dtype(float)
 _LAYOUTS = 16
 """Number of layouts that are kept, one for each number of rows."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """A buffer that has all arrays of a state one after the other: the time, outputs, inputs,
-    estimates, covariances, innovations and their covariances of a batch, and the numbers by which
-    compiled code marks rows; see ``update`` in ``templates/filter.c``."""
-
-    buffer: Any
-    """The type of the buffer."""
-    u: int
-    """Position of the inputs in bytes."""
-    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
-    """Shape, position in bytes and strides of the estimates (batch, nx) and so on."""
-    marks: int
-    """Position of the numbers that mark rows in bytes."""
 
 
 def compiled_filter(estimator: RecursiveEstimator) -> CompiledFilter | str:
@@ -67,35 +51,37 @@ class CompiledFilter:
         self._by_sample = estimator.noise.samples is not None
         self._rows = rows_of_numbers(estimator, made)
         R = estimator.noise.R(0.0)[None]
-        self._plan = plan_of(estimator, made, R, **estimator.plan_settings())
-        self.run = CompiledRun(estimator, made, self._plan)
+        self.plan = plan_of(estimator, made, R, **estimator.plan_settings())
+        """The first argument of the compiled function."""
+        self.run = CompiledRun(estimator, made, self.plan)
         """Returns the estimates of a record; None if NumPy has to process it."""
-        self._layouts: dict[int, _Layout] = {}
-        self._update = made.code.update
-        self._update.argtypes = [
+        self._layouts: dict[int, Layout] = {}
+        self.code = made.code.update
+        """The compiled function; see ``update`` in ``templates/filter.c``."""
+        self.code.argtypes = [
             *(ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_double),
             *[ctypes.c_void_p] * 5,
         ]
-        self._update.restype = ctypes.c_int64
+        self.code.restype = ctypes.c_int64
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State | None:
         """Return the state after a sample; None if NumPy has to process it. The arguments are those
         of `Estimator.update`."""
         batch = len(state.xhat)
-        layout = self._layouts.get(batch) or self._layout(batch)
+        layout = self.layout(batch)
         if state.P is None or self._rows not in (1, batch):
             return None
         before = state.packed
         if type(before) is not layout.buffer:
-            before = self._packed(state, layout)
+            before = layout.packed(state.t, state.u, state.xhat, state.P)
         # All arrays of the next state are parts of one buffer, whose address is found once.
         buffer = layout.buffer()
-        plan = self._plan
+        plan = self.plan
         if self._by_sample:
             plan = plan.with_R(self._estimator.noise.R(t)[None])
         memory, arrays = self._estimator.carried_memory(state)
         more = call_with(arrays) if arrays else None
-        left = self._update(
+        left = self.code(
             addressof(plan.structure),
             batch,
             state.t is None,
@@ -106,10 +92,7 @@ class CompiledFilter:
             addressof(before),
             addressof(more) if more else None,
         )
-        x, P, innovation, S = [
-            np.ndarray(shape, _DOUBLE, buffer, place, strides)
-            for shape, place, strides in layout.views
-        ]
+        x, P, innovation, S = layout.arrays(buffer)
         # The attributes are set at once, in a quarter of the time that State(...) takes.
         after = object.__new__(State)
         after.__dict__.update(
@@ -150,41 +133,14 @@ class CompiledFilter:
             getattr(after, name)[rows] = getattr(part, name)
         return with_rows(self._estimator, after, rows, part)
 
-    def _layout(self, batch: int) -> _Layout:
+    def layout(self, batch: int) -> Layout:
         """Return the layout of a buffer for a batch."""
-        nx, ny, nu = self._sizes
-        shapes = [(nx,), (nx, nx), (ny,), (ny, ny)]
-        sizes = [1, ny * batch, nu * batch, *(batch * int(np.prod(shape)) for shape in shapes)]
-        ends = [8 * int(end) for end in np.cumsum(sizes)]
-        views = []
-        for shape, place in zip(shapes, ends[2:], strict=False):
-            array = np.moveaxis(np.empty((*shape, batch)), -1, 0)
-            views.append((array.shape, place, array.strides))
-        kind = ctypes.c_double * (ends[-1] // 8 + batch)
-        buffer = type("Packed", (kind,), {"__reduce__": _left_behind})
-        layout = _Layout(buffer, ends[1], tuple(views), ends[-1])
-        if len(self._layouts) < _LAYOUTS:
-            self._layouts[batch] = layout
+        layout = self._layouts.get(batch)
+        if layout is None:
+            layout = Layout.of(*self._sizes, batch)
+            if len(self._layouts) < _LAYOUTS:
+                self._layouts[batch] = layout
         return layout
-
-    def _packed(self, state: State, layout: _Layout) -> Any:
-        """Return the arrays of a state in a buffer."""
-        buffer, nu = layout.buffer(), self._sizes[2]
-        if state.t is not None:
-            buffer[0] = state.t
-        if state.u is not None and nu:
-            np.ndarray((nu, len(state.xhat)), _DOUBLE, buffer, layout.u)[:] = np.asarray(state.u).T
-        for value, (shape, place, strides) in zip(
-            (state.xhat, state.P), layout.views, strict=False
-        ):
-            np.ndarray(shape, _DOUBLE, buffer, place, strides)[:] = value
-        return buffer
-
-
-def _left_behind(self: Any) -> tuple[Any, ...]:
-    """Return what is copied or pickled in place of a buffer: None, because its address holds in its
-    own place and process only."""
-    return type(None), ()
 
 
 def _contiguous(array: np.ndarray) -> bytes:

@@ -68,20 +68,25 @@ int64_t run(const struct call *c, int64_t *reached)
     return left;
 }
 
+/* Set u (NU,) to the inputs that the plant defines in a row. */
+static void defined_inputs(const struct plan *plan, int64_t batch, int64_t row, double t, double *u)
+{
+    double p[LP];
+    for (int i = 0; i < NP; i++) p[i] = plan->p[plan->p_rows ? i * batch + row : i];
+    plant_input(t, p, 1, u, 1);
+}
+
 /* Leave rows to NumPy, which says what is wrong, at a time between the steps of a map, and those
    whose inputs are not the ones that the plant defines. Returns 0 if there are none. */
 static int64_t mark_unusable(const struct call *c, int64_t *reached)
 {
     const struct plan *plan = c->plan;
-    double p[LP], known[LU];
+    double known[LU];
     int64_t found = 0;
     for (int64_t row = 0; row < c->batch; row++) {
         int wrong = plan->discrete && c->t[0] != floor(c->t[0]);
         if (NU && plan->input == 0) {
-            if (row == 0 || plan->p_rows) {
-                for (int i = 0; i < NP; i++) p[i] = plan->p[plan->p_rows ? i * c->batch + row : i];
-                plant_input(c->t[0], p, 1, known, 1);
-            }
+            if (row == 0 || plan->p_rows) defined_inputs(plan, c->batch, row, c->t[0], known);
             for (int i = 0; i < NU; i++) {
                 const double given = c->u[i * c->batch + row];
                 const double size = fmax(fabs(given), fabs(known[i]));
@@ -96,7 +101,7 @@ static int64_t mark_unusable(const struct call *c, int64_t *reached)
 /* Filter one sample. Buffers hold one after the other t, y, u, x, P, the innovation, S, and the
    numbers of ``reached``, with the batch as the last axis. ``from`` is that of the sample before; if
    this is the first sample, x and P of it are predictions. ``more`` has further arrays, or is
-   NULL. */
+   NULL; without u the inputs are those that the plant defines. */
 int64_t update(const struct plan *plan, int64_t batch, int64_t first, double t, const double *y,
                const double *u, double *to, const double *from, const struct call *more)
 {
@@ -110,7 +115,12 @@ int64_t update(const struct plan *plan, int64_t batch, int64_t first, double t, 
     c.samples = 1;
     to[0] = t;
     for (int64_t i = 0; i < NY * batch; i++) to_y[i] = y[i];
-    for (int64_t i = 0; i < NU * batch; i++) to_u[i] = u[i];
+    for (int64_t row = 0; NU && !u && row < batch; row++) {
+        double known[LU];
+        defined_inputs(plan, batch, row, t, known);
+        for (int i = 0; i < NU; i++) to_u[i * batch + row] = known[i];
+    }
+    for (int64_t i = 0; u && i < NU * batch; i++) to_u[i] = u[i];
     c.t = to;
     c.y = to_y;
     c.u = to_u;

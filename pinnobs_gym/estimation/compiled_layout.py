@@ -1,0 +1,78 @@
+"""Where the arrays of a state are in a buffer of compiled code."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+_DOUBLE = np.dtype(float)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A buffer that has all arrays of a state one after the other: the time, outputs, inputs,
+    estimates, covariances, innovations and their covariances of a batch, and the numbers by which
+    compiled code marks rows; see ``update`` in ``templates/filter.c``."""
+
+    buffer: Any
+    """The type of the buffer."""
+    inputs_place: int
+    """Position of the inputs (nu, batch) in bytes."""
+    nu: int
+    """Number of inputs."""
+    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
+    """Shape, position in bytes and strides of the estimates (batch, nx) and so on."""
+    places: tuple[tuple[int, int], ...]
+    """Begin and end of the same, in doubles."""
+    marks: int
+    """Position of the numbers that mark rows in bytes."""
+
+    @staticmethod
+    def of(nx: int, ny: int, nu: int, batch: int) -> Layout:
+        """Return the layout for a model of these sizes and a batch."""
+        shapes = [(nx,), (nx, nx), (ny,), (ny, ny)]
+        sizes = [1, ny * batch, nu * batch, *(batch * int(np.prod(shape)) for shape in shapes)]
+        ends = [8 * int(end) for end in np.cumsum(sizes)]
+        views = []
+        for shape, place in zip(shapes, ends[2:], strict=False):
+            array = np.moveaxis(np.empty((*shape, batch)), -1, 0)
+            views.append((array.shape, place, array.strides))
+        kind = ctypes.c_double * (ends[-1] // 8 + batch)
+        buffer = type("Packed", (kind,), {"__reduce__": _left_behind})
+        places = tuple(pairwise(end // 8 for end in ends[2:]))
+        return Layout(buffer, ends[1], nu, tuple(views), places, ends[-1])
+
+    def arrays(self, buffer: Any) -> list[np.ndarray]:
+        """Return the estimates (batch, nx), their covariances, the innovations and their
+        covariances in a buffer."""
+        return [
+            np.ndarray(shape, _DOUBLE, buffer, place, strides)
+            for shape, place, strides in self.views
+        ]
+
+    def inputs(self, buffer: Any) -> np.ndarray:
+        """Return the inputs (batch, nu) in a buffer."""
+        batch = self.views[0][0][0]
+        return np.ndarray((self.nu, batch), _DOUBLE, buffer, self.inputs_place).T
+
+    def packed(self, t: float | None, u: Any, xhat: np.ndarray, P: np.ndarray) -> Any:
+        """Return a new buffer with the values of a state, see
+        `pinnobs_gym.estimation.estimator.State`."""
+        buffer = self.buffer()
+        if t is not None:
+            buffer[0] = t
+        if u is not None and self.nu:
+            self.inputs(buffer)[:] = u
+        for array, value in zip(self.arrays(buffer), (xhat, P), strict=False):
+            array[:] = value
+        return buffer
+
+
+def _left_behind(self: Any) -> tuple[Any, ...]:
+    """Return what is copied or pickled in place of a buffer: None, because its address holds in its
+    own place and process only."""
+    return type(None), ()

@@ -1,0 +1,102 @@
+"""Files of live filters: arrays and plain values in NumPy's format ``npz``, read without running
+code from them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.live_identity import check_identity, identity
+from pinnobs_gym.estimation.live_tree import Tree, in_memory_order
+from pinnobs_gym.files import replacing
+
+FORMAT = "pinnobs-gym live filter"
+VERSION = 1
+"""Version of the format; files of another one are refused."""
+
+
+def write(path: Path, estimator: Estimator, content: Mapping[str, Any]) -> None:
+    """Write a content to a file atomically, with what the estimator and its model are.
+
+    Args:
+        path: path of the file.
+        estimator: the estimator.
+        content: values, arrays and states, see `Tree.plain`.
+
+    Raises:
+        ValueError: in one line, if the file cannot be written or a part cannot be saved.
+    """
+    tree = Tree(estimator)
+    plain = tree.plain(dict(content))
+    ordered = [in_memory_order(array) for array in tree.arrays]
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "identity": identity(estimator),
+        "content": plain,
+        "orders": [order for _, order in ordered],
+    }
+    text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    arrays: dict[str, Any] = {f"array{i}": array for i, (array, _) in enumerate(ordered)}
+    with replacing(path) as temporary:
+        try:
+            with temporary.open("wb") as file:
+                np.savez(file, header=text, **arrays)
+        except OSError as error:
+            raise ValueError(f"cannot write {path}: {error}") from None
+
+
+def read(path: Path, estimator: Estimator) -> dict[str, Any]:
+    """Return the content of a file that `write` wrote for the same estimator and model.
+
+    Raises:
+        ValueError: in one line, if the file does not exist, is damaged, of another kind or version,
+            or of another estimator or model; it then says what differs.
+    """
+    header, arrays = _loaded(path)
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path} is of version {header.get('version')} of the format of live filters; expected "
+            f"{VERSION}"
+        )
+    check_identity(path, header.get("identity"), identity(estimator))
+    try:
+        orders = header["orders"]
+        ordered = [arrays[f"array{i}"] for i in range(len(orders))]
+        found = [
+            array.transpose(np.argsort(order).astype(int))  # an empty order is of floats
+            for array, order in zip(ordered, orders, strict=True)
+        ]
+        content = Tree(estimator, found).value(header["content"])
+        if not isinstance(content, dict):
+            raise TypeError("no content")
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise damaged(path, error) from None
+    return content
+
+
+def damaged(path: Path, error: Exception) -> ValueError:
+    """Return the error of one line that says that a file cannot be used."""
+    reason = " ".join(f"{type(error).__name__}: {error}".split())
+    return ValueError(f"{path} is damaged or no file of a live filter ({reason})")
+
+
+def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the header and the arrays of a file."""
+    try:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            arrays = {name: loaded[name] for name in loaded.files}
+        header = json.loads(arrays["header"].tobytes())
+        if header["format"] != FORMAT:
+            raise TypeError("another format")
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from None
+    except Exception as error:  # zip files and NumPy raise many kinds for what they cannot read
+        raise damaged(path, error) from None
+    return header, arrays
