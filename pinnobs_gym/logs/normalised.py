@@ -11,6 +11,8 @@ from pinnobs_gym.simulation.noise import AssumedNoise, SampledLevel
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import Setup, System
 
+_SINGULAR = 1e-13
+"""Least eigenvalue of a matrix of correlations below which it is taken for singular."""
 _EARLY = 0.1
 """Least share of the samples that count as the start."""
 _LATEST = 0.5
@@ -82,10 +84,10 @@ def _normalised_squares(values: np.ndarray, S: np.ndarray, absent: np.ndarray) -
         scaled = S / std[:, :, None] / std[:, None, :]
     # Without the rows and columns of absent outputs, whose values are zero.
     scaled = np.where(absent[:, :, None] | absent[:, None, :], np.eye(S.shape[-1]), scaled)
-    least = np.linalg.eigvalsh(scaled)[:, 0]
-    scaled[~(least > 0)] = np.eye(S.shape[-1])
+    regular = np.linalg.eigvalsh(scaled)[:, 0] > _SINGULAR
+    scaled[~regular] = np.eye(S.shape[-1])
     squares = (values * np.linalg.solve(scaled, values[..., None])[..., 0]).sum(axis=1)
-    return np.where((least > 0) & ~absent.all(axis=1), squares, np.nan)
+    return np.where(regular & ~absent.all(axis=1), squares, np.nan)
 
 
 def _of_residuals(system: System, setup: Setup, record: Record, estimates: Estimates) -> Normalised:
