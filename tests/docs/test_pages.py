@@ -166,6 +166,8 @@ def test_the_cells_of_a_guide_run_and_take_few_lines(path, tmp_path):
     """What a reader writes is the model and the calls; the cell that simulates a log is hidden."""
     printed = run_cells(path, tmp_path)
     assert "estimates: estimates.csv; picture: estimates.png" in printed
+    wrong = "ekf.csv" in printed  # of an estimator that does not suit the plant, as is shown
+    assert printed.count("warning: ") == wrong
     own = [text for options, text in cells(path) if "hide-input" not in options]
     assert any("assert" in text for text in own)  # that the estimates are right
     assert any('Image("estimates.png"' in text for text in own)
