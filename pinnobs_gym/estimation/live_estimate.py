@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.estimation.live_steps import Moments, Packed, Point, moments_of
+from pinnobs_gym.estimation.live_steps import Moments, Packed, Point, arrays_of, moments_of
 
 
 class Estimate:
@@ -24,7 +24,7 @@ class Estimate:
         self.t: float | None = point.t
         self._y = y
         # A state may hold particles or windows, which would fill the memory of who keeps estimates.
-        self._source = point if isinstance(point, Packed) else moments_of(point)
+        self._source = point if isinstance(point, Packed) else arrays_of(point)
 
     @cached_property
     def xhat(self) -> np.ndarray:
@@ -58,7 +58,7 @@ class Estimate:
     @cached_property
     def _moments(self) -> Moments:
         source = self._source
-        return source.moments() if isinstance(source, Packed) else source
+        return source.moments() if isinstance(source, Packed) else moments_of(*source)
 
     def __getstate__(self) -> dict[str, Any]:
         # A buffer of compiled code holds in its own process only.

@@ -72,17 +72,24 @@ def state_of(point: Point) -> State:
     return point.state() if isinstance(point, Packed) else point
 
 
-def moments_of(state: State) -> Moments:
-    """Return the moments of a state."""
-    P, innovation, S = (
-        None if array is None else np.asarray(array)[0]
-        for array in (state.P, state.innovation, state.S)
-    )
+Arrays: TypeAlias = tuple[np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray | None]
+"""The estimate (1, nx), its covariance, the innovation and its covariance."""
+
+
+def arrays_of(state: State) -> Arrays:
+    """Return the moments of a state as arrays."""
+    return state.xhat, state.P, state.innovation, state.S
+
+
+def moments_of(
+    xhat: np.ndarray, P: np.ndarray | None, innovation: np.ndarray | None, S: np.ndarray | None
+) -> Moments:
+    """Return the moments in arrays; see `arrays_of`."""
     return Moments(
-        np.asarray(state.xhat)[0].tolist(),
-        None if P is None else np.diagonal(P).tolist(),
-        None if innovation is None else innovation.tolist(),
-        None if S is None else S.ravel().tolist(),
+        np.asarray(xhat)[0].tolist(),
+        None if P is None else np.diagonal(np.asarray(P)[0]).tolist(),
+        None if innovation is None else np.asarray(innovation)[0].tolist(),
+        None if S is None else np.asarray(S)[0].ravel().tolist(),
     )
 
 
