@@ -58,5 +58,7 @@ def fit_figure(logs: Sequence[Log], fit: Fit) -> Figure:
 def _around(off: np.ndarray, std: np.ndarray) -> tuple[float, float]:
     """Return limits of a panel of residuals, which outliers and a first sample do not widen."""
     known = abs(off[np.isfinite(off)])
-    size = max(3 * float(np.median(std)), 1.5 * float(np.quantile(known, 0.99)) if len(known) else 0)
+    size = max(
+        3 * float(np.median(std)), 1.5 * float(np.quantile(known, 0.99)) if len(known) else 0
+    )
     return -size, size

@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimation.square_root import WIDE
 from pinnobs_gym.logs.reading import Log
 from pinnobs_gym.logs.unknown import Parameters
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel, noise_root
 from pinnobs_gym.simulation.record import Prior, Record
-from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.system import Setup, System, output_scale, vector
 
+_MARGIN = 1.5
+"""Factor by which the noise of outputs is kept above that with which filters carry roots."""
 _ENTRIES = 2**23
 """About how many numbers the results of a filter on several rows have."""
 
@@ -62,6 +65,16 @@ class FilterRows:
         if q:
             process[:] = np.exp(rows[:, p + r :])
         return outputs, process
+
+    def smallest(self, share: float) -> np.ndarray:
+        """Return the smallest factors on the unknown noise of outputs: a share of what is told, but
+        none for which the prior is so wide that filters carry roots of covariances
+        (`pinnobs_gym.estimation.square_root`), which takes a hundred times as long."""
+        log = self.logs[0]
+        std = np.sqrt(np.stack([np.diagonal(each.record.prior.cov[0]) for each in self.logs]))
+        widest = float((std / vector(log.system.scale, log.system.nx, "scale")).max())
+        least = _MARGIN * widest / WIDE * output_scale(log.system) / self.std
+        return np.minimum(1.0, np.maximum(share, least))[self.outputs]
 
     def chunks(self, log: Log, count: int) -> list[slice]:
         """Return the parts of a number of rows that are filtered at once, so that memory lasts."""

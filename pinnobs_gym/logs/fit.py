@@ -199,7 +199,8 @@ def _noise_values(system: System, made: NoiseFit, std: np.ndarray) -> tuple[Foun
         system.state_names, sizes, np.broadcast_to(process, sizes.shape), strict=True
     ):
         if size:
-            unit = system.units.get(name, "") + ("" if system.discrete else "/√s")
+            unit = system.units.get(name, "")
+            unit = unit if system.discrete else f"{unit or 1}/√s"
             value = float(size)
             found.append(Found(f"process noise of {name}", unit, value, value * float(error)))
     return tuple(found)

@@ -63,36 +63,43 @@ def minimised(
     """Return the point of least cost near v (n,), and the cost about it, by the Levenberg-Marquardt
     method (Nocedal & Wright 2006, section 10.3), whose steps are kept within bounds.
 
+    Steps of any length are damped in proportion to the curvature (Marquardt). Where the longest is
+    given, components are of comparable size, and are damped alike (Levenberg): far from the minimum
+    the curvature of a likelihood says little of how far it is.
+
     Args:
         evaluate: returns the cost about a point.
         v: where the search begins.
         inside: the points that are allowed; all if None.
         most: largest number of evaluations after the first.
         least_gain: predicted decrease of the cost at which the search ends.
-        longest: largest change of a component in one step.
+        longest: largest change of a component in one step. It is less after a step that failed.
     """
-    best, damping = evaluate(v), _DAMPING[0]
+    best, damping, radius = evaluate(v), _DAMPING[0], longest
     if not np.isfinite(best.cost):
         return v, best
     for _ in range(most):
-        # Marquardt's scaling; a direction that changes nothing keeps a unit of its own.
         diagonal = np.diagonal(best.information)
-        size = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        scaled = best.information / np.outer(size, size)
-        damped = scaled + (damping + 1e-14) * np.eye(len(v))
-        step = np.linalg.solve(damped, best.right / size) / size
-        if abs(step).max() > longest:
-            step *= longest / abs(step).max()
-        trial = v + step
-        if inside is not None:
-            trial = inside.nearest(trial, damped * np.outer(size, size))
-        step = trial - v
-        gain = float(step @ best.right)
+        size = np.where(diagonal > 0, diagonal, 1.0) if longest == np.inf else np.ones(len(v))
+        while True:  # until the step is short enough; one that is not finite never is
+            damped = best.information + damping * np.diag(size)
+            step = _solved(damped, best.right)
+            if abs(step).max() <= radius or damping > _DAMPING[1]:
+                break
+            damping *= 10
+        trial = v + step if inside is None else inside.nearest(v + step, damped)
+        gain = float((trial - v) @ best.right)
         at = evaluate(trial)
         if at.cost <= best.cost + _ROUNDING * abs(best.cost):
-            v, best, damping = trial, at, damping / 10
+            v, best, damping, radius = trial, at, damping / 10, min(longest, 2 * radius)
         else:
-            damping *= 10
+            damping, radius = damping * 10, float(abs(step).max()) / 4
         if gain <= least_gain or damping > _DAMPING[1]:
             break
     return v, best
+
+
+def _solved(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return A⁻¹b for A (n, n) positive definite, or nearly so, and scaled in any way."""
+    size = np.sqrt(np.diagonal(A))
+    return np.linalg.solve(A / np.outer(size, size) + 1e-14 * np.eye(len(b)), b / size) / size

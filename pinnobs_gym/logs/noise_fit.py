@@ -23,7 +23,7 @@ _PROCESS_FACTORS = 10.0 ** np.arange(-2, 3)
 """Factors on the told noise that are tried first, all with each other."""
 _SMALLEST, _LARGEST = (1e-3, 1e-5), 1e5
 """Smallest factors on the noise of outputs and on process noise, and the largest on both."""
-_WITHOUT = np.r_[1.0, np.geomspace(0.5, 10, 30)]
+_WITHOUT = np.geomspace(1, 1000, 40)
 """Factors on the noise of outputs that are tried where there is no process noise."""
 _ITERATIONS, _GAIN = 60, 1e-6
 _LONGEST = 2.0
@@ -120,7 +120,7 @@ class _Likelihood:
         _, r, q = rows.sizes
         nx = len(rows.L)
         low, high = (side[nx:] for side in limits(rows.logs[0].system, parameters))
-        least = np.repeat(np.log(_SMALLEST), (r, q))
+        least = np.r_[np.log(rows.smallest(_SMALLEST[0])), np.full(q, np.log(_SMALLEST[1]))]
         box = StateBox(np.r_[low, least], np.r_[high, np.full(r + q, np.log(_LARGEST))])
         self.inside = Inside(np.zeros(self._n), np.eye(self._n), box)
 
