@@ -111,9 +111,8 @@ def _unseen(system: System, told: Seen, estimates: Estimates) -> list[str]:
     if not names or estimates.P is None:
         return []
     return [
-        f"{', '.join(names)}: the variance never fell below that without outputs; these outputs "
-        "tell nothing of it, and its estimate is the model's alone; measure more, or fix it with a "
-        "small --P0-std"
+        f"{', '.join(names)}: the variance never fell, as these outputs tell nothing of it; the "
+        "estimate is the model's alone; measure more, or fix it by a small --P0-std"
     ]
 
 

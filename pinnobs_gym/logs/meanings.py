@@ -98,7 +98,8 @@ def warnings_of(tests: Sequence[OutputTests], together: Size | None) -> list[str
             names += f" and {len(worst) - NAMED} more outputs" if len(worst) > NAMED else ""
             values = "innovations" if worst[0].of_filter else "residuals"
             lines.append(f"{names}: {what.format(values=values)}; {meaning}")
-    usual = together is None or USUAL[0] <= together.median <= USUAL[1]
+    low = USUAL[0] if all(each.small_tells for each in tests) else 0.0
+    usual = together is None or low <= together.median <= USUAL[1]
     if not lines and together is not None and not usual and together.chance < CHANCE:
         lines.append(
             f"all outputs together (squares {_rounded(together.median)} times the expected): "
