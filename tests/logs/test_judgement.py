@@ -125,7 +125,7 @@ def test_outliers_are_not_taken_for_a_wrong_noise():
     assert "these are outliers" in line
     assert "robust_ekf" in line
     burst = estimates.innovation.copy()
-    burst[:, 200:230] *= 12
+    burst[:, 300:330] *= 12
     (line,) = warned(record, replace(estimates, innovation=burst))
     assert "come together" in line
     assert "the model fails" in line
@@ -292,3 +292,15 @@ def test_states_that_no_output_sees_are_told_and_others_not():
     assert "states that the outputs tell nothing of: position, constant" in judgement.facts
     (line,) = judgement.warnings
     assert line.startswith("position: ")
+
+
+def test_a_filter_that_has_to_find_the_state_first_is_a_fact_and_no_warning():
+    record, estimates = right(1000)
+    e, slow = estimates.innovation.copy(), summed(right(1000, 1)[1], 0.9).innovation
+    e[:, :300] = 3 * slow[:, :300]
+    judgement = judge(Linear(), SETUP, record, replace(estimates, innovation=e))
+    assert judgement.warnings == ()
+    assert "the filter had to find the state first" in "\n".join(judgement.facts)
+    late = estimates.innovation.copy()
+    late[:, 700:] = 3 * slow[:, 700:]
+    assert warned(record, replace(estimates, innovation=late))

@@ -39,7 +39,7 @@ def test_right_logs_raise_no_warning(cls, estimator):
         (Radar, times(1, DEGREES), "bearing"),
         (Tank, times(1, 0.01), "level2"),
         (DrivenCar, without_input(0, -1.0), "the model does not explain"),
-        (Cart, without_input(0, -1.0), "with the input force before"),
+        (Cart, without_input(0, -1.0), "the inputs and their clock"),
         (Tank, swapped, "the model does not explain"),
         (Cart, output_noise(0.1), "the output is noisier than told"),
         (Radar, output_noise(0.1**0.5), "the output is noisier than told"),
