@@ -167,18 +167,16 @@ def drift_of(values: np.ndarray) -> Drift:
 
 def outliers_of(values: np.ndarray) -> Outliers:
     """Return the share of values (n,) that are, by their robust standard deviation, beyond the
-    bound of a normal value with probability `FAR`. Their number is binomial; as they may come
-    together, it is that of `effective_number` values."""
-    from scipy.special import betainc, ndtri
+    bound of a normal value with probability `FAR`, of which the number is binomial."""
+    from scipy.special import bdtrc, ndtri
 
     far = abs(values) > float(ndtri(1 - FAR / 2)) * _robust_std(values)
     rows = np.flatnonzero(far)
     if not len(rows):
         return Outliers(0.0, 1.0, 0, 0, 1.0)
-    number, share = effective_number(far), float(far.mean())
-    count = share * number
-    chance = float(betainc(count, number - count + 1, FAR))
-    return Outliers(share, len(far) / number, int(rows[0]), int(rows[-1]), chance)
+    chance = float(bdtrc(len(rows) - 1, len(values), FAR))
+    memory = len(values) / effective_number(far)
+    return Outliers(float(far.mean()), memory, int(rows[0]), int(rows[-1]), chance)
 
 
 def _robust_std(values: np.ndarray) -> float:

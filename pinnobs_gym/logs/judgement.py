@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from pinnobs_gym.logs.innovation_tests import (
     size_of,
 )
 from pinnobs_gym.logs.input_tests import driven_by
-from pinnobs_gym.logs.meanings import warnings_of
+from pinnobs_gym.logs.meanings import early_facts, warnings_of
 from pinnobs_gym.logs.normalised import Normalised, normalised
 from pinnobs_gym.logs.unseen import Seen, seen
 from pinnobs_gym.logs.verdicts import OutputTests
@@ -61,7 +61,8 @@ def judge(system: System, setup: Setup, record: Record, estimates: Estimates) ->
     found = normalised(system, setup, record, estimates)
     tests, together = _tests(system, record, found)
     told = seen(system, setup, record, estimates)
-    facts = [*innovation_facts(found, tests, together), *common_facts(system, setup, record)]
+    facts = [*innovation_facts(found, tests, together), *early_facts(tests)]
+    facts += common_facts(system, setup, record)
     warnings = [*_diverged(system, record, estimates), *warnings_of(tests, together)]
     warnings += _first(system, record, found)
     if told is not None:
@@ -75,27 +76,13 @@ def _tests(
 ) -> tuple[list[OutputTests], Size | None]:
     """Return the tests of the outputs that have enough samples, and the size of all together."""
     tests = []
-    for i, name in enumerate(system.output_names):
+    for i in range(system.ny):
         rows = np.flatnonzero(np.isfinite(found.values[:, i]))
         rows = rows[rows >= found.start]
-        if len(rows) < FEWEST:
-            continue
-        values, t = found.values[rows, i], record.t[rows]
-        outliers = outliers_of(values)
-        tests.append(
-            OutputTests(
-                name,
-                size_of(values**2, np.ones(len(values))),
-                correlation_of(values, t),
-                drift_of(values),
-                outliers,
-                (float(t[outliers.first]), float(t[outliers.last])),
-                driven_by(values, rows, record.u[0], system.input_names),
-                bool(found.small_tells[i]),
-                bool(found.white[i]),
-                found.of_filter,
-            )
-        )
+        if len(rows) >= FEWEST:
+            half = rows[len(rows) // 2 :]
+            later = _tests_of(i, system, record, found, half) if len(half) >= FEWEST else None
+            tests.append(replace(_tests_of(i, system, record, found, rows), later=later))
     if found.squares is None or len(tests) < 2:
         return tests, None
     rows = np.flatnonzero(np.isfinite(found.squares))
@@ -106,14 +93,34 @@ def _tests(
     return tests, size_of(found.squares[rows], degrees)
 
 
+def _tests_of(
+    i: int, system: System, record: Record, found: Normalised, rows: np.ndarray
+) -> OutputTests:
+    """Return the tests of an output at some samples (n,) that have it."""
+    values, t = found.values[rows, i], record.t[rows]
+    outliers = outliers_of(values)
+    return OutputTests(
+        system.output_names[i],
+        size_of(values**2, np.ones(len(values))),
+        correlation_of(values, t),
+        drift_of(values),
+        outliers,
+        (float(t[outliers.first]), float(t[outliers.last])),
+        driven_by(values, rows, record.u[0], system.input_names),
+        bool(found.small_tells[i]),
+        bool(found.white[i]),
+        found.of_filter,
+        float(t[0]),
+    )
+
+
 def _unseen(system: System, told: Seen, estimates: Estimates) -> list[str]:
     names = [name for name, each in zip(system.state_names, told.matters, strict=True) if each]
     if not names or estimates.P is None:
         return []
     return [
-        f"{', '.join(names)}: the variance never fell below that without outputs; these outputs "
-        "tell nothing of it, and its estimate is the model's alone; measure more, or fix it with a "
-        "small --P0-std"
+        f"{', '.join(names)}: the variance never fell, as these outputs tell nothing of it; the "
+        "estimate is the model's alone; measure more, or fix it by a small --P0-std"
     ]
 
 

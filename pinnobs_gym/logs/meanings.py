@@ -72,7 +72,7 @@ MEANINGS = {
     ),
 }
 """What is seen, and what it means and what to try, for each verdict."""
-_EFFECTS = ("noisy", "slow", "driven", "bursts", "outliers")
+_EFFECTS = ("noisy", "slow", "driven", "early", "bursts", "outliers")
 """Verdicts of other outputs that a model with an unexplained one makes likely."""
 
 
@@ -98,7 +98,8 @@ def warnings_of(tests: Sequence[OutputTests], together: Size | None) -> list[str
             names += f" and {len(worst) - NAMED} more outputs" if len(worst) > NAMED else ""
             values = "innovations" if worst[0].of_filter else "residuals"
             lines.append(f"{names}: {what.format(values=values)}; {meaning}")
-    usual = together is None or USUAL[0] <= together.median <= USUAL[1]
+    low = USUAL[0] if all(each.small_tells for each in tests) else 0.0
+    usual = together is None or low <= together.median <= USUAL[1]
     if not lines and together is not None and not usual and together.chance < CHANCE:
         lines.append(
             f"all outputs together (squares {_rounded(together.median)} times the expected): "
@@ -106,6 +107,23 @@ def warnings_of(tests: Sequence[OutputTests], together: Size | None) -> list[str
             "the correlation of their noise is told wrongly"
         )
     return lines
+
+
+def early_facts(tests: Sequence[OutputTests]) -> list[str]:
+    """Return a line on outputs that fit from the second half of their values on only. A filter that
+    has to find the state from a wide prior first is no fault of a log."""
+    early = [
+        f"{each.name} before t = {each.later.begin:.6g}"
+        for each in tests
+        if each.later is not None and each.verdict(CHANCE / len(tests)) == "early"
+    ]
+    if not early:
+        return []
+    more = f" and {len(early) - NAMED} more outputs" if len(early) > NAMED else ""
+    return [
+        f"the filter had to find the state first: estimates are worse than their standard "
+        f"deviations by the innovations of {', '.join(early[:NAMED])}{more}, and fit later"
+    ]
 
 
 def _seen(tests: OutputTests, verdict: str) -> str:

@@ -122,11 +122,12 @@ def told_noise(system: System, setup: Setup, record: Record) -> AssumedNoise:
 def _start(variance: np.ndarray, absent: np.ndarray) -> int:
     """Return how many samples belong to the start, where a filter forgets a wide prior: until the
     variances (num_samples, ny) are near those of the second half, within limits."""
-    number, early = len(variance), int(_EARLY * len(variance))
-    ends = [early]
+    number = len(variance)
+    ends = [int(_EARLY * number)]
     for own, missing in zip(variance.T, absent.T, strict=True):
-        later = own[number // 2 :][~missing[number // 2 :]]
+        present = np.flatnonzero(~missing)
+        later = own[present[present >= number // 2]]
         if len(later):
-            wide = (own > _SETTLED * np.median(later)) & ~missing
-            ends += (np.flatnonzero(wide[: int(_LATEST * number)]) + 1)[-1:].tolist()
+            settled = present[own[present] <= _SETTLED * np.median(later)]
+            ends.append(min(int(settled[0]), int(_LATEST * number)))
     return max(ends)

@@ -24,6 +24,10 @@ MANY = 0.01
 SINGLE = 3.0
 """Number of samples over which such values come together below which they are single wrong outputs,
 with what each does to the next estimates."""
+_PASSING = ("unexplained", "slow", "driven", "bursts")
+"""Verdicts on a model or a filter that may fail at first only."""
+_LENIENT = 0.05
+"""Probability below which the second half counts as wrong, too."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +54,25 @@ class OutputTests:
     """Whether values of a right model are uncorrelated."""
     of_filter: bool
     """Whether these are innovations with covariances; otherwise residuals."""
+    begin: float
+    """Time of the first value."""
+    later: OutputTests | None = None
+    """The tests of the second half of the values, if they are enough."""
 
     def verdict(self, chance: float) -> str:
         """Return what is wrong, a key of `pinnobs_gym.logs.meanings.MEANINGS`; an empty text if
-        nothing is.
+        nothing is. It is "early", no fault of the log, where a model or a filter fails, but not in
+        the least in the second half.
 
         Args:
             chance: probability below which something is not taken for chance.
         """
+        found, later = self._verdict(chance), self.later
+        passing = found in _PASSING and later is not None and not later._verdict(_LENIENT)
+        return "early" if passing else found
+
+    def _verdict(self, chance: float) -> str:
+        """Return the verdict on all values; see `verdict`."""
         size, r, out = self.size, self.correlation, self.outliers
         alike = self.white and r.chance < chance and r.value > CORRELATED
         alike |= self.white and self.drift.chance < chance and self.drift.ratio > DRIFTING

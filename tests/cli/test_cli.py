@@ -58,7 +58,8 @@ def test_estimate_is_the_same_path_as_a_record_from_an_env(folder, capsys):
     assert run("estimate", "--system", "ReverseDuffing", "--log", "log.csv") == 0
     with (folder / "estimates.csv").open() as file:
         header, *lines = csv.reader(file)
-    assert header == ["t", "x1", "x2", "x1_std", "x2_std"]
+    innovations = ["y1_innovation", "y1_innovation_std"]
+    assert header == ["t", "x1", "x2", "x1_std", "x2_std", *innovations]
     table = np.array(lines, dtype=float)
     own = EKF.for_setup(source.system, source.setup).run(record)
     np.testing.assert_allclose(table[:, 1:3], own.xhat[0], rtol=1e-12)
