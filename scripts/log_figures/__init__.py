@@ -1,0 +1,1 @@
+"""Parts of the group ``logs`` of `scripts/benchmark.py`."""
