@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimation.square_root import WIDE
+from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.logs.reading import Log
 from pinnobs_gym.logs.unknown import Parameters
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel, noise_root

@@ -90,11 +90,18 @@ def fit(
         progress: is told in a few words what is being done.
 
     Raises:
-        ValueError: in one line, if nothing is to be found, or as these two do.
+        ValueError: in one line, if nothing is to be found, if the logs are not of one system, or as
+            these two do.
     """
     if not parameters.names and not noise:
         raise ValueError("nothing is to be found; name parameters, or ask for the noise")
     system = logs[0].system
+    other = next((log for log in logs if type(log.system) is not type(system)), None)
+    if other is not None:
+        raise ValueError(
+            f"log {other.path} is one of {type(other.system).__name__}; expected "
+            f"{type(system).__name__}, as of {logs[0].path}"
+        )
     told = system.noise(setup.noise_std, setup.process_noise)
     if not noise and not told.stochastic:
         return _by_trajectories(logs, setup, parameters, progress)
@@ -135,7 +142,7 @@ def _by_likelihood(
     starts = []
     if parameters.names:
         try:
-            starts = [fit_parameters(logs, setup, parameters, progress).d]
+            starts = [fit_parameters(logs, setup, parameters, progress, again=False).d]
         except ValueError:  # no trajectory is finite; the filter's estimates may still be
             starts = []
     made = fit_noise(logs, setup, parameters, noise=noise, starts=starts, progress=progress)

@@ -62,7 +62,7 @@ def doubts_of_parameters(parameters: Parameters, d: np.ndarray, known: Precision
 def doubts_of_residuals(
     system: System, residuals: Sequence[Residuals], larger: float | None
 ) -> list[str]:
-    """Return whether the fit does not explain the logs, a line for each output.
+    """Return whether the fit does not explain the logs, a line for each way in which it does not.
 
     Args:
         system: the model.
@@ -70,33 +70,39 @@ def doubts_of_residuals(
         larger: the factor by which standard errors were enlarged; None if they are those of noise
             that was found, or of a filter.
     """
+    named = list(zip(system.output_names, residuals, strict=True))
     lines = []
-    for name, own in zip(system.output_names, residuals, strict=True):
-        if own.ratio > _USUAL[1]:
-            grown = "" if larger is None else f"; standard errors are enlarged {larger:.2g} times"
-            lines.append(
-                f"the residuals of {name} are {own.ratio:.2g} times the noise that is told: the "
-                f"model does not explain the log, or its noise is told too small{grown}"
-            )
-        elif own.ratio < _USUAL[0]:
-            lines.append(
-                f"the residuals of {name} are {own.ratio:.2g} times the noise that is told, which "
-                "is too large; standard errors are those of the told noise"
-            )
-        if abs(own.serial) > _SERIAL:
-            factor = np.sqrt((1 + min(own.serial, 0.999)) / (1 - min(own.serial, 0.999)))
-            advice = "; try --noise, which takes what the model leaves out as process noise"
-            lines.append(
-                f"the residuals of {name} are correlated, {own.serial:.2f} from one sample to the "
-                "next: the model leaves something out"
-                + (
-                    f", and standard errors are about {factor:.2g} times too small"
-                    if own.serial > 0
-                    else ""
-                )
-                + (advice if larger is not None else "")
-            )
+    if large := [f"{name} {own.ratio:.2g}" for name, own in named if own.ratio > _USUAL[1]]:
+        grown = "" if larger is None else f"; standard errors are enlarged {larger:.2g} times"
+        lines.append(
+            f"residuals over the noise that is told: {', '.join(large)}; the model does not "
+            f"explain the log, or its noise is told too small{grown}"
+        )
+    if small := [f"{name} {own.ratio:.2g}" for name, own in named if own.ratio < _USUAL[0]]:
+        lines.append(
+            f"residuals over the noise that is told: {', '.join(small)}; it is told too large, and "
+            "standard errors are those of the told noise"
+        )
+    if serial := [(name, own.serial) for name, own in named if abs(own.serial) > _SERIAL]:
+        lines.append(_of_serial(serial, larger is not None))
     return lines
+
+
+def _of_serial(serial: Sequence[tuple[str, float]], by_trajectory: bool) -> str:
+    """Return what correlations of residuals from one sample to the next, by output, say. Errors
+    with the correlation r^k over k samples have the effect of white ones that are
+    √((1 + r)/(1 − r)) times as large."""
+    listed = ", ".join(f"{name} {r:.2f}" for name, r in serial)
+    r = min(max(r for _, r in serial), 0.999)
+    line = f"residuals are correlated from one sample to the next: {listed}; the model leaves "
+    line += "something out"
+    if r <= 0:
+        return line
+    factor = f"{np.sqrt((1 + r) / (1 - r)):.2g}"
+    line += f", and standard errors are up to {factor} times too small"
+    if by_trajectory:
+        return f"{line}; try --noise, which takes what the model leaves out as process noise"
+    return f"{line}. Sensor errors that last ask for as much more --noise-std in a filter"
 
 
 def doubts_of_noise(system: System, made: NoiseFit, std: np.ndarray) -> list[str]:

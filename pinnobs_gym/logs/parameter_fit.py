@@ -50,6 +50,8 @@ def fit_parameters(
     setup: Setup,
     parameters: Parameters,
     progress: Callable[[str], object] = lambda text: None,
+    *,
+    again: bool = True,
 ) -> ParameterFit:
     """Return the parameters with the least sum of squared output errors.
 
@@ -67,6 +69,7 @@ def fit_parameters(
         setup: the output noise.
         parameters: the unknown ones.
         progress: is told in a few words what is being done.
+        again: whether the search may be repeated.
 
     Raises:
         ValueError: in one line, if the logs have too few outputs, or if the model is not defined at
@@ -80,7 +83,8 @@ def fit_parameters(
         found.append(
             problem.grown(d, lambda text, f=factor: progress(f"{text}, start times {f:g}"))
         )
-        if found[-1][0] <= _EXPLAINED * problem.freedom or not start.any():
+        explained = found[-1][0] <= _EXPLAINED * problem.freedom
+        if explained or not again or not start.any():
             break
     cost, v = min(found, key=lambda each: each[0])
     if not np.isfinite(cost):

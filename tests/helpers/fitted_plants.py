@@ -85,6 +85,51 @@ class Swing(System):
         return x[..., :1]
 
 
+@dataclass(frozen=True)
+class Decay(System):
+    """x' = -kx + u, with a held input, of which x is measured almost exactly."""
+
+    k: float = 1.0
+    state_names = ("x",)
+    output_names = ("y1",)
+    input_names = ("u1",)
+    scale = (1.0,)
+    setups = {"benchmark": Setup(xhat0=(2.1,), P0=independent(1.0), dt=0.2, noise_std=0.01)}
+
+    def f(self, t, x, u):
+        return stack(x, u[..., 0] - self.k * x[..., 0])
+
+    def h(self, t, x, u):
+        return x
+
+
+@dataclass(frozen=True)
+class StiffDecay(Decay):
+    """The same by a linearly implicit method."""
+
+    stiff = True
+
+
+@dataclass(frozen=True)
+class OwnDecay(Decay):
+    """The same by a flow of its own."""
+
+    def flow(self, t0, t1, x, u):
+        xp, rest = array_namespace(x), u[..., 0] / self.k
+        return stack(x, rest + (x[..., 0] - rest) * xp.exp(-self.k * (t1 - t0)))
+
+
+@dataclass(frozen=True)
+class MapDecay(Decay):
+    """The map x⁺ = kx + u."""
+
+    discrete = True
+    setups = {"benchmark": Setup(xhat0=(2.1,), P0=independent(1.0), dt=1.0, noise_std=0.01)}
+
+    def f(self, t, x, u):
+        return stack(x, self.k * x[..., 0] + u[..., 0])
+
+
 def simulated_log(system, setup, num_samples, seed=0, measured_input=None):
     """A log of a plant from a setup's prior, with its process noise and output noise; and its true
     states (num_samples, nx). The input (num_samples, nu) is held."""
