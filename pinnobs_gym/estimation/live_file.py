@@ -64,7 +64,7 @@ def read(path: Path, estimator: Estimator) -> dict[str, Any]:
             f"{path} is of version {header.get('version')} of the format of live filters; expected "
             f"{VERSION}"
         )
-    check_identity(path, header.get("identity"), identity(estimator))
+    check_identity(path, header["identity"], identity(estimator))
     try:
         orders = header["orders"]
         ordered = [arrays[f"array{i}"] for i in range(len(orders))]
@@ -93,7 +93,7 @@ def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             loaded = np.load(file, allow_pickle=False)
             arrays = {name: loaded[name] for name in loaded.files}
         header = json.loads(arrays["header"].tobytes())
-        if header["format"] != FORMAT:
+        if header["format"] != FORMAT or not isinstance(header["identity"], dict):
             raise TypeError("another format")
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from None

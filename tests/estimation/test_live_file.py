@@ -215,6 +215,7 @@ def _base(header):
 CHANGES = {
     "another version": lambda h: h.update(version=VERSION + 1),
     "another format": lambda h: h.update(format="something else"),
+    "no identity": lambda h: h.pop("identity"),
     "no content": lambda h: h.pop("content"),
     "no state": lambda h: h["content"].update(dict=[]),
     "content that is none": lambda h: h.update(content=[1, 2]),
