@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pinnobs_gym.estimation.live import Live
     from pinnobs_gym.leaderboard.published.trained import load
     from pinnobs_gym.scoring.evaluation import evaluate
+    from pinnobs_gym.scoring.log_evaluation import evaluate_logs
     from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.augmented import augmented
     from pinnobs_gym.simulation.augmented_system import Unknown
@@ -32,6 +33,7 @@ __all__ = [
     "__version__",
     "augmented",
     "evaluate",
+    "evaluate_logs",
     "independent",
     "load",
     "read_rows",
@@ -55,6 +57,7 @@ _HOMES = {
     "stack": "simulation.system",
     "table": "simulation.table",
     "evaluate": "scoring.evaluation",
+    "evaluate_logs": "scoring.log_evaluation",
     "load": "leaderboard.published.trained",
     "read_rows": "scoring.table",
 }

@@ -57,6 +57,34 @@ def by_option(arguments: Sequence[str]) -> list[tuple[str, list[str]]]:
     return groups
 
 
+LOG_OPTIONS = ("--columns", "--also", "--noise-std", "--process-noise", "--xhat0", "--P0-std")
+"""Options of sensor logs that commands have which otherwise simulate episodes."""
+
+
+def check_apart(arguments: Sequence[str], simulated: Sequence[str], of_logs: Sequence[str]) -> None:
+    """Check that options of simulated episodes and those of sensor logs, which are there if
+    ``--log`` is, are not mixed.
+
+    Args:
+        arguments: the arguments of a command.
+        simulated: its options of simulated episodes.
+        of_logs: its options of logs beside ``--log``.
+
+    Raises:
+        ValueError: in one line that names the options.
+    """
+    given = {option for option, values in by_option(arguments)}
+    log = "--log" in given
+    wrong = [option for option in (simulated if log else of_logs) if option in given]
+    if wrong and log:
+        raise ValueError(
+            f"{', '.join(wrong)} and --log; {', '.join(simulated)} are of simulated episodes, "
+            "which --log replaces"
+        )
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)} without --log; expected the log it belongs to")
+
+
 def _joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
     """Return the arguments with each option only once, with all its values if it is one of
     ``lists``.

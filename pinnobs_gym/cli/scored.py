@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pinnobs_gym.cli.console import console, print_table, progress
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import AnyGame
 from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.against import Opponents, compare
 from pinnobs_gym.leaderboard.contenders import contenders
@@ -41,7 +41,7 @@ def with_progress(episodes: int, score: Callable[[Callable[[int], None]], Evalua
 
 
 def report(
-    game: Game,
+    game: AnyGame,
     evaluated: Evaluated,
     out: Path,
     picture: bool = True,

@@ -34,19 +34,23 @@ def state_figure(
     """Return a figure of estimates over time, with a panel per state.
 
     Of an angle, outputs and estimates are drawn at the values nearest to the true state. Where the
-    true state or the estimate jumps by a period its line is broken.
+    true state or the estimate jumps by a period its line is broken. True states that are known in
+    part are dots, at the values nearest to the estimates.
 
     Args:
         system: names and units.
         t: times in s, or steps of a map, shape (num_samples,).
         xhat: estimates, shape (num_samples, nx).
-        x: true states (num_samples, nx), if known.
+        x: true states (num_samples, nx), if known; NaN where they are not.
         y: outputs (num_samples, ny); those that directly measure a state are drawn as dots.
         P: covariances (num_samples, nx, nx), drawn as a band of two standard deviations.
         title: title of the figure.
     """
     figure, column = panels(system.nx, width=8, height=1.0 + 1.6 * system.nx)
     measured = measured_states(system)
+    references = None
+    if x is not None and np.isnan(x).any():
+        x, references = None, nearest(x, xhat, system.state_period)
     if y is not None:
         y = drawn_outputs(system, xhat if x is None else x, y)
     if x is not None:
@@ -73,6 +77,12 @@ def state_figure(
             area = broken(breaks, t, estimate - band, estimate + band)
             panel.fill_between(*area, color=ESTIMATE, alpha=0.15, lw=0)
         seen = x[:, i] if x is not None else estimate[kept]
+        if references is not None:
+            known = ~np.isnan(references[:, i])
+            dots = references[known, i]
+            # Under the estimate, as many dots together are as a line.
+            panel.plot(t[known], dots, ".", ms=3, color=TRUE, label="reference", zorder=1.5)
+            seen = np.concatenate([seen, dots])
         if len(seen):
             panel.set_ylim(*_limits(seen, float(system.scale[i])))
         panel.grid(alpha=0.3)

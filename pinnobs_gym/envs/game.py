@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Self, Unpack
+from typing import Any, NamedTuple, Protocol, Self, Unpack
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from pinnobs_gym.envs.vector_env import EstimationVectorEnv
 from pinnobs_gym.files import file_name
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.system import Setup, System
 
 
 class GameName(NamedTuple):
@@ -38,6 +38,40 @@ class GameName(NamedTuple):
     def file_stem(self) -> str:
         """The name as the beginning of file names."""
         return "-".join(map(file_name, (self.system, self.setup, self.condition)))
+
+
+class GivenModel(Protocol):
+    """What estimators are given of a game beside its records."""
+
+    @property
+    def system(self) -> System:
+        """The model."""
+        ...
+
+    @property
+    def setup(self) -> Setup:
+        """The setup: noise, prior and transient window."""
+        ...
+
+
+class AnyGame(Protocol):
+    """What scored episodes are of: a `Game` that is simulated, or sensor logs of one model
+    (`pinnobs_gym.scoring.log_game.LogGame`)."""
+
+    @property
+    def name(self) -> GameName:
+        """The name in rows."""
+        ...
+
+    @property
+    def source(self) -> GivenModel:
+        """The model and the setup that estimators are given."""
+        ...
+
+    @property
+    def nominal(self) -> AnyGame:
+        """The game under which estimators are trained."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -86,9 +120,13 @@ class Game:
     def __reduce__(self) -> tuple[Any, ...]:
         return Game, (self.name, self.system, self.changes)
 
-    @cached_property
+    @property
     def source(self) -> EpisodeSource:
         """The source of the episodes, with the model and the setup that estimators are given."""
+        return self._source
+
+    @cached_property
+    def _source(self) -> EpisodeSource:
         return EpisodeSource(self.system, self.name.setup, self.name.condition, **self.changes)
 
     @property

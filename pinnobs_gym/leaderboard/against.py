@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.envs.game import Game, GameName
+from pinnobs_gym.envs.game import AnyGame, GameName
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.published import reading
 from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.leaderboard.tables import Table
 from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.log_game import LOG_SETUP
 from pinnobs_gym.scoring.provenance import game_hash
 from pinnobs_gym.scoring.rows import Row, Stored
 
@@ -41,7 +42,7 @@ class Comparison:
     """The ranks of the estimator, in a sentence."""
 
 
-def opponents(source: Path, game: Game, seeds: range) -> Opponents:
+def opponents(source: Path, game: AnyGame, seeds: Sequence[int]) -> Opponents:
     """Return the stored scores of a game with which those of some episodes can be compared.
 
     Args:
@@ -78,10 +79,16 @@ def opponents(source: Path, game: Game, seeds: range) -> Opponents:
         )
     wanted = set(map(rows.episode_of, seeds))
     common = [row for row in comparable if row["episode"] in wanted]
+    if not common and name.setup == LOG_SETUP:
+        files = ", ".join(dict.fromkeys(row["log"] for row in comparable))
+        raise ValueError(
+            f"{where}: no scores of these logs with these references; it has those of {files}, as "
+            "they were read then"
+        )
     if not common:
         numbers = [rows.seed_of(row) for row in comparable]
         raise ValueError(
-            f"{where}: no scores of the episodes of seeds {seeds.start} to {seeds.stop - 1}; it "
+            f"{where}: no scores of the episodes of seeds {seeds[0]} to {seeds[-1]}; it "
             f"has those of {min(numbers)} to {max(numbers)}"
         )
     return Opponents(source, where, common)
@@ -128,11 +135,14 @@ def _known(games: set[GameName], name: GameName) -> str:
     return f"there are those of {', '.join(systems) or 'no system'}"
 
 
-def _command(game: Game) -> str:
-    """Return the command that scores every estimator in a game."""
-    system, setup, condition = game.system, game.name.setup, game.name.condition
+def _command(game: AnyGame) -> str:
+    """Return the command that scores every estimator in a game, or an estimator on logs."""
+    if game.name.setup == LOG_SETUP:
+        return "pinnobs evaluate with each estimator, and the same noise and prior"
+    cls, setup, condition = type(game.source.system), game.name.setup, game.name.condition
     own = game.name.env_id.removeprefix("pinnobs/").rpartition("-v")[0]
-    system = own if system.startswith("pinnobs_gym.systems.") else system
+    inside = cls.__module__.startswith("pinnobs_gym.systems.")
+    system = own if inside else f"{cls.__module__}:{cls.__qualname__}"
     options = "" if setup == "benchmark" else f" --setup {setup}"
     options += "" if condition == "nominal" else f" --condition {condition}"
     return f"pinnobs leaderboard --systems {system}{options}, and name its rows file"

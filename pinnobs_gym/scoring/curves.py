@@ -29,11 +29,12 @@ class Example:
 
     seed: int
     t: np.ndarray
-    """Times in s, shape (points,)."""
+    """Times in s from the first sample, shape (points,)."""
     x: np.ndarray
-    """True states, shape (points, nx)."""
+    """True states, shape (points, nx); NaN where they are unknown."""
     xhat: np.ndarray
-    """Estimates, shape (points, nx); of an angle, the value nearest to the true state."""
+    """Estimates, shape (points, nx); of an angle, the value nearest to the true state. Where true
+    states are known in part, it is they that are nearest to the estimates."""
     y: np.ndarray
     """Outputs, shape (points, ny); of an angle that is a state, the value nearest to it."""
     std: np.ndarray | None
@@ -45,7 +46,7 @@ class Curves:
     """The errors of one estimator over time in some episodes of one game."""
 
     t: np.ndarray
-    """The kept times in s, shape (points,)."""
+    """The kept times in s from the first sample, shape (points,)."""
     seeds: np.ndarray
     """Seeds of the episodes, shape (episodes,)."""
     error: np.ndarray
@@ -72,13 +73,18 @@ def labels(system: System) -> tuple[str, ...]:
 def curves_of(played: Played) -> Curves:
     """Return the curves of a batch of whole episodes at the kept times; the first is the
     example."""
-    system, t, xhat = played.system, played.record.t, played.estimates.xhat
-    shown = nearest(xhat, played.truth, system.state_period)
-    dots = drawn_outputs(system, played.truth, played.record.y)
+    system, xhat = played.system, played.estimates.xhat
+    t = played.record.t - played.record.t[0]  # a log's clock may begin at any time
+    shown, truth = nearest(xhat, played.truth, system.state_period), played.truth
+    if np.isnan(truth).any():  # the estimates are known at all samples, so that these stay
+        shown, truth = xhat, nearest(truth, xhat, system.state_period)
+    dots = drawn_outputs(system, shown if np.isnan(truth).any() else truth, played.record.y)
     error = system.state_residual(xhat, played.truth)
-    error = by_sample(error, system.scale, system.observable(played.truth))
+    error = by_sample(error, system.scale, played.scored)
     reference, std = played.reference, played.std
-    k, m = kept(len(t)), kept_of_example(len(t))
+    known = np.flatnonzero(~np.isnan(played.truth).all(axis=(0, 2)))
+    k = known[kept(len(known))]
+    m = np.union1d(kept_of_example(len(t)), known[kept_of_example(len(known))])
     return Curves(
         t=t[k],
         seeds=np.asarray(played.seeds),
@@ -87,7 +93,7 @@ def curves_of(played: Played) -> Curves:
         example=Example(
             played.seeds[0],
             t[m],
-            rounded(played.truth[0, m]),
+            rounded(truth[0, m]),
             rounded(shown[0, m]),
             rounded(dots[0, m]),
             None if std is None else rounded(std[0, m]),
@@ -151,12 +157,12 @@ def read(folder: Path, game: GameName) -> dict[tuple[str, str], list[Curves]]:
 
 def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:
     """Merge one estimator's curves, restricted to these episodes, each once; None if there are
-    none. Parts on another number of times than the first are left out."""
+    none. Parts on other times than the first are left out."""
     wanted = set(seeds)
     chosen: list[tuple[Curves, np.ndarray]] = []
     for part in parts:
         keep = np.array([int(seed) in wanted for seed in part.seeds])
-        if keep.any() and (not chosen or len(part.t) == len(chosen[0][0].t)):
+        if keep.any() and (not chosen or np.array_equal(part.t, chosen[0][0].t)):
             wanted -= set(part.seeds[keep].tolist())
             chosen.append((part, keep))
     if not chosen:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import AnyGame
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.provenance import canonical
@@ -19,7 +19,7 @@ _ASIDE = ("seed", *ALWAYS_MAY_CHANGE)
 """Settings of trainers that names do not show, or show otherwise."""
 
 
-def deviations(estimator: BaseEstimator, game: Game) -> dict[str, Any]:
+def deviations(estimator: BaseEstimator, game: AnyGame) -> dict[str, Any]:
     """Return what differs between an estimator and the one that its name stands for in a game: its
     settings or those of its training that are not the defaults, a noise level or a model other than
     those of the game, and a condition that it was trained under. If its settings are those tuned

@@ -10,7 +10,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import AnyGame, Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.registry import TRAINERS, trainer_class
@@ -34,6 +34,7 @@ from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.scoring.tuned import SUFFIX, TUNED, is_tuned, required_settings
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.training.by_name import LOGS
 from pinnobs_gym.training.log import SILENT, Log
 
 BATCH = 256
@@ -163,7 +164,8 @@ class Evaluated:
     """The result of an evaluation."""
 
     rows: list[Row]
-    """The rows in the order of seeds. Rows known to be stored but not read have no scores."""
+    """The rows in the order of seeds, or of logs. Rows known to be stored but not read have no
+    scores."""
     first_played: Played | None
     """The first batch that was run; None if all episodes were stored."""
     reused: int
@@ -225,10 +227,11 @@ def run_episodes(
 def score_episodes(
     common: Row,
     play_batch: Callable[[Sequence[int]], Played],
-    seeds: range,
+    seeds: Sequence[int],
     results: Results | None = None,
     progress: Callable[[int], None] | None = None,
     more: Callable[[Played], list[Row]] | None = None,
+    size: int = BATCH,
 ) -> Evaluated:
     """Score the episodes that are not stored yet, batch by batch.
 
@@ -240,6 +243,7 @@ def score_episodes(
         results: the stored rows, and the file to which new rows are appended.
         progress: called after each batch with its number of episodes.
         more: returns further fields of the rows of a batch.
+        size: number of episodes of a batch.
 
     Raises:
         ValueError: in one line, if a name in the rows is empty, too long or has white space at its
@@ -250,8 +254,8 @@ def score_episodes(
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
     first_played = None
-    for first in range(0, len(missing), BATCH):
-        batch = missing[first : first + BATCH]
+    for first in range(0, len(missing), size):
+        batch = missing[first : first + size]
         played = play_batch([rows_module.seed_of(row) for row in batch])
         first_played = first_played or played
         scored = zip(batch, _scored(played), strict=True)
@@ -279,7 +283,7 @@ def _scored(played: Played) -> list[Row]:
 
 def make_estimator(
     estimator: BaseEstimator | type[BaseEstimator] | str,
-    game: Game,
+    game: AnyGame,
     options: Mapping[str, Any],
     tuned: bool = False,
 ) -> BaseEstimator:
@@ -317,7 +321,7 @@ def _check_model(model: System, system: System) -> None:
         f"{type(each).__name__} (nx={each.nx}, ny={each.ny})" for each in (model, system)
     )
     if found != expected:
-        raise ValueError(f"the estimator's model is {found}; the env plays {expected}")
+        raise ValueError(f"the estimator's model is {found}; that of the game is {expected}")
 
 
 def _identifiability(game: Game) -> Row:
@@ -341,13 +345,14 @@ def game_fields(game: Game) -> Row:
     }
 
 
-def estimator_fields(estimator: BaseEstimator, game: Game) -> Row:
+def estimator_fields(estimator: BaseEstimator, game: AnyGame) -> Row:
     """Return the fields of rows that say which estimator was run."""
     condition = game.name.condition
     # An estimator trained under the very condition that is scored is no match for the others.
     informed = condition != "nominal" and estimator.training.get("condition") == condition
     knows = [*estimator.knows, *estimator.training.get("knows", ())]
     knows += ["condition"] if informed else []
+    knows += [LOGS] if estimator.training.get("condition") == LOGS else []
     tuned = is_tuned(type(estimator), estimator.options, game)
     knows += [TUNED] if tuned else []
     return {

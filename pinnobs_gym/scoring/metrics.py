@@ -130,12 +130,13 @@ def score(
     return Scores(**errors, **own, state_rmse=states)
 
 
-def windows(t: np.ndarray, transient_end: float) -> dict[str, slice]:
+def windows(t: np.ndarray, transient_end: float, start: float | None = None) -> dict[str, slice]:
     """Return the samples of each window of an episode.
 
     Args:
         t: sample times in s, shape (num_samples,).
-        transient_end: end of the transient window, in s from the first sample.
+        transient_end: end of the transient window, in s from the start.
+        start: time in s at which the episode starts; that of the first sample if None.
 
     Returns:
         Slices by name: ``first`` is the first sample, whose estimate has seen one output only;
@@ -144,7 +145,8 @@ def windows(t: np.ndarray, transient_end: float) -> dict[str, slice]:
         window has at least one sample; those of an episode of one or two samples overlap.
     """
     n = len(t)
-    within = int(np.searchsorted(t - t[0], transient_end * (1 + 1e-9), side="right"))
+    since = t - (t[0] if start is None else start)
+    within = int(np.searchsorted(since, transient_end * (1 + 1e-9), side="right"))
     steady = min(max(within, 2), n - 1)
     return {
         "whole": slice(0, n),
@@ -189,6 +191,8 @@ def error_scores(
     transient_end: float,
     scored: np.ndarray | None = None,
     alternatives: Sequence[np.ndarray] = (),
+    known: np.ndarray | bool = True,
+    start: float | None = None,
 ) -> dict[str, np.ndarray]:
     """Compute the scores that depend on errors alone, for a batch of episodes.
 
@@ -197,9 +201,12 @@ def error_scores(
         x: true states, shape (batch, num_samples, nx).
         xhat: estimates, same shape; an episode with a value that is not finite counts as diverged.
         scale: scale of the errors, one number per state.
-        transient_end: end of the transient window, in s from the first sample.
+        transient_end: end of the transient window, in s from the start.
         scored: which errors count in NRMSE, bool, shape of x; all if None.
         alternatives: states indistinguishable from x by any output, arrays of x's shape.
+        known: which of the true states are known, bool, shape of x, some of each episode; the
+            others count in no score, which ``scored`` says, too.
+        start: time in s at which the episode starts; that of the first sample if None.
 
     Returns:
         Arrays (batch,) by name; infinite where the estimates are not finite:
@@ -227,18 +234,18 @@ def error_scores(
         size = abs(x) + abs(xhat)
         relative = np.divide(2 * abs(error), size, out=np.zeros_like(size), where=size > 0)
         scores = {
-            "mae": abs(error).mean(axis=(1, 2)),
-            "mse": square.mean(axis=(1, 2)),
-            "rmse": np.sqrt(square.mean(axis=(1, 2))),
-            "smape": 100 * relative.mean(axis=(1, 2)),
+            "mae": abs(error).mean(axis=(1, 2), where=known),
+            "mse": square.mean(axis=(1, 2), where=known),
+            "rmse": np.sqrt(square.mean(axis=(1, 2), where=known)),
+            "smape": 100 * relative.mean(axis=(1, 2), where=known),
         }
         counts = np.ones(x.shape, dtype=bool) if scored is None else scored
         total, number = _sums(error, scale, counts)
-        parts = windows(t, transient_end)
+        parts = windows(t, transient_end, start)
         for name, part in parts.items():
             scores[_score_name(name)] = window_nrmse(total, number, part)
         by_sample = np.sqrt(total / np.maximum(number, 1))
-        scores["settling"] = _settling(t, by_sample)
+        scores["settling"] = _settling(t, by_sample, t[0] if start is None else start)
         scores["peak"] = by_sample.max(axis=1)
         for other in alternatives:
             total = np.minimum(total, _sums(xhat - other, scale, counts)[0])
@@ -288,8 +295,8 @@ def _score_name(window: str) -> str:
     return "nrmse" if window == "whole" else f"nrmse_{window}"
 
 
-def _settling(t: np.ndarray, by_sample: np.ndarray) -> np.ndarray:
+def _settling(t: np.ndarray, by_sample: np.ndarray, start: float) -> np.ndarray:
     above = ~(by_sample <= SETTLED)
     last = len(t) - 1 - np.argmax(above[:, ::-1], axis=1)
-    after = np.append(t, np.inf)[last + 1] - t[0]
+    after = np.append(t, np.inf)[last + 1] - start
     return np.where(above.any(axis=1), after, 0.0)

@@ -13,9 +13,10 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from pinnobs_gym.envs.figures import state_figure
-from pinnobs_gym.envs.game import Game, GameName
+from pinnobs_gym.envs.game import AnyGame, Game, GameName
 from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates
 from pinnobs_gym.scoring.cramer_rao import Reference, reference
+from pinnobs_gym.scoring.known_states import counted, score_known
 from pinnobs_gym.scoring.metrics import Scores, score
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
@@ -34,19 +35,23 @@ _PREPARED: WeakValueDictionary[int, BaseEstimator] = WeakValueDictionary()
 class Played:
     """A batch of episodes with an estimator's results."""
 
-    game: Game
+    game: AnyGame
     seeds: tuple[int, ...]
-    """Seeds of the episodes."""
+    """Seeds of the episodes; of a log, the number of its episode."""
     record: Record
     """The record given to the estimator."""
     truth: np.ndarray
-    """True states at the record's samples, shape (batch, num_samples, nx), in state units."""
+    """True states at the record's samples, shape (batch, num_samples, nx), in state units; NaN
+    where the reference of a log has none."""
     estimates: Estimates
     """x̂(k|k) at the same samples."""
     us_per_step: float
     """CPU microseconds per step and episode, without what an online estimator prepares once."""
     drawn: bool = True
     """Whether the initial states are those drawn by the game."""
+    transient: float | None = None
+    """End of the transient window of a log, in s from its first sample; None for a game that is
+    simulated, whose setup says it."""
 
     @property
     def system(self) -> System:
@@ -62,9 +67,9 @@ class Played:
 
     @cached_property
     def reference(self) -> Reference | None:
-        """The Cramér-Rao reference of the episodes; None where it does not apply, or where the
-        initial states or the game's settings are changed."""
-        if not self.drawn or self.game.changes:
+        """The Cramér-Rao reference of the episodes; None where it does not apply, as to logs, or
+        where the initial states or the game's settings are changed."""
+        if not isinstance(self.game, Game) or not self.drawn or self.game.changes:
             return None
         key = (type(self.system), self.game.name, self.seeds)
         if key not in _REFERENCES:
@@ -83,8 +88,17 @@ class Played:
     @cached_property
     def scores_alone(self) -> Scores:
         """The scores without the reference, which takes longer."""
-        end = self.game.source.setup.transient_end
-        return score(self.system, self.record, self.truth, self.estimates, end)
+        parts = self.system, self.record, self.truth, self.estimates
+        if self.transient is not None:
+            return score_known(*parts, self.transient)
+        return score(*parts, self.game.source.setup.transient_end)
+
+    @cached_property
+    def scored(self) -> np.ndarray:
+        """Which errors are scored, bool (batch, num_samples, nx)."""
+        if self.transient is not None:
+            return counted(self.system, self.truth, self.record.prior.mean)
+        return np.asarray(self.system.observable(self.truth))
 
     def figure(self, title: str, row: int = 0) -> Figure:
         """Return a figure of one of the episodes, with a panel per state."""
@@ -115,18 +129,29 @@ def play(
     episodes = game.episodes(seeds, x0)
     record = source.record(episodes)
     truth = np.ascontiguousarray(episodes.x[: record.num_samples].swapaxes(0, 1))
+    estimates, cost = timed(estimator, record)
+    return Played(game, tuple(seeds), record, truth, estimates, cost, drawn=x0 is None)
+
+
+def timed(estimator: BaseEstimator, record: Record) -> tuple[Estimates, float]:
+    """Return the estimates for a record, and their cost in CPU microseconds per step and episode,
+    without what an online estimator prepares once.
+
+    Raises:
+        ValueError: if the estimates do not have shape (batch, num_samples, nx).
+    """
     _prepare(estimator, record)
     start = time.process_time()
     estimates = estimator.run(record)
     cost = (time.process_time() - start) / (record.num_samples * record.batch) * 1e6
     xhat = np.asarray(estimates.xhat, dtype=float)
-    if xhat.shape != truth.shape:
+    expected = (record.batch, record.num_samples, estimator.system.nx)
+    if xhat.shape != expected:
         raise ValueError(
             f"{type(estimator).__name__} returned estimates of shape {xhat.shape}; expected "
-            f"{truth.shape}"
+            f"{expected}"
         )
-    estimates = replace(estimates, xhat=xhat)
-    return Played(game, tuple(seeds), record, truth, estimates, cost, drawn=x0 is None)
+    return replace(estimates, xhat=xhat), cost
 
 
 def _prepare(estimator: BaseEstimator, record: Record) -> None:

@@ -17,6 +17,7 @@ from uuid import uuid4
 import numpy as np
 
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.envs.game import GivenModel
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.simulation.code_hash import Unreadable, code_hash, content, digest
@@ -29,16 +30,23 @@ _GAME = (
     "pinnobs_gym.scoring.cramer_rao",
 )
 """The modules that make and score episodes, with what they import."""
+_LOGS = ("pinnobs_gym.scoring.known_states", "pinnobs_gym.scoring.log_playing")
+"""Those that score logs. How a log is read does not count: the numbers of episodes tell what was
+read."""
 
 
-def game_hash(source: EpisodeSource) -> str:
+def game_hash(source: GivenModel) -> str:
     """Return the hash of a game: the code of its system, of the simulation and of the scores, its
     setup and the system's parameters. Scores with another hash are not comparable.
+
+    That of logs depends on the noise and the prior that estimators are told, and not on the logs,
+    which are its episodes.
 
     A game whose code cannot be read has another hash each time.
     """
     try:
-        code = code_hash(type(source.system), *_GAME)
+        own = _GAME if isinstance(source, EpisodeSource) else _LOGS
+        code = code_hash(type(source.system), *own)
         return digest([code, content(source.system), content(source.setup)])
     except Unreadable:
         return unique()

@@ -21,9 +21,13 @@ Row: TypeAlias = dict[str, Any]
 """One scored episode (``kind`` is ``score``). Its keys:
 
 - ``schema``: version of this format.
-- ``env_id``, ``setup``, ``condition``, ``episode``: the episode; ``seed:12`` is that of seed 12.
+- ``env_id``, ``setup``, ``condition``, ``episode``: the episode; ``seed:12`` is that of seed 12. A
+  sensor log with reference states has the setup ``log``, and as seed a hash of its samples and its
+  reference (`pinnobs_gym.scoring.log_game.episode_number`).
+- ``log``, ``reference``: of a sensor log, the names of its files; absent otherwise.
 - ``game_hash``: hash of the code and settings that make and score the episode.
-- ``ranked``: whether the system is ranked under this condition; ``nx``: number of states.
+- ``ranked``: whether the system is ranked under this condition; ``nx``: number of states; of a
+  log, of those that are scored.
 - ``free_over_known``, ``nominal_over_free``: how what the condition changes without estimators
   being told enlarges steady errors (`pinnobs_gym.scoring.identifiability.Identifiability`); absent
   where there is nothing of this kind.
@@ -92,6 +96,8 @@ FLOOR_WHOLE = "floor, whole"
 """Track of the floor of errors that is smoothed, for offline estimators."""
 SUBMITTED = "submitted"
 """What ``knows`` of submitted estimates begins with."""
+LOG_FILES = ("log", "reference")
+"""The fields that rows of logs have in addition."""
 NAMES = ("env_id", "setup", "condition", "estimator", "track")
 """The fields that are names."""
 NEEDED = {
@@ -276,6 +282,9 @@ def _check(row: Row, constants: bool) -> None:
     if kind == "score":
         if "us_per_step" not in row and SUBMITTED not in row["knows"]:
             raise ValueError("a row without us_per_step")
+        for name in LOG_FILES:
+            if name in row and not is_name(row[name]):
+                raise ValueError(f"{name}={shown(row[name])}; expected {NAME_EXPECTED}")
         _check_training(row["training"])
         _restore(row)
 

@@ -17,11 +17,11 @@ from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.scoring.present import Present, present_in
-from pinnobs_gym.scoring.row_format import KEY, OPTIONAL, SCHEMA, Row, checked
+from pinnobs_gym.scoring.row_format import KEY, LOG_FILES, OPTIONAL, SCHEMA, Row, checked
 
 TOLERANCE = 1e-6
 """Largest relative difference between numbers of the same episode from different machines."""
-_ASIDE = ("us_per_step", "batch", "versions", "date")
+_ASIDE = ("us_per_step", "batch", "versions", "date", *LOG_FILES)
 """The fields in which two rows of an episode may differ."""
 _ESTIMATES = frozenset((*SCORES, *OPTIONAL_SCORES, "state_rmse"))
 """The fields with numbers that depend on the estimates."""

@@ -19,16 +19,18 @@ SQUARED = ("nrmse_transient", "nrmse_steady_modulo")
 
 
 def log_episodes(log: Log, rows: list[Row], played: Played | None) -> None:
-    """Log the scores of each episode against its seed, and a figure of the first episode that was
-    run."""
+    """Log the scores of each episode against its seed, or of each sensor log against its number
+    from 0, and a figure of the first episode that was run."""
+    steps = {row["episode"]: i if "log" in row else seed_of(row) for i, row in enumerate(rows)}
     for row in rows:
         for name in LOGGED:
             if np.isfinite(row[name]):
-                log.scalar(f"episode/{name}", row[name], seed_of(row))
-    first = rows[0]
+                log.scalar(f"episode/{name}", row[name], steps[row["episode"]])
     if played is not None and log.active:
-        title = f"{first['env_id']}, {first['condition']}: {first['estimator']}"
-        log.figure("states", played.figure(title), played.seeds[0])
+        (drawn,) = (row for row in rows if seed_of(row) == played.seeds[0])
+        what = drawn.get("log", drawn["condition"])
+        title = f"{drawn['env_id']}, {what}: {drawn['estimator']}"
+        log.figure("states", played.figure(title), steps[drawn["episode"]])
 
 
 def log_summary(log: Log, rows: list[Row]) -> None:

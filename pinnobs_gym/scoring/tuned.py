@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING
 from typing import Any
 
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import AnyGame
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.provenance import canonical
@@ -24,7 +24,7 @@ SUFFIX = f", {TUNED}"
 """What follows the name of such an estimator in rows."""
 
 
-def tuned_settings(cls: type[BaseEstimator], game: Game) -> dict[str, Any] | None:
+def tuned_settings(cls: type[BaseEstimator], game: AnyGame) -> dict[str, Any] | None:
     """Return the settings of an estimator that are stored with the system of a game for its setup.
     None if there are none, or all are the defaults of the class.
 
@@ -38,7 +38,7 @@ def tuned_settings(cls: type[BaseEstimator], game: Game) -> dict[str, Any] | Non
     return None
 
 
-def entries_of(game: Game) -> tuple[TunedEntry, ...]:
+def entries_of(game: AnyGame) -> tuple[TunedEntry, ...]:
     """Return all that is stored with the system of a game, for any setup; nothing with a system
     that is not defined in a file.
 
@@ -52,7 +52,7 @@ def entries_of(game: Game) -> tuple[TunedEntry, ...]:
     return read(path)
 
 
-def required_settings(cls: type[BaseEstimator], game: Game) -> dict[str, Any]:
+def required_settings(cls: type[BaseEstimator], game: AnyGame) -> dict[str, Any]:
     """Return the `tuned_settings` of an estimator in a game.
 
     Raises:
@@ -77,7 +77,7 @@ def required_settings(cls: type[BaseEstimator], game: Game) -> dict[str, Any]:
     return found
 
 
-def is_tuned(cls: type[BaseEstimator], options: Mapping[str, Any], game: Game) -> bool:
+def is_tuned(cls: type[BaseEstimator], options: Mapping[str, Any], game: AnyGame) -> bool:
     """Return whether an estimator has the settings stored with the system of a game, and no others
     that are not the defaults of its class.
 

@@ -81,4 +81,5 @@ def _record(trainer: Trainer[Any, Any]) -> Mapping[str, np.ndarray]:
         return {}
     record = trainer.record
     prior = {"xhat0": record.prior.mean, "P0": record.prior.cov}
-    return {"t": record.t, "y": record.y, "u": record.u, **prior}
+    arrays = {"t": record.t, "y": record.y, "u": record.u, **prior}
+    return arrays if record.noise_std is None else {**arrays, "noise_std": record.noise_std}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from numbers import Integral
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 from pinnobs_gym.estimation.hints import as_tuple, check_settings, field_hints, fits
 
@@ -49,6 +49,18 @@ class TrainingConfig:
     def records(self) -> int:
         """Number of recorded episodes to train on; 0 if the trainer plays episodes itself."""
         return 1
+
+    def for_records(self, number: int) -> Self:
+        """Return the settings for a number of records, such as those of sensor logs.
+
+        Raises:
+            ValueError: in one line, if the trainer learns from another number.
+        """
+        if number != self.records:
+            raise ValueError(
+                f"{number} logs are given; expected {self.records}, which this trainer learns from"
+            )
+        return self
 
     def __post_init__(self) -> None:
         self.check_shared()

@@ -70,6 +70,9 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
     takes: ClassVar[frozenset[str]] = EVERYTHING
     """What a plant may have, as `BaseEstimator.takes` of the estimators that need the trainer. A
     plant with anything else is refused before the training."""
+    simulates: ClassVar[bool] = False
+    """Whether the trainer learns from episodes that it simulates with the model; others learn from
+    the outputs of their record, which may be those of sensor logs."""
     paced_by_budget: ClassVar[bool] = False
     """Whether `finished` takes the budget into account, because the schedule depends on it."""
 

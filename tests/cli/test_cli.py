@@ -115,7 +115,7 @@ def test_estimate_with_process_noise(folder, level):
         (["evaluate", "--system", "Academic", "--condition", "x"], "unknown condition 'x'; known"),
         (["evaluate", "--system", "Academic", "--setup", "x"], "unknown setup 'x' of Academic"),
         (["evaluate", "--system", "Academic", "--set", "x=1"], "setting 'x=1'; expected name=val"),
-        (["evaluate", "--system", "Academic", "--checkpoint", "x"], "is not one that is trained"),
+        (["evaluate", "--system", "Academic", "--trained", "x"], "is not one that is trained"),
         (["evaluate", "--system", "Academic", "--out", "file/x"], "cannot write"),
         (["systems", "Duffing"], "unknown system 'Duffing'"),
         (["train"], "name a trainer first: pinnobs train kkl_autoencoder | kkl_pinn | "),
@@ -347,7 +347,7 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     assert trained.read_bytes() == before
     assert run("train", "pinn_obs", *where, *small[:4], "--iterations", "30", "--resume") == 0
     assert "after 30 iterations" in capsys.readouterr().out
-    scored = ["evaluate", "--estimator", "pinn_obs_replay", "--checkpoint", trained]
+    scored = ["evaluate", "--estimator", "pinn_obs_replay", "--trained", trained]
     assert run(*scored, "--system", "ReverseDuffing", "--episodes", "2") == 0
     capsys.readouterr()
     assert run(*scored, "--system", "Academic", "--episodes", "2") == 2
@@ -365,7 +365,7 @@ def test_a_gain_is_trained_on_several_episodes_and_told_the_noise(folder, capsys
     assert run("train", "pinn_gain", *where, *small) == 0
     assert "pinn_gain on own record" in capsys.readouterr().out
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
-    scored = ["evaluate", "--estimator", "pinn_gain", "--checkpoint", trained, "--out", "ev"]
+    scored = ["evaluate", "--estimator", "pinn_gain", "--trained", trained, "--out", "ev"]
     for condition in ("nominal", "noise5"):
         more = ["--system", "Academic", "--episodes", "2", "--condition", condition]
         assert run(*scored, *more) == 0

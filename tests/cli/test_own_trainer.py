@@ -138,7 +138,7 @@ def test_train_scores_the_estimator_that_stands_beside_the_trainer(module, capsy
     assert any(name.endswith("-two_gains-episode1000000-seed0-two_gains.png") for name in files)
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
     scored = ("evaluate", "--estimator", f"{module}:TwoGains", *ON, "--episodes", 2)
-    assert run(*scored, "--checkpoint", trained, "--out", "ev") == 0
+    assert run(*scored, "--trained", trained, "--out", "ev") == 0
     (first, _) = rows.load(Path("ev/rows.jsonl")).rows
     assert first["training"]["trainer"] == "two_gains"
 

@@ -148,7 +148,10 @@ def test_tensorboard_has_scalars_a_figure_and_hparams(tmp_path):
             {"estimator": "open_loop", "options": {"noise_std": 0.1}},
             "^setting 'noise_std'; expected no settings$",
         ),
-        ({"estimator": EKF(Academic())}, "model is Academic .*; the env plays ReverseDuffing"),
+        (
+            {"estimator": EKF(Academic())},
+            "model is Academic .*; that of the game is ReverseDuffing",
+        ),
         ({"estimator": "pinn_obs_replay"}, "has to be trained first: pinnobs train pinn_obs"),
     ],
 )

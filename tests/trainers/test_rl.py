@@ -203,7 +203,7 @@ def test_through_the_command(tmp_path: Path, capsys: Any) -> None:
     assert cli(["train", "rl", *common, *steps]) == 0
     path = next(p for p in tmp_path.glob("*.pt") if "checkpoint" not in p.name)
     assert "sb3 on own record" in capsys.readouterr().out
-    chosen = ["--estimator", "sb3", "--checkpoint", str(path), "--episodes", "2"]
+    chosen = ["--estimator", "sb3", "--trained", str(path), "--episodes", "2"]
     assert cli(["evaluate", *common, *chosen]) == 0
     assert "true states in training" in capsys.readouterr().out
 

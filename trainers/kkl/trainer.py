@@ -52,6 +52,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
     """
 
     takes = KKL.takes
+    simulates = True
     paced_by_budget = True
     labelled: ClassVar[bool] = True
     """Whether T* is fitted to simulated z, and not to T's own."""

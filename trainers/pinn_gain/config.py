@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pinnobs_gym.estimation.learned.gain_network import Variant
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
@@ -43,6 +43,16 @@ class PinnGainConfig(TrainingConfig):
     @property
     def records(self) -> int:
         return self.episodes
+
+    def for_records(self, number: int) -> PinnGainConfig:
+        """Return the settings for a number of records. Those held out are as many as set or, if
+        that is more than half of them, a quarter."""
+        if number < 2:
+            raise ValueError(
+                f"{number} log is given; pinn_gain learns from at least 2, one of them held out"
+            )
+        held_out = self.held_out if 2 * self.held_out <= number else max(1, number // 4)
+        return replace(self, episodes=number, held_out=held_out)
 
     def __post_init__(self) -> None:
         self.check_shared()

@@ -47,6 +47,7 @@ class RLTrainer(Trainer[RLConfig, TrainedAgent]):
 
     name = "rl"
     takes = Sb3.takes
+    simulates = True
     presets = PRESETS
 
     def start(self) -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from pinnobs_gym.cli.console import console
-from pinnobs_gym.cli.options import parse, settings_of
+from pinnobs_gym.cli.options import LOG_OPTIONS, check_apart, parse, settings_of
+from pinnobs_gym.cli.own_model import own_model
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.cli.video import check_video, write_video
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import AnyGame, Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
@@ -19,23 +21,30 @@ from pinnobs_gym.leaderboard.against import opponents
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
 from pinnobs_gym.leaderboard.published.trained import load_published
 from pinnobs_gym.scoring.evaluation import (
+    Evaluated,
     Results,
     make_estimator,
     run_episodes,
     seeds_of,
 )
-from pinnobs_gym.training.by_name import load
+from pinnobs_gym.scoring.log_evaluation import run_logs
+from pinnobs_gym.scoring.log_game import LogGame
+from pinnobs_gym.training.by_name import check_times, load
+
+_SIMULATED = ("--setup", "--condition", "--episodes", "--seed", "--video", "--tuned")
+"""Options of simulated episodes."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score one estimator on one system, episode by episode."""
+    """Score one estimator on one system, episode by episode: on simulated episodes, or on sensor
+    logs of which reference states are known."""
 
     system: str
     """Name or module:Class of the system."""
     estimator: str = "ekf"
     """Name or module:Class of the estimator."""
-    checkpoint: Path | None = None
+    trained: Path | None = None
     """Trained estimator to load; published stands for the one that ships with the package."""
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as assumed_noise=0.1."""
@@ -49,6 +58,25 @@ class Evaluate:
     """Number of episodes; of a single one TensorBoard has no picture."""
     seed: int = 0
     """Seed of the first episode."""
+    log: tuple[Path, ...] = ()
+    """Sensor logs to score in place of simulated episodes: CSV files as for pinnobs estimate, each
+    with its reference."""
+    reference: tuple[Path, ...] = ()
+    """Reference states of each log, in the same order: CSV files with columns t and some of the
+    states by name. Their times need not be those of the log, and empty cells do not count."""
+    columns: tuple[str, ...] = ()
+    """Columns of the logs under other names or in other units, such as t=millis*1e-3."""
+    noise_std: tuple[float, ...] = ()
+    """Of logs: standard deviations of the output noise; the benchmark's if not given."""
+    process_noise: tuple[float, ...] = ()
+    """Of logs: standard deviations of the process noise after one second (of a map: after one
+    step), in state units per √s; the benchmark's if not given."""
+    also: tuple[str, ...] = ()
+    """Of logs: unknown constants as further states, as pinnobs estimate has them."""
+    xhat0: tuple[float, ...] | None = None
+    """Of logs: initial estimate; the benchmark's if not given."""
+    P0_std: tuple[float, ...] | None = None
+    """Of logs: its standard deviations; the benchmark's if not given."""
     fresh: bool = False
     """Run all episodes, also those whose scores are stored; the new scores replace them."""
     against: Path | None = None
@@ -61,11 +89,15 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate and print."""
-        game = Game.of(self.system, self.setup, self.condition)
         cls = ESTIMATORS.resolve(self.estimator)
-        if self.tuned and (self.set or self.checkpoint is not None):
-            other = "--checkpoint" if self.checkpoint is not None else "--set"
+        if self.tuned and (self.set or self.trained is not None):
+            other = "--trained" if self.trained is not None else "--set"
             raise ValueError(f"--tuned and {other}; expected one of them")
+        return self._run_logs(cls) if self.log else self._run_episodes(cls)
+
+    def _run_episodes(self, cls: type[BaseEstimator]) -> int:
+        """Evaluate on simulated episodes."""
+        game = Game.of(self.system, self.setup, self.condition)
         options = settings_of(cls, self.set)
         if self.video is not None:
             check_video(self.video)
@@ -74,27 +106,58 @@ class Evaluate:
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
-        others = None
-        if self.against is not None:
-            others = opponents(self.against, game, seeds_of(self.seed, episodes))
-        shipped = published_floors([game.name])  # reject what is damaged before anything is run
-        check_writable(self.out)
         seeds = seeds_of(self.seed, episodes)
-        results = Results(rows_file(self.out), fresh=self.fresh)
-        score = partial(run_episodes, game, estimator, seeds, results)
-        report(game, with_progress(episodes, score), self.out, self.episodes > 1, others, shipped)
+        score = partial(run_episodes, game, estimator, seeds)
+        self._report(game, seeds, score, self.episodes > 1)
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)
             console.print(f"video: {self.video}", soft_wrap=True)
         return 0
 
-    def _trained(self, cls: type[BaseEstimator], game: Game) -> BaseEstimator | None:
+    def _run_logs(self, cls: type[BaseEstimator]) -> int:
+        """Evaluate on sensor logs."""
+        if self.against == PUBLISHED:
+            raise ValueError(
+                "--against published and --log; expected a rows file with scores of the same logs"
+            )
+        system, setup = own_model(
+            self.system,
+            noise_std=self.noise_std,
+            process_noise=self.process_noise,
+            xhat0=self.xhat0,
+            P0_std=self.P0_std,
+            also=self.also,
+        )
+        game = LogGame.of(system, setup, self.log, self.reference, self.columns)
+        for note in game.notes:
+            console.print(note, soft_wrap=True, highlight=False)
+        trained = self._trained(cls, game)
+        if trained is not None:
+            for each in game.logs.values():
+                check_times(trained, each.log.record, f"log {each.log.path}: {self.trained}")
+        estimator = make_estimator(trained or cls, game, settings_of(cls, self.set))
+        score = partial(run_logs, game, estimator)
+        self._report(game, tuple(game.logs), score, picture=True)
+        return 0
+
+    def _report(
+        self, game: AnyGame, seeds: Sequence[int], score: Callable[..., Evaluated], picture: bool
+    ) -> None:
+        """Run and report what ``score`` scores, which is given the stored rows and the progress."""
+        others = None if self.against is None else opponents(self.against, game, seeds)
+        shipped = published_floors([game.name])  # reject what is damaged before anything is run
+        check_writable(self.out)
+        run: Any = partial(score, Results(rows_file(self.out), fresh=self.fresh))
+        report(game, with_progress(len(seeds), run), self.out, picture, others, shipped)
+
+    def _trained(self, cls: type[BaseEstimator], game: AnyGame) -> BaseEstimator | None:
         """Return the trained estimator to score, None if it needs none."""
-        if self.checkpoint == PUBLISHED:
+        if self.trained == PUBLISHED:
             return load_published(self.estimator, game)
-        return None if self.checkpoint is None else load(cls, self.checkpoint, game)
+        return None if self.trained is None else load(cls, self.trained, game)
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command and return its exit status."""
+    check_apart(arguments, _SIMULATED, ("--reference", *LOG_OPTIONS))
     return parse(Evaluate, "evaluate", arguments).run()

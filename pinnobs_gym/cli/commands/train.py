@@ -10,26 +10,33 @@ from typing import Any, Generic, TypeVar
 import tyro
 
 from pinnobs_gym.cli.console import console
-from pinnobs_gym.cli.options import by_option, parse
+from pinnobs_gym.cli.options import LOG_OPTIONS, by_option, check_apart, parse
 from pinnobs_gym.cli.output import write_figure
+from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.training_task import Task, on_episodes, on_logs
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.files import check_writable, file_name
+from pinnobs_gym.files import check_writable
+from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.registry import TRAINERS, trainer_name
 from pinnobs_gym.scoring import acceptance
 from pinnobs_gym.scoring.playing import Played, play
-from pinnobs_gym.training.by_name import load, trainer_of
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.training.by_name import load
 from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import train
-from pinnobs_gym.training.trainer import Trainer, first_episode
+from pinnobs_gym.training.trainer import Trainer
 
 ConfigType = TypeVar("ConfigType")
+_SIMULATED = ("--setup", "--condition", "--episode", "--episodes")
+"""Options of simulated episodes."""
 
 
 @dataclass(frozen=True)
 class Train(Generic[ConfigType]):
-    """Train an estimator on episodes of a system; the trainer's settings determine how many."""
+    """Train an estimator on episodes of a system; the trainer's settings determine how many. Or,
+    with --log, on sensor logs."""
 
     system: str
     """Name or module:Class of the system."""
@@ -44,6 +51,22 @@ class Train(Generic[ConfigType]):
     episode: int | None = None
     """Seed of the training episode, or of the first of several; by default those of each training
     seed are its own."""
+    log: tuple[Path, ...] = ()
+    """Sensor logs to learn from in place of simulated episodes: CSV files as for pinnobs estimate,
+    several of them with the same sample times. For trainers that learn from outputs alone."""
+    columns: tuple[str, ...] = ()
+    """Columns of the logs under other names or in other units, such as t=millis*1e-3."""
+    noise_std: tuple[float, ...] = ()
+    """Of logs: standard deviations of the output noise; the benchmark's if not given."""
+    process_noise: tuple[float, ...] = ()
+    """Of logs: standard deviations of the process noise after one second (of a map: after one
+    step), in state units per √s; the benchmark's if not given."""
+    also: tuple[str, ...] = ()
+    """Of logs: unknown constants as further states, as pinnobs estimate has them."""
+    xhat0: tuple[float, ...] | None = None
+    """Of logs: initial estimate; the benchmark's if not given."""
+    P0_std: tuple[float, ...] | None = None
+    """Of logs: its standard deviations; the benchmark's if not given."""
     out: Path = Path("runs/train")
     """Folder of checkpoints, trained files, figures and TensorBoard log."""
     resume: bool = False
@@ -56,46 +79,60 @@ def run(arguments: Sequence[str]) -> int:
         raise ValueError(f"name a trainer first: pinnobs train {' | '.join(TRAINERS.sources)}")
     spec = arguments[0]
     cls = TRAINERS.resolve(spec)
+    check_apart(arguments[1:], _SIMULATED, LOG_OPTIONS)
     chosen = _chosen_training(cls, spec, arguments[1:])
     estimators = _estimators_of(cls)
     check_writable(chosen.out)
-    game = Game.of(chosen.system, chosen.setup, chosen.condition)
-    title = game.name.file_stem
-    seed = chosen.config.seed
-    episode = first_episode(seed) if chosen.episode is None else chosen.episode
-    stem = chosen.out / f"{title}-{file_name(cls.name)}-episode{episode}-seed{seed}"
-    checkpoint = stem.with_name(stem.name + ".checkpoint.pt")
-    path = stem.with_name(stem.name + ".pt")
+    task = _task(cls, chosen)
+    path, checkpoint = task.file(".pt"), task.file(".checkpoint.pt")
     for earlier in (checkpoint, path):
         if earlier.exists() and not chosen.resume:
             raise ValueError(
                 f"{earlier} already exists; --resume continues it, --out names another folder"
             )
-    trainer = trainer_of(cls, chosen.config, game, episode)
-    with Log(chosen.out / "tensorboard" / stem.name) as log:
+    trainer = task.make()
+    with Log(chosen.out / "tensorboard" / task.stem.name) as log:
         result = train(trainer, log=log, checkpoint=checkpoint, resume=chosen.resume, progress=True)
     result.save(path)
-    pictures = trainer.figures(result)
-    for kind, figure in pictures.items():
-        write_figure(stem.with_name(f"{stem.name}-{kind}.png"), figure)
+    pictures = {task.file(f"-{kind}.png"): each for kind, each in trainer.figures(result).items()}
+    for picture, figure in pictures.items():
+        write_figure(picture, figure)
     by = {"budget": ", all of its budget", "interrupted": "; stopped by Ctrl-C"}
     console.print(
         f"loss {result.loss:.3g} after {result.iterations} iterations, {result.seconds:.1f} CPU s"
         + by.get(result.ending, "")
     )
-    for kind in pictures:
-        console.print(f"picture: {stem.with_name(f'{stem.name}-{kind}.png')}", soft_wrap=True)
-    for label, kind_of in estimators.items():
-        estimator = load(kind_of, path, game)
-        own = _report_training(label, estimator, game, episode, result.loss)
-        picture = stem.with_name(f"{stem.name}-{label}.png")
-        write_figure(picture, own.figure(f"{label}: {title}"))
+    for picture in pictures:
         console.print(f"picture: {picture}", soft_wrap=True)
+    if task.game is not None:
+        for label, kind in estimators.items():
+            picture = task.file(f"-{label}.png")
+            _replay(label, kind, path, task.game, task.episode, result.loss, picture)
     console.print(f"trained file: {path}", soft_wrap=True)
     if checkpoint.exists():
         console.print(f"checkpoint: {checkpoint} (--resume continues it)", soft_wrap=True)
     console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
     return 0
+
+
+def _task(cls: type[Trainer[Any, Any]], chosen: Train[Any]) -> Task:
+    """Return what is learned from."""
+    if not chosen.log:
+        game = Game.of(chosen.system, chosen.setup, chosen.condition)
+        return on_episodes(cls, chosen.config, game, chosen.episode, chosen.out)
+    system, setup = own_model(
+        chosen.system,
+        noise_std=chosen.noise_std,
+        process_noise=chosen.process_noise,
+        xhat0=chosen.xhat0,
+        P0_std=chosen.P0_std,
+        also=chosen.also,
+    )
+    prior = Prior.of(system, setup, 1)
+    logs = [read_log(path, system, prior, chosen.columns) for path in chosen.log]
+    for note in (note for log in logs for note in log.notes):
+        console.print(note, soft_wrap=True, highlight=False)
+    return on_logs(cls, chosen.config, setup, logs, chosen.out)
 
 
 def _estimators_of(trainer: type[Trainer[Any, Any]]) -> dict[str, type[BaseEstimator]]:
@@ -120,6 +157,22 @@ def _chosen_training(
         config=(tyro.conf.OmitArgPrefixes,),
         description=f"{Train.__doc__} Presets: {', '.join(cls.presets)}.",
     )
+
+
+def _replay(
+    label: str,
+    kind: type[BaseEstimator],
+    path: Path,
+    game: Game,
+    episode: int,
+    loss: float,
+    picture: Path,
+) -> None:
+    """Print the scores of a trained estimator's replays, and draw that of its own record."""
+    estimator = load(kind, path, game)
+    own = _report_training(label, estimator, game, episode, loss)
+    write_figure(picture, own.figure(f"{label}: {game.name.file_stem}"))
+    console.print(f"picture: {picture}", soft_wrap=True)
 
 
 def _report_training(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.game import AnyGame, Game
 from pinnobs_gym.estimation.estimator import BaseEstimator, labelled
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.published.manifest import Manifest, PublishedTraining
@@ -103,7 +103,7 @@ def load(name: str, system: str | type[System], setup: str = "benchmark") -> Bas
     return load_published(name, game)
 
 
-def load_published(name: str, game: Game) -> BaseEstimator:
+def load_published(name: str, game: AnyGame) -> BaseEstimator:
     """Return a published trained estimator for a game; see `load`."""
     cls = ESTIMATORS.resolve(name.partition(" (")[0])
     if cls.needs_training is None:

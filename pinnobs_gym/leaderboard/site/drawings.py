@@ -110,7 +110,8 @@ def _game(styled: Styled, game: GameResults) -> Charts:
         tables |= {"truth": game.states.truth, "estimates": game.states.estimates}
         for i, name in enumerate(game.states.names):
             measured, limits = f"y{i}" in game.states.truth, game.states.limits[i]
-            spec = over_time.state(styled, i, name, end, limits, measured)
+            shown = limits, measured, game.states.in_part
+            spec = over_time.state(styled, i, name, end, *shown)
             specs[f"state{game.number}-{i}"] = spec
     return _charts(f"game{game.number}", specs, tables)
 

@@ -19,7 +19,7 @@ from pinnobs_gym.leaderboard.site.over_samples import States, errors, reference,
 from pinnobs_gym.leaderboard.standings_table import Table
 from pinnobs_gym.scoring import curves
 from pinnobs_gym.scoring.curves import Curves
-from pinnobs_gym.scoring.rows import seed_of
+from pinnobs_gym.scoring.rows import Row, seed_of
 
 Players = Mapping[str, Sequence[ScoredRun]]
 """Runs of one game by the contender's name."""
@@ -115,8 +115,13 @@ def _results(
         over_floor=over_floor({e.name: e.standing for e in table.entries if e.name in players}),
         floor_errors=errors(_curves(game, floors, folders)),
         floor_settling=settling(floor_rows, until=max(settled["t"])),
-        states=states(own),
+        states=states(own, _logs(rows.values())),
     )
+
+
+def _logs(rows: Iterable[Iterable[Row]]) -> dict[int, str]:
+    """Return the names of the logs among the episodes of some rows, by their seeds."""
+    return {seed_of(row): row["log"] for own in rows for row in own if "log" in row}
 
 
 def _transient_end(game: GameName) -> float:

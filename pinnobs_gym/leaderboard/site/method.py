@@ -13,6 +13,7 @@ from pinnobs_gym.leaderboard.contenders import Contender, contenders
 from pinnobs_gym.leaderboard.floor import contending
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.standings import training_of
+from pinnobs_gym.scoring.row_format import LOG_FILES
 from pinnobs_gym.scoring.rows import Row, Stored, game_of, seed_of
 
 
@@ -126,8 +127,11 @@ def commands(runs: Iterable[ScoredRun]) -> list[str]:
     one per set of other conditions for the systems played under it. They may produce more rows,
     since every named estimator plays every named system. Estimators play by their own recipe; any
     other, which their names in rows say in brackets, needs a suite of one's own. Submitted
-    estimates are left out: no estimator here makes them."""
+    estimates are left out: no estimator here makes them. Of sensor logs there is a line for each
+    estimator, without what it was told of noise and prior."""
     runs = [run for run in runs if not run.submitted]
+    of_logs = [run for run in runs if "log" in run.rows[0]]
+    runs = [run for run in runs if "log" not in run.rows[0]]
     usual: dict[str, list[ScoredRun]] = {}
     others: dict[tuple[str, str], list[ScoredRun]] = {}
     for run in runs:
@@ -140,7 +144,17 @@ def commands(runs: Iterable[ScoredRun]) -> list[str]:
         played = {run.game.condition for run in some}
         alike.setdefault((setup, *sorted(played)), []).extend(some)
     lines = [_command(some) for some in usual.values()]
+    lines += map(_command_of_logs, of_logs)
     return lines + [_command(some, conditions) for (_, *conditions), some in alike.items()]
+
+
+def _command_of_logs(run: ScoredRun) -> str:
+    """Return the command line that scores an estimator on sensor logs."""
+    words = ["pinnobs evaluate --system", run.game.system.rpartition("-v")[0]]
+    for option in LOG_FILES:
+        files = dict.fromkeys((row["episode"], row[option]) for row in run.rows)
+        words += [f"--{option}", *(shlex.quote(name) for _, name in files)]
+    return " ".join([*words, "--estimator", shlex.quote(run.estimator.partition(" (")[0])])
 
 
 def _command(runs: Sequence[ScoredRun], conditions: Sequence[str] = ()) -> str:

@@ -20,7 +20,10 @@ POINTS = 120
 class States:
     """One episode with the estimators' results."""
 
-    seed: int
+    called: str
+    """Which episode it is, such as ``seed 3`` or ``log drive.csv``."""
+    in_part: bool
+    """Whether true states are known in part, such as the reference states of a log."""
     names: tuple[str, ...]
     """Names of the states, with units."""
     limits: tuple[tuple[float, float], ...]
@@ -71,9 +74,14 @@ def reference(found: Iterable[Curves], after: float) -> Columns:
     return {"t": numbers(t[k][some]), "median": numbers(medians(lines[:, some]))}
 
 
-def states(found: Mapping[str, Curves]) -> States | None:
+def states(found: Mapping[str, Curves], logs: Mapping[int, str]) -> States | None:
     """Return the example episode that most estimators share, of the lowest seed in a tie; None
-    without curves."""
+    without curves.
+
+    Args:
+        found: each estimator's curves.
+        logs: names of the files of those episodes that are logs, by their seeds.
+    """
     seeds = [own.example.seed for own in found.values()]
     if not seeds:
         return None
@@ -81,9 +89,10 @@ def states(found: Mapping[str, Curves]) -> States | None:
     shown = {name: own for name, own in found.items() if own.example.seed == seed}
     first = next(iter(shown.values()))
     return States(
-        seed=seed,
+        called=f"log {logs[seed]}" if seed in logs else f"seed {seed}",
+        in_part=bool(np.isnan(first.example.x).any()),
         names=first.states,
-        limits=tuple(map(_limits, first.example.x.T)),
+        limits=tuple(map(_limits, first.example.x.T, first.example.xhat.T)),
         truth=_truth(first),
         estimates=_estimates(shown),
     )
@@ -93,6 +102,8 @@ def _truth(own: Curves) -> Columns:
     """Return `States.truth` of an example."""
     t, x, y = own.example.t, own.example.x, own.example.y
     breaks = [jumps(each, period) for each, period in zip(x.T, _periods(own), strict=True)]
+    if np.isnan(x).any():  # dots, which have no line to break
+        breaks = [np.empty(0, dtype=int)] * len(breaks)
     t, x = _broken(breaks, t, x)
     new = np.unique(np.concatenate(breaks)).astype(int)
     y = np.insert(y.astype(float), new, np.nan, axis=0)  # no dot is drawn twice
@@ -124,7 +135,9 @@ def _estimates(shown: Mapping[str, Curves]) -> Columns:
     for name, own in shown.items():
         example, std = own.example, own.example.std
         curves = zip(example.xhat.T, _periods(own), example.x.T, strict=True)
-        breaks = [jumps(*each) for each in curves]
+        breaks = [
+            jumps(xhat, period, None if np.isnan(x).any() else x) for xhat, period, x in curves
+        ]
         t, mean = _broken(breaks, example.t, example.xhat)
         std = np.full(example.xhat.shape, np.nan) if std is None else std
         parts = {"m": mean, "s": 2 * _broken(breaks, example.t, std)[1]}
@@ -133,8 +146,12 @@ def _estimates(shown: Mapping[str, Curves]) -> Columns:
     return table
 
 
-def _limits(x: np.ndarray) -> tuple[float, float]:
-    """Return the range of a state with a margin."""
+def _limits(x: np.ndarray, xhat: np.ndarray) -> tuple[float, float]:
+    """Return the range of a state with a margin: that of its true values and, if some are unknown,
+    of the estimates."""
+    if np.isnan(x).any():
+        seen = np.concatenate([x, xhat]).astype(float)
+        x = seen[np.isfinite(seen)] if np.isfinite(seen).any() else np.zeros(1)
     low, high = float(x.min()), float(x.max())
     margin = 0.15 * (high - low) + 1e-9 * max(abs(low), abs(high), 1.0)
     return low - margin, high + margin

@@ -100,11 +100,17 @@ def settling(styled: Styled, end: float) -> Spec:
 
 
 def state(
-    styled: Styled, index: int, title: str, end: float, limits: tuple[float, float], measured: bool
+    styled: Styled,
+    index: int,
+    title: str,
+    end: float,
+    limits: tuple[float, float],
+    measured: bool,
+    in_part: bool = False,
 ) -> Spec:
     """Chart one state of the example episode within its limits, with the selected estimator's
-    estimate. Dots are an output that directly measures the state. The page can set the end (s) of
-    the time axis."""
+    estimate. Dots are an output that directly measures the state; dark dots the true state if it is
+    known in part. The page can set the end (s) of the time axis."""
     scale = alt.Scale(domain=list(limits), nice=False, clamp=True)
     until = alt.Scale(domainMin=0, domainMax=alt.ExprRef(expr="until"), nice=False)
     x = alt.X("t:Q", scale=until, axis=alt.Axis(tickCount=6), title="t (s)")
@@ -124,9 +130,13 @@ def state(
 
     layers = [
         mine.mark_area(opacity=0.18, clip=True).encode(y=y("low"), y2="high:Q"),
-        truth.mark_line(style="truth", clip=True).encode(y=y(f"x{index}")),
         mine.mark_line(strokeDash=[5, 3], clip=True).encode(y=y(f"m{index}")),
     ]
+    if in_part:
+        known = truth.transform_filter(f"isValid(datum.x{index})")
+        layers.append(known.mark_point(style="reference_state", clip=True).encode(y=y(f"x{index}")))
+    else:
+        layers.insert(1, truth.mark_line(style="truth", clip=True).encode(y=y(f"x{index}")))
     if measured:
         layers.insert(0, truth.mark_point(style="measured", clip=True).encode(y=y(f"y{index}")))
     return finished(*layers, height=120, selected="", until=end)

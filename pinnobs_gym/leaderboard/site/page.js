@@ -42,6 +42,7 @@
         reference: { color: text, strokeWidth: 1.6, strokeDash: [1, 3], strokeCap: "round" },
         floor: { color: soft, strokeWidth: 2.6, opacity: 0.75 },
         truth: { color: text, strokeWidth: 1.6 },
+        reference_state: { color: text, filled: true, size: 9 },
         measured: { color: soft, filled: true, size: 7, opacity: 0.7 },
         level: { color: soft, strokeDash: [3, 3], strokeWidth: 1 },
         middle: { color: text, thickness: 2.5, size: 14 },

@@ -46,7 +46,7 @@ def test_lines_of_an_angle_have_a_gap_where_it_jumps():
     example = Example(0, t, x, x + np.array([0.2, 0.1]), x[:, :1], np.full(x.shape, 0.25))
     own = curves(np.ones((1, 8)), t=t)
     own = replace(own, example=example, state_period=(2 * np.pi, None))
-    found = over_samples.states({"a": own})
+    found = over_samples.states({"a": own}, {})
     assert found is not None
     # π lies between 3 and 4 s; the sample at 4 s is drawn behind a gap.
     assert found.truth["t"] == [0, 1, 2, 3, 4, 4, 5, 6, 7]
@@ -56,16 +56,16 @@ def test_lines_of_an_angle_have_a_gap_where_it_jumps():
     lines = lines_of(found.estimates, "a")
     assert [line[0] for line in lines] == found.truth["t"]
     assert [line[1:3] for line in lines if None in line] == [(None, None)]
-    plain = over_samples.states({"a": replace(own, state_period=None)})
+    plain = over_samples.states({"a": replace(own, state_period=None)}, {})
     assert plain is not None
     assert plain.truth["t"] == t.tolist()
 
 
 def test_the_example_is_of_the_episode_that_most_have():
     own = {"a": curves(np.ones((1, 3)), seed=5), "b": curves(np.ones((1, 3)))}
-    found = over_samples.states({**own, "c": curves(np.ones((1, 3)))})
+    found = over_samples.states({**own, "c": curves(np.ones((1, 3)))}, {})
     assert found is not None
-    assert found.seed == 0
+    assert found.called == "seed 0"
     assert found.truth == {
         "t": [0, 1, 2],
         "x0": [0, 1, 2],
@@ -74,4 +74,4 @@ def test_the_example_is_of_the_episode_that_most_have():
     }
     assert set(found.estimates["estimator"]) == {"b", "c"}
     assert lines_of(found.estimates, "b")[1] == (1, 2, 0.5, 0, 0.5)
-    assert over_samples.states({}) is None
+    assert over_samples.states({}, {}) is None
