@@ -29,13 +29,27 @@ struct call {
 };
 #endif
 
-/* Load a sample; innovations and rows of H of missing outputs are zero later. */
+/* A sample of W rows: its time, outputs and inputs, the covariance of the outputs' noise, and the
+   innovations with their covariances, which are found from these. */
+#define sample AT_WIDTH(sample)
+struct sample {
+    lanes t, y[NY], u[LU], R[NY * NY], e[NY], S[NY * NY];
+};
+
+/* What is known of W rows beside x and P: the number of samples in a row beyond the gate, and
+   whether x and P are NaN throughout. */
+#define memory AT_WIDTH(memory)
+struct memory {
+    int64_t beyond[W], lost[W];
+};
+
+/* Load the covariance of the noise of a sample, without the covariances of missing outputs. */
 static inline void AT_WIDTH(load_R)(const struct plan *plan, int64_t k, int64_t batch, int64_t row,
                                     int count, const lanes *restrict y, lanes *restrict R)
 {
-    const int64_t rows = plan->R_rows ? batch : 0;
-    const double *from = plan->R + k * plan->R_samples * NY * NY * (rows ? rows : 1);
-    AT_WIDTH(load)(NY * NY, from, rows, row, count, R);
+    const int64_t own = plan->R_rows ? batch : 0;
+    const double *from = plan->R + k * plan->R_samples * NY * NY * (own ? own : 1);
+    AT_WIDTH(load)(NY * NY, from, own, row, count, R);
     for (int i = 0; i < NY; i++) /* covariances with missing outputs do not count */
         for (int j = 0; j < NY; j++)
             if (i != j)
