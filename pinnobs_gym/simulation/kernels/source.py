@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 
@@ -38,10 +39,13 @@ def library_source(plant: PlantCode, template: str) -> str:
         parts += [
             f"#undef W\n#undef AT_WIDTH\n#define W {width}\n#define AT_WIDTH(name) name##_{width}",
             read("lanes.h"),
+            read("rows.h"),
             plant.lanes,
         ]
         if not alone:
-            parts += [*steps_and(plant, _SMOOTHERS.get(template, template)), read("filter_rows.c")]
+            between = read("inputs.h"), read("marks.h")
+            parts += filter_parts(plant, _SMOOTHERS.get(template, template), between)
+            parts.append(read("filter_rows.c"))
         if alone or smooths:
             parts.append(read(f"{template}.c"))
     called = "".join(
@@ -53,16 +57,18 @@ def library_source(plant: PlantCode, template: str) -> str:
     return "\n".join(parts)
 
 
-def steps_and(plant: PlantCode, algorithm: str) -> list[str]:
-    """Return the parts of a filter for W lanes: the steps of the model, and ``predict`` and
-    ``correct`` of the template ``algorithm``."""
+def filter_parts(plant: PlantCode, algorithm: str, between: Sequence[str]) -> list[str]:
+    """Return the parts of a filter for W lanes.
+
+    Args:
+        plant: the equations.
+        algorithm: name of the template of its ``predict`` and ``correct``.
+        between: the texts of ``known_input`` of ``inputs.h`` and of the functions of ``marks.h``.
+    """
     steps = plant.steps or read("loops.h")
-    return [
-        read("steps.h"),
-        steps,
-        *(read(f"{n}.h") for n in ("motion", "filter")),
-        read(f"{algorithm}.c"),
-    ]
+    inputs, marks = between
+    files = inputs, read("motion.h"), read("filter.h"), marks, read(f"{algorithm}.c")
+    return [read("steps.h"), steps, *files]
 
 
 @cache

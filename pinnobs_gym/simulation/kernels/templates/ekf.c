@@ -29,7 +29,7 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
     }
     AT_WIDTH(output_moments)(H, P, R, HP, S);
     AT_WIDTH(mark_wide)(plan, P, S, bad);
-    if (plan->gate) { /* rows that were beyond the gate for long are restarted in NumPy */
+    if (plan->gate) { /* restart after too many samples in a row beyond it, of lanes in NumPy */
         lanes Se[NY];
         for (int i = 0; i < NY; i++) EACH_LANE Se[i][l] = e[i][l];
         AT_WIDTH(divide)(1, S, Se, bad);
@@ -41,8 +41,13 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
                 nis += Se[i][l] * e[i][l];
             }
             if (present) memory->beyond[l] = nis <= plan->gate[present] ? 0 : memory->beyond[l] + 1;
+#ifndef RESTARTS
             bad[l] |= memory->beyond[l] >= plan->patience;
+#endif
         }
+#ifdef RESTARTS
+        AT_WIDTH(restart)(plan, H, R, P, HP, S, memory);
+#endif
     }
     if (plan->huber) { /* enlarge variances of outputs with large innovations */
         lanes excess[NY];

@@ -1,6 +1,70 @@
 /* A filter through the samples of a call: what is loaded, stored and left to NumPy. Its algorithm is
    the pair ``predict`` and ``correct`` of another template. */
 
+/* The arrays of a call, with the batch as the last axis. The row of a sample is (n, batch). */
+#ifndef CALL
+#define CALL
+struct call {
+    const struct plan *plan;
+    int64_t batch, samples;
+    const double *t;          /* (samples,) */
+    const double *y;          /* (samples, NY, batch); NaN is missing */
+    const double *u;          /* (samples, NU, batch) */
+    double *x;                /* (samples, NX, batch) */
+    double *P;                /* (samples, NX, NX, batch) */
+    double *innovation;       /* (samples, NY, batch) */
+    double *S;                /* (samples, NY, NY, batch) */
+    const double *t_before;   /* time of the sample before, or NULL: x and P are then predictions */
+    const double *u_before;   /* (NU, batch) */
+    const double *x_before;   /* (NX, batch) */
+    const double *P_before;   /* (NX, NX, batch) */
+    /* EKF with a gate */
+    int64_t *beyond;          /* (batch,) samples in a row beyond the gate */
+    /* results of the forward pass of a smoother, or NULL; innovation and S are then NULL */
+    double *x_predicted;      /* (samples, NX, batch) */
+    double *P_predicted;      /* (samples, NX, NX, batch) */
+    double *F;                /* (samples, NX, NX, batch) of the step to a sample */
+    double *Q;                /* (samples, NX, NX, batch) of the same */
+};
+#endif
+
+/* Load the covariance of the noise of a sample. */
+static inline void AT_WIDTH(load_R)(const struct plan *plan, int64_t k, int64_t batch, int64_t row,
+                                    int count, const lanes *restrict y, lanes *restrict R)
+{
+    const int64_t own = plan->R_rows ? batch : 0;
+    const double *from = plan->R + k * plan->R_samples * NY * NY * (own ? own : 1);
+    AT_WIDTH(load)(NY * NY, from, own, row, count, R);
+    AT_WIDTH(leave_out_missing)(y, R);
+}
+
+/* Find the rows whose state and covariance are NaN throughout. They remain so. Rows in which some
+   values are not finite are left to NumPy, where the others become so in the order in which dense
+   products carry them. */
+static inline void AT_WIDTH(find_lost)(const lanes *restrict x, const lanes *restrict P,
+                                       int64_t *restrict lost)
+{
+    EACH_LANE {
+        lost[l] = 1;
+        for (int i = 0; i < NX; i++) lost[l] &= x[i][l] != x[i][l];
+        for (int i = 0; i < NX * NX; i++) lost[l] &= P[i][l] != P[i][l];
+    }
+}
+
+/* Note the number of the sample in the lanes that are bad for the first time, which NumPy has to
+   go on with. Return whether all rows that exist are bad. The others go on, so that none depends
+   on its neighbours. */
+static inline int AT_WIDTH(note_bad)(const int64_t *restrict bad, int64_t k, int64_t samples,
+                                     int64_t *restrict reached, int count)
+{
+    int all = 1;
+    for (int l = 0; l < count; l++) {
+        if (bad[l] && reached[l] == samples) reached[l] = k;
+        all &= bad[l] != 0;
+    }
+    return all;
+}
+
 #ifdef SMOOTHED
 /* Predict sample k by the Jacobian F of the model's step and the process noise Q over it, which a
    smoother needs: P = F P F^T + Q. */

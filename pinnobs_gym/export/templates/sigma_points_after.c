@@ -1,0 +1,9 @@
+static void after_prediction(const struct plan *plan, real *x, real *P)
+{
+    (void)plan, (void)x, (void)P;
+}
+
+static void after_correction(const struct plan *plan, real *x, real *P)
+{
+    (void)plan, (void)x, (void)P;
+}
