@@ -11,9 +11,13 @@ from __future__ import annotations
 import re
 
 _NAME = re.compile(r"AT_WIDTH\((\w+)\)")
-_ALIAS = re.compile(r"^#(?:define|undef) (?:lanes|interval|rk_step|steps|sample|memory)\b.*\n", re.M)
+_ALIAS = re.compile(
+    r"^#(?:define|undef) (?:lanes|interval|rk_step|steps|sample|memory)\b.*\n", re.M
+)
 _TYPE = re.compile(r"^typedef double lanes\[W\];\n#define EACH_LANE .*\n", re.M)
-_DECLARED = re.compile(r"(?<![\w*(] )(?<![\w*(])\blanes ((?:\w+(?:\[[^\];]*\])*(?: = [^;,]*)?,?\s*)+);")
+_DECLARED = re.compile(
+    r"(?<![\w*(] )(?<![\w*(])\blanes ((?:\w+(?:\[[^\];]*\])*(?: = [^;,]*)?,?\s*)+);"
+)
 _SCALAR = re.compile(r"^\w+$")
 _LITERAL = re.compile(r"(?<![\w.])(?:\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 

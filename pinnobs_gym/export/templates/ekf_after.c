@@ -30,11 +30,7 @@ static void wrap_covariance(const struct plan *plan, real *P)
     }
 }
 
-static void after_prediction(const struct plan *plan, real *x, real *P)
-{
-    (void)x;
-    wrap_covariance(plan, P);
-}
+static void after_prediction(const struct plan *plan, real *P) { wrap_covariance(plan, P); }
 
 /* Find by how much the multipliers r of the components at their bounds shrink per unit of that of
    component p, by elimination in the correlation matrix C. Return the variance of p that is left
@@ -130,7 +126,7 @@ static void keep_inside(const struct plan *plan, const real *P, real *x)
     }
 }
 
-static void after_correction(const struct plan *plan, real *x, real *P)
+static void after_correction(const struct plan *plan, real *x, const real *P)
 {
     if (plan->low) keep_inside(plan, P, x);
 }

@@ -23,15 +23,15 @@ typedef enum {
 typedef struct {
     double t;             /* time of the last sample in @time_unit@ */
     uint32_t samples;     /* number of samples so far; 0 before the first */
-    @real@ x[@NX@];       /* @states@ */
+    @real@ x[@NX@];       /* estimates: @states@ */
+    @real@ u[@LU@];       /* inputs at the last sample */
     @fields@
 } @name@;
 
-/* Start. xhat0 (@NX@) and P0 (@NX@ x @NX@) are the mean and the covariance of the initial state; NULL stands
-   for those of the export. */
-void @name@_init(@name@ *filter, const @real@ *xhat0, const @real@ *P0);
+/* Start. @start@ */
+void @name@_init(@name@ *filter, const @real@ *xhat0@P0@);
 
-/* Take the sample at time t: outputs y (@NY@), of which NAN is a missing one, and inputs u (@NU@)@inputs@. */
+/* Take the sample at time t: outputs y (@NY@), of which NAN is a missing one, and inputs u@inputs@. */
 @name@_status @name@_update(@name@ *filter, double t, const @real@ *y, const @real@ *u);
 
 #endif

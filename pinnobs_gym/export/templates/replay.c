@@ -12,7 +12,7 @@ int main(void)
     static char line[65536];
     static @name@ filter;
     long number = 1;
-    @name@_init(&filter, NULL, NULL);
+    @name@_init(&filter, NULL@no_P0@);
     if (!fgets(line, sizeof line, stdin)) return 1;
     while (fgets(line, sizeof line, stdin)) {
         double cells[1 + @NAME@_OUTPUTS + @NAME@_INPUTS];

@@ -130,7 +130,7 @@ static inline void AT_WIDTH(move)(const struct interval *over, lanes *restrict x
         return;
     }
     struct steps at = {.begun = 0};
-    struct rk_step s;
+    struct rk_step s = {.h = 0};
     while (AT_WIDTH(next_step)(over, &at, &s)) AT_WIDTH(runge_kutta)(&s, over->p, x);
 }
 
@@ -159,7 +159,7 @@ SEPARATE void AT_WIDTH(move_moments)(const struct interval *over, lanes *restric
         return;
     }
     struct steps at = {.begun = 0};
-    struct rk_step s;
+    struct rk_step s = {.h = 0};
     while (AT_WIDTH(next_step)(over, &at, &s)) {
         AT_WIDTH(runge_kutta_linearised)(&s, over->p, x, step_F, A_first, A_last);
 #ifdef STRAIGHT

@@ -84,7 +84,7 @@ static inline void AT_WIDTH(move_points)(const struct interval *over, lanes *res
         return;
     }
     struct steps at = {.begun = 0};
-    struct rk_step s;
+    struct rk_step s = {.h = 0};
     while (AT_WIDTH(next_step)(over, &at, &s))
         for (int p = 0; p < num_points; p++)
             AT_WIDTH(runge_kutta)(&s, over->p, points + p * NX);
