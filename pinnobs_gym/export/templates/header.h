@@ -4,6 +4,10 @@
 
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #define @NAME@_STATES @NX@
 #define @NAME@_OUTPUTS @NY@
 #define @NAME@_INPUTS @NU@
@@ -12,7 +16,7 @@
 /* What became of a sample. All but @NAME@_OK leave the filter as it was. */
 typedef enum {
     @NAME@_OK,
-    @NAME@_TIME,     /* t is not finite, does not increase@or_whole@ */
+    @NAME@_TIME,     /* t is not finite, or does not increase@or_whole@ */
     @NAME@_GAP,      /* too long since the sample before */
     @NAME@_OUTPUT,   /* an output is infinite */
     @NAME@_INPUT,    /* an input is not finite */
@@ -33,5 +37,9 @@ void @name@_init(@name@ *filter, const @real@ *xhat0@P0@);
 
 /* Take the sample at time t: outputs y (@NY@), of which NAN is a missing one, and inputs u@inputs@. */
 @name@_status @name@_update(@name@ *filter, double t, const @real@ *y, const @real@ *u);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif
