@@ -69,8 +69,9 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
     values = _values(estimator, found, name, "float" if float32 else "double")
     values["checksum"] = checksum
     head = own("head.c").replace("@math@", "tgmath" if float32 else "math")
-    texts = (own("header.h"), f"{head}\n{source}", own("replay.c"))
-    return CFiles(name, *(_filled(_filled(text, values), values) for text in texts), checksum)
+    texts = [own("header.h"), f"{head}\n{source}", own("replay.c")]
+    header, source, replay = (_filled(_filled(text, values), values) for text in texts)
+    return CFiles(name, header, source, replay, checksum)
 
 
 def _check_exportable(estimator: BaseEstimator) -> None:
@@ -161,8 +162,8 @@ def _values(estimator: BaseEstimator, found: Algorithm, name: str, real: str) ->
     start = f"xhat0 ({system.nx}) is the initial estimate; NULL stands for that of the export."
     if has_P:
         start = (
-            f"xhat0 ({system.nx}) and P0 ({system.nx} x {system.nx}) are the mean and the covariance "
-            "of the\n   initial state; NULL stands for those of the export."
+            f"xhat0 ({system.nx}) and P0 ({system.nx} x {system.nx}) are the mean and the "
+            "covariance of the\n   initial state; NULL stands for those of the export."
         )
     return {
         "name": name,

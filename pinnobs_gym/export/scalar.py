@@ -1,9 +1,9 @@
 """The code of compiled algorithms for a single episode, as plain C.
 
 The templates of `pinnobs_gym.simulation.kernels` work on lanes, episodes side by side: an array of
-lanes is (n, W), and one lane is an array of W numbers. Exported code has one episode, and numbers in
-place of lanes. It is made from the same text by the rules of `scalar`, so that the operations and
-their order are the same.
+lanes is (n, W), and one lane is an array of W numbers. Exported code has one episode, and numbers
+in place of lanes. It is made from the same text by the rules of `scalar`, so that the operations
+and their order are the same.
 """
 
 from __future__ import annotations

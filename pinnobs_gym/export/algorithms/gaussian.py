@@ -49,7 +49,7 @@ def algorithm(estimator: Any, code: PlantCode, prior: Prior) -> Algorithm | None
         f"@real@ innovation[{ny}]; /* outputs less their predictions; 0 where missing */",
         f"@real@ S[{ny * ny}]; /* covariance of the innovation */",
     ]
-    places = dict.fromkeys(("restart", "before", "after"), "")
+    places: dict[str, str] = dict.fromkeys(("restart", "before", "after"), "")
     if gate:
         fields += [
             f"@real@ P_restart[{nx * nx}]; /* covariance after a restart by the gate */",
