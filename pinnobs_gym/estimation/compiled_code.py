@@ -25,7 +25,7 @@ def library_of(estimator: BaseEstimator) -> PlantLibrary | str:
     template = getattr(cls, "template", "")
     if not template:
         return f"{cls.__name__} has no compiled code"
-    if changed := _changed(cls):
+    if changed := changed_method(cls):
         return f"{cls.__name__} defines {changed}"
     noise = estimator.noise
     if type(noise) is not AssumedNoise or type(noise.told) is not Noise:
@@ -33,7 +33,7 @@ def library_of(estimator: BaseEstimator) -> PlantLibrary | str:
     return plant_library(estimator.system, template)
 
 
-def _changed(cls: type[BaseEstimator]) -> str:
+def changed_method(cls: type[BaseEstimator]) -> str:
     """Return the name of a method of the class that names the template which a subclass of it
     overrides, an empty text if there is none."""
     classes = cls.__mro__

@@ -78,20 +78,7 @@ class Plan:
             R: output noise, shape (samples or 1, ny, ny, batch or 1).
         """
         plan = Plan(PlanStructure(), [])
-        p = plant_numbers(system, numbers)
-        breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
-        measured = {"previous": 1, "linear": 2}[system.input_hold]
-        plan.set(p=p, L=L, breaks=breaks, output_period=_periods(system.output_period))
-        D = L @ L.T
-        plan.set(D=D, diagonal=int(not (D - np.diag(np.diag(D))).any()))
-        plan.set(state_period=_periods(system.state_period))
-        box = system.state_box
-        plan.set(low=None if box is None else box.low, high=None if box is None else box.high)
-        structure = plan.structure
-        structure.p_rows, structure.m = int(p.ndim > 1), L.shape[1]
-        structure.longest, structure.num_breaks = longest_step(system), len(breaks)
-        structure.input = measured if system.measured_input else 0
-        structure.discrete = int(system.discrete)
+        plan.set(**plan_values(system, numbers, L))
         return plan.with_R(R)
 
     def with_R(self, R: np.ndarray) -> Plan:
@@ -107,6 +94,39 @@ class Plan:
                 self.kept.append(np.ascontiguousarray(value, dtype=float))
                 value = address(self.kept[-1])
             setattr(self.structure, name, value)
+
+
+def plan_values(
+    system: System, numbers: Sequence[str], L: np.ndarray
+) -> dict[str, np.ndarray | float | None]:
+    """Return the fields of ``struct plan`` that a model determines; those that do not apply are
+    None.
+
+    Args:
+        system: the model.
+        numbers: the attributes of the system that its code takes.
+        L: process noise, shape (nx, m).
+    """
+    p, D, box = plant_numbers(system, numbers), L @ L.T, system.state_box
+    breaks = np.sort(np.asarray(system.breakpoints(), dtype=float))
+    measured = {"previous": 1, "linear": 2}[system.input_hold]
+    return {
+        "p": p,
+        "p_rows": int(p.ndim > 1),
+        "L": L,
+        "m": L.shape[1],
+        "D": D,
+        "diagonal": int(not (D - np.diag(np.diag(D))).any()),
+        "longest": longest_step(system),
+        "breaks": breaks,
+        "num_breaks": len(breaks),
+        "input": measured if system.measured_input else 0,
+        "discrete": int(system.discrete),
+        "state_period": _periods(system.state_period),
+        "output_period": _periods(system.output_period),
+        "low": None if box is None else box.low,
+        "high": None if box is None else box.high,
+    }
 
 
 def _periods(periods: Any) -> np.ndarray | None:

@@ -16,12 +16,18 @@ from pinnobs_gym.simulation.kernels.straight import (
 )
 
 _NAME = re.compile(r"[A-Za-z_]\w*")
+_PARAMETER = re.compile(r"(\w+)(?:, |\)$)")
 
 
 def function(head: str, s: Straight, first: str = "") -> str:
-    """Return a C function: its head, lines that come first, and straight code."""
-    first = f"    {first}\n" if first else ""
-    return f"static void {head}\n{{\n{first}{s.body()}\n}}"
+    """Return a C function: its head, lines that come first, and straight code. Parameters that are
+    not used are named, since compilers may warn of them."""
+    body = s.body()
+    named = set(_NAME.findall(first)) | set(_NAME.findall(body))
+    unused = [name for name in _PARAMETER.findall(head) if name not in named]
+    lines = [*([first] if first else []), *(f"(void){name};" for name in unused)]
+    text = "".join(f"    {line}\n" for line in lines)
+    return f"static void {head}\n{{\n{text}{body}\n}}"
 
 
 def _loaded(s: Straight, array: str, rows: Rows) -> Rows:

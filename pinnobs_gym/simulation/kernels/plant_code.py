@@ -162,7 +162,7 @@ def _input_function(trace: Trace) -> str:
     stored = [f"u[{i} * step] = {entry};" for i, entry in enumerate(entries)]
     body = "\n    ".join([*lines, *stored])
     return (
-        "static void plant_input(double now, const double *restrict p, int stride, "
+        "static void plant_input(seconds now, const double *restrict p, int stride, "
         "double *restrict u, int step)\n"
         f"{{\n    (void)now; (void)p; (void)stride; (void)u; (void)step;\n    {body}\n}}"
     )

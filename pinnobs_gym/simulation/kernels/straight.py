@@ -89,7 +89,9 @@ class Straight:
 
     def body(self) -> str:
         """Return the lines as loops over the lanes. Lines with calls have loops of their own, so
-        that the others become vector instructions."""
+        that the others become vector instructions. Lines that no stored value needs are left
+        out."""
+        self._code = self._needed()
         phases = self._phases()
         last = max(phases.values(), default=0)
         last += last % 2
@@ -106,6 +108,16 @@ class Straight:
             "\n        ".join(["EACH_LANE {", *group]) + "\n    }" for group in groups if group
         ]
         return arrays + "    " + "\n    ".join(loops)
+
+    def _needed(self) -> dict[str, str]:
+        """Return the lines that stored values depend on, in their order."""
+        needed = {name for _, code in self._stored for name in _NAME.findall(code)}
+        lines = {}
+        for name, code in reversed(self._code.items()):
+            if name in needed:
+                needed.update(_NAME.findall(code))
+                lines[name] = code
+        return dict(reversed(lines.items()))
 
     def _phases(self) -> dict[str, int]:
         """Return the number of the loop of each line: odd for lines with calls."""

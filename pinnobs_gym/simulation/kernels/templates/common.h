@@ -10,6 +10,8 @@
 #define SEPARATE static
 #endif
 
+typedef double seconds; /* times: numbers of double precision in code of any other */
+
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 
 /* NumPy's functions, NaN included, that C does not have. */
@@ -55,7 +57,7 @@ struct plan {
     int64_t R_samples;        /* 1, or 0 if R is the same at all samples */
     int64_t R_rows;           /* 1, or 0 if R is the same in all rows */
     double longest;           /* longest Runge-Kutta step in s */
-    const double *breaks;     /* ascending times at which f jumps */
+    const seconds *breaks;    /* ascending times at which f jumps */
     int64_t num_breaks;
     int64_t input;            /* 0: defined by the plant, 1: measured and held, 2: joined */
     int64_t discrete;         /* 1 if the plant is a map */

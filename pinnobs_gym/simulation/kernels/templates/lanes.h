@@ -59,7 +59,7 @@ static inline void AT_WIDTH(cholesky)(int n, const lanes *restrict P, lanes *res
 {
     for (int j = 0; j < n; j++) {
         for (int i = 0; i < j; i++) EACH_LANE L[i * n + j][l] = 0;
-        double pivot[W];
+        double pivot[W] = {0};
         for (int i = j; i < n; i++) {
             double rest[W];
             EACH_LANE rest[l] = P[i * n + j][l];
@@ -85,36 +85,5 @@ static inline void AT_WIDTH(divide_factored)(int n, int m, lanes *restrict A,
                 EACH_LANE A[i * m + j][l] -= A[i * m + q][l] * L[q * m + j][l];
             EACH_LANE A[i * m + j][l] /= L[j * m + j][l];
         }
-    }
-}
-
-/* Copy W rows, of which the first ``count`` exist, of an array (n, rows or 1) into lanes. The last
-   row stands for those that do not exist. */
-SEPARATE void AT_WIDTH(load)(int64_t n, const double *restrict from, int64_t rows, int64_t row,
-                             int count, lanes *restrict to)
-{
-    if (rows == 0) {
-        for (int64_t i = 0; i < n; i++) EACH_LANE to[i][l] = from[i];
-    } else if (count == W) {
-        for (int64_t i = 0; i < n; i++) EACH_LANE to[i][l] = from[i * rows + row + l];
-    } else if (count == 1) {
-        for (int64_t i = 0; i < n; i++) EACH_LANE to[i][l] = from[i * rows + row];
-    } else {
-        for (int64_t i = 0; i < n; i++)
-            EACH_LANE to[i][l] = from[i * rows + row + MIN(l, count - 1)];
-    }
-}
-
-/* Copy the lanes that exist into W rows of an array (n, rows). */
-SEPARATE void AT_WIDTH(store)(int64_t n, const lanes *restrict from, double *restrict to,
-                              int64_t rows, int64_t row, int count)
-{
-    if (count == W) {
-        for (int64_t i = 0; i < n; i++) EACH_LANE to[i * rows + row + l] = from[i][l];
-    } else if (count == 1) {
-        for (int64_t i = 0; i < n; i++) to[i * rows + row] = from[i][0];
-    } else {
-        for (int64_t i = 0; i < n; i++)
-            for (int l = 0; l < count; l++) to[i * rows + row + l] = from[i][l];
     }
 }

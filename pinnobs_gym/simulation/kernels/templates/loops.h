@@ -1,4 +1,8 @@
 /* The functions of steps.h in loops, for plants of which step_code.py would write too much code. */
+/* The place in ``t`` and ``u`` of each stage */
+static const int AT_WIDTH(stage)[4] = {0, 1, 1, 2};
+#define STAGE AT_WIDTH(stage)
+
 static inline void AT_WIDTH(runge_kutta)(const struct rk_step *s, const lanes *p, lanes *restrict x)
 {
     lanes k[4][NX], point[NX];

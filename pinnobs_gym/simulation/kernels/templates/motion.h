@@ -5,12 +5,12 @@
 struct interval {
     const struct plan *plan;
     const lanes *p;
-    double t0, t1;
+    seconds t0, t1;
     lanes u0[LU], u1[LU];     /* measured inputs at both */
 };
 
 /* Inputs at a time of the interval, for all lanes. */
-static inline void AT_WIDTH(input_at)(const struct interval *over, double t, double part,
+static inline void AT_WIDTH(input_at)(const struct interval *over, seconds t, double part,
                                       lanes *restrict u)
 {
     if (over->plan->input == 1) {
@@ -18,22 +18,18 @@ static inline void AT_WIDTH(input_at)(const struct interval *over, double t, dou
     } else if (over->plan->input == 2) {
         for (int i = 0; i < NU; i++)
             EACH_LANE u[i][l] = (1 - part) * over->u0[i][l] + part * over->u1[i][l];
-    } else if (over->plan->p_rows) {
-        EACH_LANE plant_input(t, &over->p[0][l], W, &u[0][l], W);
-    } else { /* the same in all lanes */
-        plant_input(t, &over->p[0][0], W, &u[0][0], W);
-        for (int i = 0; i < NU; i++)
-            for (int l = 1; l < W; l++) u[i][l] = u[i][0];
+    } else {
+        AT_WIDTH(known_input)(over->plan, over->p, t, u);
     }
 }
 
-static inline void AT_WIDTH(set_step)(const struct interval *over, double start, double step,
-                                      int64_t k, double last, struct rk_step *s)
+static inline void AT_WIDTH(set_step)(const struct interval *over, seconds start, seconds step,
+                                      int64_t k, seconds last, struct rk_step *s)
 {
     s->h = step;
     for (int i = 0; i < 3; i++) {
-        const double t = MIN(start + (k + 0.5 * i) * step, last);
-        const double whole = over->t1 - over->t0;
+        const seconds t = MIN(start + (k + 0.5 * i) * step, last);
+        const seconds whole = over->t1 - over->t0;
         EACH_LANE s->t[i][l] = t;
         if (i == 0 && k > 0 && last == INFINITY) { /* the end of the previous step */
             memcpy(s->u[0], s->u[2], sizeof s->u[0]);
@@ -88,7 +84,7 @@ SEPARATE void AT_WIDTH(add_noisy_step)(const struct plan *plan, double h,
    breakpoint; at its end, a part has the left limit of what jumps there. */
 #define steps AT_WIDTH(steps)
 struct steps {
-    double start, end, step, last;
+    seconds start, end, step, last;
     int64_t count, k, next_break;
     int begun;
 };
@@ -109,7 +105,7 @@ static inline int AT_WIDTH(next_step)(const struct interval *over, struct steps 
             at->end = plan->breaks[at->next_break];
             at->last = nextafter(at->end, at->start);
         }
-        const double count = ceil((at->end - at->start) / plan->longest - 1e-6);
+        const seconds count = ceil((at->end - at->start) / plan->longest - 1e-6);
         at->count = count < 1 ? 1 : (int64_t)count;
         at->step = (at->end - at->start) / at->count;
         at->k = 0;
@@ -124,7 +120,7 @@ static inline int AT_WIDTH(next_step)(const struct interval *over, struct steps 
 static inline void AT_WIDTH(move)(const struct interval *over, lanes *restrict x)
 {
     if (over->plan->discrete) {
-        for (double k = over->t0; k < over->t1; k++) {
+        for (seconds k = over->t0; k < over->t1; k++) {
             lanes t, u[LU], next[NX];
             EACH_LANE t[l] = k;
             AT_WIDTH(input_at)(over, k, (k - over->t0) / (over->t1 - over->t0), u);
@@ -134,7 +130,7 @@ static inline void AT_WIDTH(move)(const struct interval *over, lanes *restrict x
         return;
     }
     struct steps at = {.begun = 0};
-    struct rk_step s;
+    struct rk_step s = {.h = 0};
     while (AT_WIDTH(next_step)(over, &at, &s)) AT_WIDTH(runge_kutta)(&s, over->p, x);
 }
 
@@ -148,7 +144,7 @@ SEPARATE void AT_WIDTH(move_moments)(const struct interval *over, lanes *restric
 {
     lanes step_F[NX * NX], A_first[NX * NX], A_last[NX * NX];
     if (over->plan->discrete) {
-        for (double k = over->t0; k < over->t1; k++) {
+        for (seconds k = over->t0; k < over->t1; k++) {
             lanes t, u[LU], next[NX];
             EACH_LANE t[l] = k;
             AT_WIDTH(input_at)(over, k, (k - over->t0) / (over->t1 - over->t0), u);
@@ -163,7 +159,7 @@ SEPARATE void AT_WIDTH(move_moments)(const struct interval *over, lanes *restric
         return;
     }
     struct steps at = {.begun = 0};
-    struct rk_step s;
+    struct rk_step s = {.h = 0};
     while (AT_WIDTH(next_step)(over, &at, &s)) {
         AT_WIDTH(runge_kutta_linearised)(&s, over->p, x, step_F, A_first, A_last);
 #ifdef STRAIGHT

@@ -84,7 +84,7 @@ static inline void AT_WIDTH(move_points)(const struct interval *over, lanes *res
         return;
     }
     struct steps at = {.begun = 0};
-    struct rk_step s;
+    struct rk_step s = {.h = 0};
     while (AT_WIDTH(next_step)(over, &at, &s))
         for (int p = 0; p < num_points; p++)
             AT_WIDTH(runge_kutta)(&s, over->p, points + p * NX);
@@ -108,24 +108,22 @@ static inline void AT_WIDTH(predict)(const struct interval *over, lanes *restric
     for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += Q[i][l];
 }
 
-/* Correct x and P by the outputs of sample k. Lanes that NumPy has to correct are marked. */
-static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict p, int64_t k,
-                                     int64_t row, int count, lanes *restrict x, lanes *restrict P,
+/* Correct x and P by the outputs of a sample. Lanes that NumPy has to correct are marked. */
+static inline void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p,
+                                     struct sample *restrict s, lanes *restrict x,
+                                     lanes *restrict P, struct memory *restrict memory,
                                      int64_t *restrict bad)
 {
-    const struct plan *plan = c->plan;
     const int num_points = (int)plan->num_points;
-    lanes t, y[NY], u[LU], R[NY * NY], points[POINTS * NX], outputs[POINTS * NY], centre[NY];
-    lanes mean[NY], X[NX * POINTS], Y[NY * POINTS], S[NY * NY], K[NX * NY], e[NY];
-    EACH_LANE t[l] = c->t[k];
-    AT_WIDTH(load)(NY, c->y + k * NY * c->batch, c->batch, row, count, y);
-    AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, u);
-    AT_WIDTH(load_R)(plan, k, c->batch, row, count, y, R);
+    lanes *const y = s->y, *const e = s->e, *const R = s->R, *const S = s->S;
+    lanes points[POINTS * NX], outputs[POINTS * NY], centre[NY];
+    lanes mean[NY], X[NX * POINTS], Y[NY * POINTS], K[NX * NY];
+    (void)memory;
     /* New points about the prediction, whose spread includes Q, and their outputs */
     AT_WIDTH(draw)(plan, x, P, points, bad);
     for (int q = 0; q < num_points; q++)
-        AT_WIDTH(plant_h)(t, points + q * NX, u, p, outputs + q * NY);
-    AT_WIDTH(plant_h)(t, x, u, p, centre);
+        AT_WIDTH(plant_h)(s->t, points + q * NX, s->u, p, outputs + q * NY);
+    AT_WIDTH(plant_h)(s->t, x, s->u, p, centre);
     AT_WIDTH(mark_undefined)(plan, NY, centre, outputs, bad);
     AT_WIDTH(deviations)(plan, NY, plan->output_period, centre, outputs, mean, Y);
     for (int i = 0; i < NX; i++)
@@ -165,40 +163,5 @@ static inline void AT_WIDTH(correct)(const struct call *c, const lanes *restrict
     AT_WIDTH(product)(NX, NY, NY, K, R, KR);
     AT_WIDTH(symmetric)(NX, NY, KR, K, own);
     for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += own[i][l];
-    AT_WIDTH(store)(NY, e, c->innovation + k * NY * c->batch, c->batch, row, count);
-    AT_WIDTH(store)(NY * NY, S, c->S + k * NY * NY * c->batch, c->batch, row, count);
     AT_WIDTH(mark_outside)(plan, x, bad);
-}
-
-/* Filter W rows, of which ``count`` exist. ``reached`` is set to the number of the sample that NumPy
-   has to do in each, or the number of samples. */
-static void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count,
-                                  int64_t *restrict reached)
-{
-    const struct plan *plan = c->plan;
-    lanes p[LP], x[NX], P[NX * NX];
-    struct interval over = {.plan = plan, .p = p};
-    int64_t bad[W];
-    EACH_LANE bad[l] = 0;
-    for (int l = 0; l < count; l++) reached[l] = c->samples;
-    AT_WIDTH(load)(NP, plan->p, plan->p_rows ? c->batch : 0, row, count, p);
-    AT_WIDTH(load)(NX, c->x_before, c->batch, row, count, x);
-    AT_WIDTH(load)(NX * NX, c->P_before, c->batch, row, count, P);
-    if (c->t_before) AT_WIDTH(load)(NU, c->u_before, c->batch, row, count, over.u1);
-    for (int64_t k = 0; k < c->samples; k++) {
-        const double *before = k ? c->t + k - 1 : c->t_before;
-        if (before) {
-            if (!AT_WIDTH(movable)(plan, *before, c->t[k])) EACH_LANE bad[l] = 1;
-            if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
-            over.t0 = *before;
-            over.t1 = c->t[k];
-            memcpy(over.u0, over.u1, sizeof over.u0);
-        }
-        AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, over.u1);
-        if (before) AT_WIDTH(predict)(&over, x, P, bad);
-        AT_WIDTH(correct)(c, p, k, row, count, x, P, bad);
-        if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
-        AT_WIDTH(store)(NX, x, c->x + k * NX * c->batch, c->batch, row, count);
-        AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * c->batch, c->batch, row, count);
-    }
 }

@@ -19,7 +19,3 @@ struct rk_step {
     lanes t[3];
     lanes u[3][LU];           /* at the start, the middle and the end */
 };
-
-static const int AT_WIDTH(stage)[4] = {0, 1, 1, 2};
-#define STAGE AT_WIDTH(stage)
-

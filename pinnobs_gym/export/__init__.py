@@ -1,0 +1,1 @@
+"""Estimators as C files of their own, for other programs and controllers."""

@@ -1,0 +1,7 @@
+@intro@
+#include <@math@.h>
+#include <string.h>
+
+#include "@name@.h"
+
+typedef @real@ real;

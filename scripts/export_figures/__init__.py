@@ -1,0 +1,1 @@
+"""What the group ``export`` of `benchmark.py` measures by: exported files, built and run."""

@@ -1,0 +1,71 @@
+"""The command that writes estimators as C."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from exported import COMPILER, FLAGS, csv_of, needs_c, replay
+from linear import record_of
+
+from pinnobs_gym.cli import main
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimators.ekf import EKF
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@needs_c
+def test_its_files_compile_and_replay_a_log(folder, capsys):
+    given = ("--system", "ReverseDuffing", "--noise-std", 0.2, "--xhat0", 0.5, -0.5)
+    assert run("export", "ekf", *given, "--out", "duffing.c", "--set", "assumed_noise=0.01") == 0
+    said = capsys.readouterr().out
+    command = [COMPILER, *FLAGS, "duffing.c", "duffing_replay.c", "-lm", "-o", "replay"]
+    subprocess.run(command, check=True)
+    assert "cc -std=c99 -O2 duffing.c duffing_replay.c -lm" in said
+    source = EpisodeSource("ReverseDuffing", noise_std=0.2)
+    record = record_of(source, 1).first_samples(50)
+    found, _ = replay(folder / "replay", csv_of(record, source.system))
+    own = EKF.for_setup(source.system, source.setup, assumed_noise=0.01)
+    record.prior.mean[:] = 0.5, -0.5
+    np.testing.assert_allclose(found[:, 1:3], own.run(record).xhat[0], atol=1e-12)
+
+
+def test_measured_inputs(folder):
+    assert run("export", "ekf", "--system", "InductionMotor", "--out", "own.c") == 0
+    assert (
+        run("export", "ekf", "--system", "InductionMotor", "--out", "m.c", "--measured-input") == 0
+    )
+    assert "#define OWN_INPUTS 0" in (folder / "own.h").read_text()
+    assert "#define M_INPUTS 2" in (folder / "m.h").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "name an estimator first: pinnobs export ekf"),
+        (["ekf", "--system", "Academic", "--out", "a.py"], "out=a.py; expected the name of a C"),
+        (["ekf", "--system", "Academic", "--out", "b.c"], "b.h already exists; expected"),
+        (["ekf", "--system", "Academic", "--out", "2a.c"], "name='2a'; expected a name in C"),
+        (["mhe", "--system", "Academic", "--out", "a.c"], "estimator 'mhe' is not exported"),
+        (["kkl_pinn", "--system", "Academic", "--out", "a.c"], "give the file with --trained FILE"),
+        (
+            ["ekf", "--system", "Academic", "--out", "a.c", "--trained", "a.pt"],
+            "trained=a.pt: estimator 'ekf' is not trained",
+        ),
+    ],
+)
+def test_bad_input_is_one_line(folder, capsys, arguments, message):
+    (folder / "b.h").touch()
+    assert run("export", *arguments) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert {path.name for path in folder.iterdir()} == {"b.h"}
