@@ -73,8 +73,10 @@ def check_apart(arguments: Sequence[str], simulated: Sequence[str], of_logs: Seq
     Raises:
         ValueError: in one line that names the options.
     """
-    given = {option for option, values in by_option(arguments)}
+    given = dict(by_option(arguments))
     log = "--log" in given
+    if log and not given["--log"]:
+        raise ValueError("--log without a file; expected one or several")
     wrong = [option for option in (simulated if log else of_logs) if option in given]
     if wrong and log:
         raise ValueError(

@@ -122,6 +122,7 @@ def _columns(path, factor):
         ([*ONE, "--video", "a.mp4"], "--video and --log"),
         ([*ONE, "--tuned"], "--tuned and --log"),
         (["--reference", "a-ref.csv"], "--reference without --log"),
+        (["--log", "--reference", "a-ref.csv"], "--log without a file"),
         (["--noise-std", "0.1"], "--noise-std without --log"),
         (["--log", "a.csv"], "1 log(s) and 0 reference(s)"),
         (["--log", "a.csv", "b.csv", "--reference", "a-ref.csv"], "2 log(s) and 1 reference(s)"),
