@@ -25,6 +25,8 @@ from pinnobs_gym.simulation.system import Setup, System, vector
 
 _FAR = 1e3
 """Distance of an estimate from the prior's mean, in scales, from which on it counts as diverged."""
+_ENOUGH = 100
+"""Least number of samples of its second half by which a log may fit later."""
 _UNLIKELY = 6.0
 """Standard deviations from which on the first innovation of an output speaks against the prior."""
 
@@ -81,7 +83,7 @@ def _tests(
         rows = rows[rows >= found.start]
         if len(rows) >= FEWEST:
             half = rows[len(rows) // 2 :]
-            later = _tests_of(i, system, record, found, half) if len(half) >= FEWEST else None
+            later = _tests_of(i, system, record, found, half) if len(half) >= _ENOUGH else None
             tests.append(replace(_tests_of(i, system, record, found, rows), later=later))
     if found.squares is None or len(tests) < 2:
         return tests, None

@@ -26,8 +26,8 @@ SINGLE = 3.0
 with what each does to the next estimates."""
 _PASSING = ("unexplained", "slow", "driven", "bursts")
 """Verdicts on a model or a filter that may fail at first only."""
-_LENIENT = 0.05
-"""Probability below which the second half counts as wrong, too."""
+_HINT = 0.01
+"""Probability below which the second half may be wrong, too."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,16 @@ class OutputTests:
             chance: probability below which something is not taken for chance.
         """
         found, later = self._verdict(chance), self.later
-        passing = found in _PASSING and later is not None and not later._verdict(_LENIENT)
+        passing = found in _PASSING and later is not None and later._fits
         return "early" if passing else found
+
+    @property
+    def _fits(self) -> bool:
+        """Whether nothing hints at a wrong model, however small its effect."""
+        chances = [self.drift.chance, self.driven.chance]
+        chances += [self.correlation.chance] if self.correlation.value > 0 else []
+        usual = USUAL[0] <= self.size.median <= USUAL[1] and self.outliers.share <= MANY
+        return usual and min(chances) >= _HINT
 
     def _verdict(self, chance: float) -> str:
         """Return the verdict on all values; see `verdict`."""
