@@ -17,9 +17,6 @@ _USUAL = (0.5, 2.0)
 """Range of the residuals over their expected standard deviation."""
 _SERIAL = 0.3
 """Correlation of residuals from one sample to the next, in size, from which on it is told."""
-_LEAST_GAIN = 1.35
-"""Gain in log-likelihood below which process noise is not told from none: twice this is the 95 %
-quantile of its law if there is none, half a χ² of one degree (Self & Liang 1987, case 5)."""
 
 
 def doubts_of_parameters(parameters: Parameters, d: np.ndarray, known: Precision) -> list[str]:
@@ -115,7 +112,7 @@ def doubts_of_noise(system: System, made: NoiseFit, std: np.ndarray) -> list[str
         if not error < 1
     ]
     lines = []
-    if made.gain_of_process_noise < _LEAST_GAIN:
+    if made.perhaps_none:
         lines.append(
             "the logs do not tell the process noise from zero: without it, the log-likelihood is "
             f"{max(0.0, made.gain_of_process_noise):.2g} less; tell none, --process-noise 0"

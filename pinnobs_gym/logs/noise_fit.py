@@ -25,6 +25,9 @@ _SMALLEST, _LARGEST = (1e-3, 1e-5), 1e5
 """Smallest factors on the noise of outputs and on process noise, and the largest on both."""
 _WITHOUT = np.geomspace(1, 1000, 40)
 """Factors on the noise of outputs that are tried where there is no process noise."""
+_LEAST_GAIN = 1.35
+"""Gain in log-likelihood below which process noise is not told from none: twice this is the 95 %
+quantile of its law if there is none, half a χ² of one degree (Self & Liang 1987, case 5)."""
 _ITERATIONS, _GAIN = 60, 1e-6
 _LONGEST = 2.0
 """Largest change of a logarithm, or of a parameter in its scale, in one step."""
@@ -57,6 +60,11 @@ class NoiseFit:
     output."""
     S: tuple[np.ndarray, ...]
     """Their covariances, shape (num_samples, ny, ny)."""
+
+    @property
+    def perhaps_none(self) -> bool:
+        """Whether the logs do not tell the process noise from none."""
+        return self.gain_of_process_noise < _LEAST_GAIN
 
 
 def fit_noise(

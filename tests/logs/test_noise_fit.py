@@ -63,7 +63,7 @@ def test_the_likelihood_is_that_of_all_outputs_at_once():
 
 def test_the_fit_maximises_the_likelihood_of_all_outputs_at_once():
     """Parameters, output noise and process noise."""
-    log = noisy_log(300, seed=3)
+    log = noisy_log(200, seed=3)
     told = replace(SETUP, noise_std=0.03, process_noise=(0.0, 2.0))
     made = fit([log], told, unknown_parameters(Oscillator(), ["k=3", "c=0.5"]), noise=True)
     found = np.array([each.value for each in made.found])

@@ -146,7 +146,9 @@ def to_paste(made: Fitted) -> list[str]:
         told = " ".join(f"{value:.4g}" for value in made.noise.noise_std)
         L = made.noise.process_noise
         diagonal = L.shape[0] == L.shape[1] and np.count_nonzero(L) == np.count_nonzero(np.diag(L))
-        if diagonal:
+        if made.noise.perhaps_none:
+            lines.append(f"as options: --noise-std {told} --process-noise 0")
+        elif diagonal:
             std = {each.name: each.std for each in made.found}
             known = [std.get(f"process noise of {name}", 0.0) for name in made.system.state_names]
             process = " ".join(
