@@ -14,7 +14,7 @@ from pinnobs_gym.estimation.live_file import damaged, read, write
 from pinnobs_gym.estimation.live_ring import Ring
 from pinnobs_gym.estimation.live_sample import Sample, check_after, sample_of
 from pinnobs_gym.estimation.live_start import check_online, check_settings, prepare, prior_of
-from pinnobs_gym.estimation.live_steps import Point, Steps, state_of, steps_of
+from pinnobs_gym.estimation.live_steps import Steps, state_of, steps_of
 from pinnobs_gym.simulation.system import System
 
 Late: TypeAlias = Literal["refuse", "replay"]
@@ -76,13 +76,12 @@ class Live:
         begun = estimator.reset(prior_of(self._system, xhat0, P0))
         self._steps: Steps = steps_of(estimator, begun)
         prepare(estimator, self._steps, begun, dt)
-        self._point: Point = begun
-        self._ring = Ring(ring, begun) if late == "replay" else None
+        self._ring = Ring(ring if late == "replay" else 0, begun)
 
     @property
     def t(self) -> float | None:
         """Time of the last sample in s; None before the first."""
-        return self._point.t
+        return self._ring.latest.t
 
     def update(
         self,
@@ -108,7 +107,7 @@ class Live:
                 or later by more than ``longest_gap``, or the model would take too many steps. The
                 filter is as it was before.
         """
-        sample, point = sample_of(self._system, t, y, u), self._point
+        sample, point = sample_of(self._system, t, y, u), self._ring.latest
         last = point.t
         if last is not None:
             if not sample.t > last:
@@ -116,9 +115,7 @@ class Live:
             if not sample.t - last <= self._longest_gap:
                 check_after(sample.t, last, self._longest_gap, self._system.time_unit)
         point = self._steps(point, sample)
-        if self._ring is not None:
-            self._ring.add(sample, point)
-        self._point = point
+        self._ring.add(sample, point)
         return Estimate(point, sample.y)
 
     def predict(self, t: float, u: Sequence[float] | np.ndarray | float | None = None) -> Estimate:
@@ -132,11 +129,12 @@ class Live:
         Raises:
             ValueError: in one line, as by `update`, or before the first sample.
         """
-        last, system = self._point.t, self._system
+        point, system = self._ring.latest, self._system
+        last = point.t
         if last is None:
             raise ValueError(f"t={t!r} is before the first sample, at which the prior holds")
         if u is None and system.measured_input and system.nu:
-            u = np.asarray(state_of(self._point).u)[0]
+            u = np.asarray(state_of(point).u)[0]
         sample = sample_of(system, t, [float("nan")] * system.ny, u)
         if not sample.t > last:
             raise ValueError(
@@ -144,19 +142,19 @@ class Live:
                 f"t={last:.15g} {system.time_unit}; expected a later time"
             )
         check_after(sample.t, last, self._longest_gap, system.time_unit)
-        return Estimate(self._steps(self._point, sample), sample.y)
+        return Estimate(self._steps(point, sample), sample.y)
 
     def _replayed(self, sample: Sample, last: float) -> Estimate:
         """Return the estimate at the time of the last sample, ``last`` in s, after a late one."""
         unit = self._system.time_unit
-        if self._ring is None:
+        if not self._ring.size:
             raise ValueError(
                 f"t={sample.t:.15g} {unit} is not after the last sample, t={last:.15g} {unit}; "
                 "expected a later one, or Live(..., late='replay')"
             )
         self._ring = self._ring.with_late(sample, self._steps, unit, self._longest_gap)
-        latest, self._point = self._ring.kept[-1]
-        return Estimate(self._point, latest.y)
+        latest, point = self._ring.kept[-1]
+        return Estimate(point, latest.y)
 
     def save(self, path: str | Path) -> None:
         """Write the filter to a file: arrays and plain values, with what the estimator and its
@@ -166,11 +164,11 @@ class Live:
             ValueError: in one line, if the file cannot be written, or the estimator remembers what
                 no file can hold.
         """
-        ring = self._ring or Ring(1, self._point)
+        ring = self._ring
         kept = [(*sample, state_of(point)) for sample, point in ring.kept]
         content = {
-            "late": "refuse" if self._ring is None else "replay",
-            "ring": ring.size,
+            "late": "replay" if ring.size else "refuse",
+            "ring": max(ring.size, 1),
             "longest_gap": self._longest_gap,
             "base": state_of(ring.base),
             "kept": [list(each) for each in kept],
@@ -197,21 +195,19 @@ class Live:
             settings = {name: content[name] for name in ("late", "ring", "longest_gap")}
             live = cls(estimator, **settings)
             kept = [(Sample(*sample), state) for *sample, state in content["kept"]]
-            live._continue(Ring(content["ring"], content["base"], kept))
+            live._continue(Ring(live._ring.size, content["base"], kept))
         except Exception as error:  # whatever an estimator makes of states that are none
             raise damaged(Path(path), error) from None
         return live
 
     def _continue(self, ring: Ring) -> None:
         """Go on from the samples and points of a file, which are tried first."""
-        system, begun = self._system, state_of(self._point)
+        system, begun = self._system, state_of(self._ring.latest)
         for point in (ring.base, *(point for _, point in ring.kept)):
             for name in ("xhat", "P"):
                 shapes = [np.shape(getattr(state, name)) for state in (point, begun)]
                 if shapes[0] != shapes[1]:
                     raise ValueError(f"{name} has shape {shapes[0]}; expected {shapes[1]}")
-        self._point = ring.latest
+        self._ring = ring
         if self.t is not None:
             self.predict(self.t + float(system.setups["benchmark"].dt))
-        if self._ring is not None:
-            self._ring = ring

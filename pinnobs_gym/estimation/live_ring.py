@@ -1,5 +1,5 @@
-"""The latest samples of a live filter with the points after them, so that a late one can be put
-where it belongs."""
+"""The point of a live filter, and its latest samples with the points after them, among which a late
+one can be put."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ class Ring:
     """The latest samples of one plant, in the order of their times.
 
     Args:
-        size: largest number of samples.
+        size: largest number of samples; 0 if none is kept.
         base: the point before the first of them.
         kept: the samples, each with the point after it.
     """
 
     def __init__(self, size: int, base: Point, kept: Iterable[tuple[Sample, Point]] = ()) -> None:
         self.size, self.base, self.kept = size, base, list(kept)
-        self._shorten()
+        while len(self.kept) > size:
+            self._drop()
 
     @property
     def latest(self) -> Point:
@@ -30,12 +31,15 @@ class Ring:
 
     def add(self, sample: Sample, point: Point) -> None:
         """Add the sample after all others, with the point after it."""
+        if not self.size:
+            self.base = point
+            return
         self.kept.append((sample, point))
-        self._shorten()
+        if len(self.kept) > self.size:
+            self._drop()
 
-    def _shorten(self) -> None:
-        while len(self.kept) > self.size:
-            self.base = self.kept.pop(0)[1]
+    def _drop(self) -> None:
+        self.base = self.kept.pop(0)[1]
 
     def with_late(self, sample: Sample, steps: Steps, unit: str, longest_gap: float) -> Ring:
         """Return the ring with a sample between the others, and all samples after it processed

@@ -21,6 +21,7 @@ from kernel_figures.timing import medians, repeated
 from pinnobs_gym import Live
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.estimator import Estimator
+from pinnobs_gym.estimation.live_ring import Ring
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
@@ -150,11 +151,11 @@ def played(
         late: as in `Live`.
     """
     live = _started(estimator, record, late=late)
-    begun = dict(vars(live))
+    size, begin = vars(live)["_ring"].size, vars(live)["_ring"].latest
     samples = [(t, y, u if given else None) for t, y, u in samples_of(record)]
 
     def play() -> None:
-        vars(live).update(begun)  # from the beginning
+        vars(live)["_ring"] = Ring(size, begin)  # from the beginning
         for t, y, u in samples:
             estimate = live.update(t, y, u)
             if read:

@@ -351,7 +351,7 @@ def test_what_an_estimator_of_ones_own_remembers_is_kept(tmp_path):
     live = Live(Many(ReverseDuffing()))
     live.update(0.5, 0.1)
     live.save(tmp_path / "x")
-    memory = Live.load(tmp_path / "x", Many(ReverseDuffing()))._point.memory
+    memory = Live.load(tmp_path / "x", Many(ReverseDuffing()))._ring.latest.memory
     first, second, rest = memory.values
     assert first is second
     assert first.flags.f_contiguous
