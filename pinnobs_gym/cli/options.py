@@ -24,7 +24,8 @@ T = TypeVar("T")
 
 
 def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any) -> T:
-    """Parse a command's options from its arguments; ``options`` are passed to `tyro.cli`.
+    """Parse a command's options from its arguments; ``options`` are passed to `tyro.cli`. Options
+    of a field that is a dataclass have no prefix.
 
     The values of an option that takes several add up if it is repeated.
 
@@ -36,6 +37,7 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
+            options |= {"config": (tyro.conf.OmitArgPrefixes,)}
             return tyro.cli(kind, prog=f"pinnobs {command}", args=arguments, **options)
     except SystemExit as end:
         if not end.code:  # help was printed

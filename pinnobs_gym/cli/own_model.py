@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -18,47 +18,46 @@ TOLERANCE = 0.1
 """Standard deviation of an unknown parameter over its value in the model, where none is given."""
 
 
-def own_model(
-    name: str,
-    *,
-    noise_std: tuple[float, ...] = (),
-    process_noise: tuple[float, ...] = (),
-    xhat0: tuple[float, ...] | None = None,
-    P0_std: tuple[float, ...] | None = None,
-    also: Sequence[str] = (),
-) -> tuple[System, Setup]:
-    """Return a system, which is registered, and its benchmark setup with what a user says of a log.
+@dataclass(frozen=True)
+class ModelOptions:
+    """What is told of the model beside its equations."""
 
-    Args:
-        name: name or ``module:Class`` of the system.
-        noise_std: standard deviations of the output noise, one for all outputs or one for each; the
-            setup's if empty.
-        process_noise: those of the process noise of the system's own states, as
-            `Setup.process_noise`; the setup's if empty.
-        xhat0: initial estimate of the system's own states; the setup's if None.
-        P0_std: its standard deviations; the setup's if None.
-        also: unknown constants as further states (`pinnobs_gym.simulation.augmented.augmented`),
-            ``NAME=mean,std`` each: a parameter, ``bias_<output>`` or ``disturbance_<state>``. A
-            parameter's ``NAME`` alone has the model's value as mean, and `TOLERANCE` of it as
-            standard deviation.
+    noise_std: tuple[float, ...] = ()
+    """Standard deviations of the output noise, one for all outputs or one for each; the
+    benchmark's if not given."""
+    process_noise: tuple[float, ...] = ()
+    """Standard deviations of the process noise after one second (of a map: after one step), in
+    state units per √s, one for all of the system's own states or one for each; the benchmark's if
+    not given."""
+    xhat0: tuple[float, ...] | None = None
+    """Initial estimate of the system's own states; the benchmark's if not given."""
+    P0_std: tuple[float, ...] | None = None
+    """Its standard deviations; the benchmark's if not given."""
+    also: tuple[str, ...] = ()
+    """Unknown constants as further states: a parameter (its value in the model, with a tenth of it
+    as standard deviation), or NAME=mean,std of a parameter, bias_OUTPUT or disturbance_STATE."""
 
-    Raises:
-        ValueError: in one line that names the value and what was expected.
-    """
-    env_id(name)  # checks and registers the user's own system
-    level = _level(noise_std) if noise_std else None
-    system, setup = SYSTEMS.resolve(name).configured(noise_std=level)
-    if process_noise:
-        setup = replace(setup, process_noise=_level(process_noise))
-        system.noise(setup.noise_std, setup.process_noise)
-    if xhat0:
-        setup = replace(setup, xhat0=xhat0)
-    if P0_std:
-        setup = replace(setup, P0=independent(*P0_std))
-    if not also:
-        return system, setup
-    larger: Any = augmented(system, **_unknowns(system, also))
-    return larger, with_constants(larger, setup)
+    def told(self, name: str) -> tuple[System, Setup]:
+        """Return the system of a name or ``module:Class``, which is registered, and its benchmark
+        setup, as told.
+
+        Raises:
+            ValueError: in one line that names the value and what was expected.
+        """
+        env_id(name)  # checks and registers the user's own system
+        level = _level(self.noise_std) if self.noise_std else None
+        system, setup = SYSTEMS.resolve(name).configured(noise_std=level)
+        if self.process_noise:
+            setup = replace(setup, process_noise=_level(self.process_noise))
+            system.noise(setup.noise_std, setup.process_noise)
+        if self.xhat0:
+            setup = replace(setup, xhat0=self.xhat0)
+        if self.P0_std:
+            setup = replace(setup, P0=independent(*self.P0_std))
+        if not self.also:
+            return system, setup
+        larger: Any = augmented(system, **_unknowns(system, self.also))
+        return larger, with_constants(larger, setup)
 
 
 def _level(values: tuple[float, ...]) -> Level:

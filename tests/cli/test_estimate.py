@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from pinnobs_gym.cli import main
-from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.batch_least_squares import BatchLeastSquares
 from pinnobs_gym.estimators.ekf import EKF
@@ -215,8 +215,8 @@ def test_also_is_augmented_with_the_users_own_noise_and_prior(folder):
         "xhat0": (0.1, 0.2),
         "P0_std": (3.0, 4.0),
     }
-    system, setup = own_model("swing_of_this_test:Swing", **told, also=["d=0.1,0.05", "k"])
-    plant, own = own_model("swing_of_this_test:Swing", **told)
+    system, setup = ModelOptions(**told, also=("d=0.1,0.05", "k")).told("swing_of_this_test:Swing")
+    plant, own = ModelOptions(**told).told("swing_of_this_test:Swing")
     by_hand = augmented(plant, {"d": Unknown(0.1, 0.05), "k": Unknown(4.0, 0.4)})
     assert type(system) is type(by_hand)
     assert system.state_names == ("p", "v", "d", "k")
@@ -233,7 +233,7 @@ def test_also_is_augmented_with_the_users_own_noise_and_prior(folder):
 
 
 def test_a_constant_of_a_setup_with_parameters_has_the_mean_that_is_given(folder):
-    plant, setup = own_model("swing_of_this_test:Swing")
+    plant, setup = ModelOptions().told("swing_of_this_test:Swing")
     system = augmented(plant, {"k": Unknown(9.0, 1.0)})
     mean = with_constants(system, replace(setup, parameters={"k": 5.0})).xhat0
     assert mean == (0.0, 0.0, 9.0)
@@ -243,7 +243,7 @@ def test_least_squares_finds_the_same_constant(folder):
     """Without process noise the last estimate of an EKF is near the least squares' one."""
     t, y, u = simulated(k=4.4)
     write(Path("log.csv"), {"t": t, "place": y, "force": u})
-    system, setup = own_model("swing_of_this_test:Swing", also=["k"])
+    system, setup = ModelOptions(also=("k",)).told("swing_of_this_test:Swing")
     log = read_log("log.csv", system, Prior.of(system, setup, 1))
     found = [
         kind.for_setup(log.system, setup).run(log.record).xhat[0, -1, 2]

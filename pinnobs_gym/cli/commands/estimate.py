@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.output import print_judgement, write_estimates, write_figure
-from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.envs.figures import state_figure
 from pinnobs_gym.estimation.estimator import BaseEstimator, Estimates
 from pinnobs_gym.estimators import ESTIMATORS
@@ -42,19 +42,8 @@ class Estimate:
     """File of the trained estimator, from pinnobs train, for one that is trained beforehand."""
     set: tuple[str, ...] = ()
     """Settings of the estimator, such as assumed_noise=0.1."""
-    also: tuple[str, ...] = ()
-    """Unknown constants to estimate as further states: a parameter (its value in the model, with a
-    tenth of it as standard deviation), or NAME=mean,std of a parameter, bias_OUTPUT or
-    disturbance_STATE."""
-    xhat0: tuple[float, ...] | None = None
-    """Initial estimate of the system's own states; the benchmark's if not given."""
-    P0_std: tuple[float, ...] | None = None
-    """Its standard deviations; the benchmark's if not given."""
-    noise_std: tuple[float, ...] = ()
-    """Standard deviations of the output noise; the benchmark's if not given."""
-    process_noise: tuple[float, ...] = ()
-    """Standard deviations of the process noise after one second (of a map: after one step), in
-    state units per √s: one for all states or one for each; the benchmark's if not given."""
+    model: ModelOptions = field(default_factory=ModelOptions)
+    """What the model is told."""
     out: Path = Path("estimates.csv")
     """File of the estimates, of several logs estimates-LOG.csv; t is in s, from the first sample on
     if the log has dates. A figure is written beside it, with the suffix .png."""
@@ -63,14 +52,7 @@ class Estimate:
 
     def run(self) -> int:
         """Estimate each log, and write the results."""
-        system, setup = own_model(
-            self.system,
-            noise_std=self.noise_std,
-            process_noise=self.process_noise,
-            xhat0=self.xhat0,
-            P0_std=self.P0_std,
-            also=self.also,
-        )
+        system, setup = self.model.told(self.system)
         kind = ESTIMATORS.resolve(self.estimator)
         if self.trained is None and kind.needs_training is not None:
             raise ValueError(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import LOG_OPTIONS, check_apart, parse, settings_of
-from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import AnyGame, Game
@@ -66,17 +66,8 @@ class Evaluate:
     states by name. Their times need not be those of the log, and empty cells do not count."""
     columns: tuple[str, ...] = ()
     """Columns of the logs under other names or in other units, such as t=millis*1e-3."""
-    noise_std: tuple[float, ...] = ()
-    """Of logs: standard deviations of the output noise; the benchmark's if not given."""
-    process_noise: tuple[float, ...] = ()
-    """Of logs: standard deviations of the process noise after one second (of a map: after one
-    step), in state units per √s; the benchmark's if not given."""
-    also: tuple[str, ...] = ()
-    """Of logs: unknown constants as further states, as pinnobs estimate has them."""
-    xhat0: tuple[float, ...] | None = None
-    """Of logs: initial estimate; the benchmark's if not given."""
-    P0_std: tuple[float, ...] | None = None
-    """Of logs: its standard deviations; the benchmark's if not given."""
+    model: ModelOptions = field(default_factory=ModelOptions)
+    """Of logs: what the model is told."""
     fresh: bool = False
     """Run all episodes, also those whose scores are stored; the new scores replace them."""
     against: Path | None = None
@@ -120,14 +111,7 @@ class Evaluate:
             raise ValueError(
                 "--against published and --log; expected a rows file with scores of the same logs"
             )
-        system, setup = own_model(
-            self.system,
-            noise_std=self.noise_std,
-            process_noise=self.process_noise,
-            xhat0=self.xhat0,
-            P0_std=self.P0_std,
-            also=self.also,
-        )
+        system, setup = self.model.told(self.system)
         game = LogGame.of(system, setup, self.log, self.reference, self.columns)
         for note in game.notes:
             console.print(note, soft_wrap=True, highlight=False)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
-from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.export.c_files import CFiles, c_files
@@ -35,15 +35,9 @@ class Export:
     """Whether numbers are of single precision; times remain double."""
     measured_input: bool = False
     """Whether the inputs are given with each sample, rather than by the equations of the model."""
-    xhat0: tuple[float, ...] | None = None
-    """Initial estimate; the benchmark's if not given."""
-    P0_std: tuple[float, ...] | None = None
-    """Its standard deviations; the benchmark's if not given."""
-    noise_std: tuple[float, ...] = ()
-    """Standard deviations of the output noise; the benchmark's if not given."""
-    process_noise: tuple[float, ...] = ()
-    """Standard deviations of the process noise after one second (of a map: after one step), in
-    state units per √s: one for all states or one for each; the benchmark's if not given."""
+
+    model: ModelOptions = field(default_factory=ModelOptions)
+    """What the model is told."""
 
     def write(self, estimator: str) -> int:
         """Write the files of an estimator, given by its name or ``module:Class``."""
@@ -55,13 +49,7 @@ class Export:
             if path.exists():
                 raise ValueError(f"{path} already exists; expected the name of a new file")
         check_writable(self.out.parent)
-        system, setup = own_model(
-            self.system,
-            noise_std=self.noise_std,
-            process_noise=self.process_noise,
-            xhat0=self.xhat0,
-            P0_std=self.P0_std,
-        )
+        system, setup = self.model.told(self.system)
         known = type(system).input is not System.input
         if system.nu and (self.measured_input or not known):
             system = replace(system, measured_input=True)

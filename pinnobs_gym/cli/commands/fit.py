@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from pinnobs_gym.cli.console import console, print_table
 from pinnobs_gym.cli.fit_figure import fit_figure
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.output import write_figure
-from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.logs.fit import Fit as Fitted
@@ -31,22 +31,18 @@ class Fit:
     system: str
     """Name or module:Class of the model."""
     log: tuple[Path, ...]
-    """CSV files. Each has an initial state of its own; the parameters are those of all."""
+    """CSV files as for pinnobs estimate. Each has an initial state of its own; the parameters are
+    those of all."""
+    columns: tuple[str, ...] = ()
+    """Columns of other names or units, such as t=millis*1e-3."""
     parameters: tuple[str, ...] = ()
     """The unknown parameters, each as k, k=START or k=START,LOW,HIGH; the search begins at the
     model's own value if none is given, and -inf or inf is no bound."""
     noise: bool = False
     """Find the noise, too: a standard deviation for each output, and the size of the model's
     process noise."""
-    xhat0: tuple[float, ...] | None = None
-    """Initial estimate; the benchmark's if not given."""
-    P0_std: tuple[float, ...] | None = None
-    """Its standard deviations; the benchmark's if not given."""
-    noise_std: tuple[float, ...] = ()
-    """Standard deviations of the output noise; the benchmark's if not given."""
-    process_noise: tuple[float, ...] = ()
-    """Standard deviations of the process noise after one second (of a map: after one step), in
-    state units per √s: one for all states or one for each; the benchmark's if not given."""
+    model: ModelOptions = field(default_factory=ModelOptions)
+    """What the model is told."""
     picture: Path = Path("fit.png")
     """File of the figure: measured and fitted outputs, and residuals."""
     out: Path | None = None
@@ -54,13 +50,7 @@ class Fit:
 
     def run(self) -> int:
         """Fit, print what was found and write the figure."""
-        system, setup = own_model(
-            self.system,
-            noise_std=self.noise_std,
-            process_noise=self.process_noise,
-            xhat0=self.xhat0,
-            P0_std=self.P0_std,
-        )
+        system, setup = self.model.told(self.system)
         if not self.parameters and not self.noise:
             listed = ", ".join(system.parameters) or "none"
             raise ValueError(
@@ -69,7 +59,9 @@ class Fit:
             )
         self._check_files()
         parameters = unknown_parameters(system, self.parameters)
-        logs = [read_log(path, system, Prior.of(system, setup, 1)) for path in self.log]
+        logs = [
+            read_log(path, system, Prior.of(system, setup, 1), self.columns) for path in self.log
+        ]
         with console.status("fit") as status:
             made = fit(
                 logs, setup, parameters, self.noise, lambda text: status.update(f"fit: {text}")

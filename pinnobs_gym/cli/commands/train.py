@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -12,7 +12,7 @@ import tyro
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import LOG_OPTIONS, by_option, check_apart, parse
 from pinnobs_gym.cli.output import write_figure
-from pinnobs_gym.cli.own_model import own_model
+from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.cli.training_task import Task, on_episodes, on_logs
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
@@ -56,17 +56,8 @@ class Train(Generic[ConfigType]):
     several of them with the same sample times. For trainers that learn from outputs alone."""
     columns: tuple[str, ...] = ()
     """Columns of the logs under other names or in other units, such as t=millis*1e-3."""
-    noise_std: tuple[float, ...] = ()
-    """Of logs: standard deviations of the output noise; the benchmark's if not given."""
-    process_noise: tuple[float, ...] = ()
-    """Of logs: standard deviations of the process noise after one second (of a map: after one
-    step), in state units per √s; the benchmark's if not given."""
-    also: tuple[str, ...] = ()
-    """Of logs: unknown constants as further states, as pinnobs estimate has them."""
-    xhat0: tuple[float, ...] | None = None
-    """Of logs: initial estimate; the benchmark's if not given."""
-    P0_std: tuple[float, ...] | None = None
-    """Of logs: its standard deviations; the benchmark's if not given."""
+    model: ModelOptions = field(default_factory=ModelOptions)
+    """Of logs: what the model is told."""
     out: Path = Path("runs/train")
     """Folder of checkpoints, trained files, figures and TensorBoard log."""
     resume: bool = False
@@ -120,14 +111,7 @@ def _task(cls: type[Trainer[Any, Any]], chosen: Train[Any]) -> Task:
     if not chosen.log:
         game = Game.of(chosen.system, chosen.setup, chosen.condition)
         return on_episodes(cls, chosen.config, game, chosen.episode, chosen.out)
-    system, setup = own_model(
-        chosen.system,
-        noise_std=chosen.noise_std,
-        process_noise=chosen.process_noise,
-        xhat0=chosen.xhat0,
-        P0_std=chosen.P0_std,
-        also=chosen.also,
-    )
+    system, setup = chosen.model.told(chosen.system)
     prior = Prior.of(system, setup, 1)
     logs = [read_log(path, system, prior, chosen.columns) for path in chosen.log]
     for note in (note for log in logs for note in log.notes):
@@ -154,7 +138,6 @@ def _chosen_training(
         f"train {spec}",
         arguments,
         default=Train(system=tyro.MISSING, config=config, preset=preset),
-        config=(tyro.conf.OmitArgPrefixes,),
         description=f"{Train.__doc__} Presets: {', '.join(cls.presets)}.",
     )
 
