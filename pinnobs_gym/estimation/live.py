@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -129,20 +129,25 @@ class Live:
         Raises:
             ValueError: in one line, as by `update`, or before the first sample.
         """
-        point, system = self._ring.latest, self._system
-        last = point.t
+        last, system = self._ring.latest.t, self._system
         if last is None:
             raise ValueError(f"t={t!r} is before the first sample, at which the prior holds")
-        if u is None and system.measured_input and system.nu:
-            u = np.asarray(state_of(point).u)[0]
-        sample = sample_of(system, t, [float("nan")] * system.ny, u)
+        sample = self._without_outputs(t, u)
         if not sample.t > last:
             raise ValueError(
                 f"t={sample.t:.15g} {system.time_unit} is not after the last sample, "
                 f"t={last:.15g} {system.time_unit}; expected a later time"
             )
         check_after(sample.t, last, self._longest_gap, system.time_unit)
-        return Estimate(self._steps(point, sample), sample.y)
+        return Estimate(self._steps(self._ring.latest, sample), sample.y)
+
+    def _without_outputs(self, t: Any, u: Any = None) -> Sample:
+        """Return a sample of which all outputs are missing; the arguments are those of
+        `predict`."""
+        system = self._system
+        if u is None and system.measured_input and system.nu:
+            u = np.asarray(state_of(self._ring.latest).u)[0]
+        return sample_of(system, t, [float("nan")] * system.ny, u)
 
     def _replayed(self, sample: Sample, last: float) -> Estimate:
         """Return the estimate at the time of the last sample, ``last`` in s, after a late one."""
@@ -202,7 +207,7 @@ class Live:
 
     def _continue(self, ring: Ring) -> None:
         """Go on from the samples and points of a file, which are tried first."""
-        system, begun = self._system, state_of(self._ring.latest)
+        begun = state_of(self._ring.latest)
         for point in (ring.base, *(point for _, point in ring.kept)):
             for name in ("xhat", "P"):
                 shapes = [np.shape(getattr(state, name)) for state in (point, begun)]
@@ -210,4 +215,6 @@ class Live:
                     raise ValueError(f"{name} has shape {shapes[0]}; expected {shapes[1]}")
         self._ring = ring
         if self.t is not None:
-            self.predict(self.t + float(system.setups["benchmark"].dt))
+            dt = float(self._system.setups["benchmark"].dt)
+            later = max(self.t + dt, float(np.nextafter(self.t, np.inf)))
+            self._steps(ring.latest, self._without_outputs(later))

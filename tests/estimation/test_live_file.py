@@ -2,6 +2,7 @@
 filter is refused."""
 
 import json
+import re
 import subprocess
 import sys
 import zipfile
@@ -70,14 +71,23 @@ def test_late_samples_are_taken_after_a_break(name, tmp_path):
         other.update(*played[4])
 
 
-def test_its_own_settings_are_kept(tmp_path):
-    live = Live(EKF(ReverseDuffing()), longest_gap=0.5)
+@pytest.mark.parametrize("gap", [0.5, 0.01, np.float64(1e9)])
+def test_its_own_settings_are_kept(gap, tmp_path):
+    """Also a gap that is shorter than the setup's time between samples."""
+    live = Live(EKF(ReverseDuffing()), longest_gap=gap, late="replay", ring=np.int64(3))
     live.update(0.0, 0.1)
     live.save(tmp_path / "x")
     other = Live.load(tmp_path / "x", EKF(ReverseDuffing()))
     assert other.t == 0.0
-    with pytest.raises(ValueError, match=r"at most longest_gap=0.5 s"):
-        other.update(0.6, 0.1)
+    with pytest.raises(ValueError, match=re.escape(f"at most longest_gap={gap:g} s")):
+        other.update(1.2 * gap, 0.1)
+
+
+def test_a_clock_of_large_numbers_is_saved(tmp_path):
+    live = Live(EKF(ReverseDuffing()))
+    live.update(1.7e18, 0.1)
+    live.save(tmp_path / "x")
+    assert Live.load(tmp_path / "x", EKF(ReverseDuffing())).t == 1.7e18
 
 
 IN_ANOTHER_PROCESS = """
