@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from benchmarks.plants.logs import Car
 
+from log_figures.recorded import Car
 from pinnobs_gym.simulation.system import Array, Setup, System, independent, stack
 
 
@@ -81,7 +81,7 @@ class Tank(System):
 
 
 class DrivenCar(Car):
-    """The car of `benchmarks.plants.logs.Car` on a drive that is drawn, with a fix in each row."""
+    """The car of `log_figures.recorded.Car` on a drive that is drawn, with a fix in each row."""
 
     setups: ClassVar = {
         "benchmark": Setup(
@@ -102,7 +102,7 @@ class DrivenCar(Car):
 
 
 class Swing(System):
-    """A linear oscillator in place of the pendulum of `benchmarks.plants.logs.Pendulum`."""
+    """A linear oscillator in place of the pendulum of `log_figures.recorded.Pendulum`."""
 
     state_names = ("theta", "omega")
     output_names = ("theta",)

@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 from benchmarks import Figure, at_least, at_most
 from benchmarks.plants.battery import Battery
-from benchmarks.plants.logs import Pendulum
 from benchmarks.plants.radar import Radar
 
 from log_figures.judged_plants import Cart, DrivenCar, Swing, Tank
+from log_figures.recorded import Pendulum
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.estimator import Estimates
 from pinnobs_gym.estimators import ESTIMATORS

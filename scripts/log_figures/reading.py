@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks import Figure, at_least, at_most, cpu_seconds
-from benchmarks.plants.logs import Car
 
+from log_figures.recorded import Car
 from pinnobs_gym.logs.formulas import parsed
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.simulation.record import Prior
@@ -86,7 +86,7 @@ def dates() -> list[str]:
 def command(log: Path, kernels: str) -> float:
     """Return the CPU time of the command in a process of its own, in s."""
     call = [sys.executable, "-m", "pinnobs_gym.cli", "estimate"]
-    call += ["--system", "benchmarks.plants.logs:Car", "--log", str(log)]
+    call += ["--system", "log_figures.recorded:Car", "--log", str(log)]
     call += ["--out", str(log.with_name("estimates.csv"))]
     own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)

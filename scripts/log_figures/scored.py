@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks import Figure, at_most
-from benchmarks.plants.logs import LOGS, Car, columns
 
+from log_figures.recorded import LOGS, Car, columns
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.scoring.evaluation import evaluate
 from pinnobs_gym.scoring.log_evaluation import evaluate_logs

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from benchmarks.plants.battery import Battery
-from benchmarks.plants.logs import Pendulum
 from benchmarks.plants.radar import Radar
 from log_figures.judged_plants import Cart, DrivenCar, Tank
 from log_figures.judgement import (
@@ -20,6 +19,7 @@ from log_figures.judgement import (
     without,
     without_input,
 )
+from log_figures.recorded import Pendulum
 
 SEEDS = range(3)
 

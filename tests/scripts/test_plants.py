@@ -4,7 +4,8 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from benchmarks.plants import battery, logs
+from benchmarks.plants import battery
+from log_figures import recorded as logs
 
 from pinnobs_gym.simulation.augmented import augmented
 

@@ -13,15 +13,15 @@ from typing import ClassVar
 
 import numpy as np
 from array_api_compat import array_namespace
-
 from benchmarks import Figure, at_most
+
 from pinnobs_gym.estimation.estimator import Estimates
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.simulation.augmented import Unknown, augmented
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Array, Setup, System, independent, stack
 
-LOGS = Path(__file__).parents[4] / "shared" / "data"
+LOGS = Path(__file__).parents[3] / "shared" / "data"
 """Folder of the logs, beside that of the project."""
 GRAVITY = (0.0, 0.0, 9.81)
 """What an accelerometer at rest measures, in earth axes (east, north, up), in m/s²."""
