@@ -5,10 +5,7 @@ import pytest
 from benchmarks.plants.battery import Battery
 from benchmarks.plants.logs import Pendulum
 from benchmarks.plants.radar import Radar
-from log_figures.judged_plants import Cart, DrivenCar, Tank
-from log_figures.judgement import (
-    DEGREES,
-    judged,
+from log_figures.changes import (
     late,
     outliers,
     output_noise,
@@ -20,6 +17,8 @@ from log_figures.judgement import (
     without,
     without_input,
 )
+from log_figures.judged_plants import Cart, DrivenCar, Tank
+from log_figures.judgement import DEGREES, judged
 
 SEEDS = range(3)
 
