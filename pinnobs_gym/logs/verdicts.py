@@ -21,6 +21,8 @@ DRIFTING = 3.0
 """Variance of means of blocks, over that of white values, from which on it matters."""
 MANY = 0.01
 """Share of values beyond the bound of outliers from which on it matters."""
+DISTURBED = 0.5
+"""Largest correlation of neighbours that single wrong outputs explain."""
 SINGLE = 3.0
 """Number of samples over which such values come together below which they are single wrong outputs,
 with what each does to the next estimates."""
@@ -90,7 +92,9 @@ class OutputTests:
         large, small = told and size.median > USUAL[1], told and size.median < USUAL[0]
         small &= self.small_tells
         far = out.chance < chance and out.share > MANY
-        if far and out.memory < SINGLE and size.median < USUAL[1] ** 2 and not (large and alike):
+        # Outliers disturb the next estimates, but do not make values much alike or much larger.
+        others = size.median < USUAL[1] ** 2 and not (alike and (large or r.value > DISTURBED))
+        if far and out.memory < SINGLE and others:
             return "outliers"
         if large:
             return ("unexplained" if alike else "noisy") if self.of_filter else "not reproduced"

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from benchmarks.plants.battery import Battery
 from benchmarks.plants.radar import Radar
-from log_figures.judged_plants import Cart, DrivenCar, Tank
-from log_figures.judgement import (
-    DEGREES,
-    judged,
+from log_figures.changes import (
     late,
     outliers,
     output_noise,
@@ -19,6 +16,8 @@ from log_figures.judgement import (
     without,
     without_input,
 )
+from log_figures.judged_plants import Cart, DrivenCar, Tank
+from log_figures.judgement import DEGREES, judged
 from log_figures.recorded import Pendulum
 
 SEEDS = range(3)
