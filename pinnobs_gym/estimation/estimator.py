@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.export.algorithm import Algorithm
+    from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 
 @dataclass(frozen=True)
@@ -178,6 +182,19 @@ class BaseEstimator(ABC):
             ValueError: in one line, if the record does not fit the system, see
                 `Record.check_fits`. The check precedes the method of any subclass.
         """
+
+    def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
+        """Return the code of the estimator beside the equations of its model, for C files (see
+        `pinnobs_gym.estimation.export.c_files`); None if it is not written as C.
+
+        Args:
+            code: the model's equations in C.
+            prior: the prior that it starts from, of one row.
+
+        Raises:
+            ValueError: in one line, if the estimator does something that the code does not.
+        """
+        return None
 
     @cached_property
     def noise(self) -> AssumedNoise:

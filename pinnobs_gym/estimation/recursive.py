@@ -5,13 +5,17 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 
 from pinnobs_gym.estimation.compiled import CompiledFilter, compiled_filter
 from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
-from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.record import Prior, Record
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.export.algorithm import Algorithm
+    from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,11 @@ class RecursiveEstimator(Estimator):
         """Return in one line why the template does not compute the same with the estimator's
         settings, an empty text if it does."""
         return ""
+
+    def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
+        from pinnobs_gym.estimation.export.filters import filter_code
+
+        return filter_code(self, code, prior) if self.template else None
 
     def ask_model(self) -> None:
         if self.compiled is None:  # compiled filters contain the model's steps

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,10 @@ from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Array, System
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.export.algorithm import Algorithm
+    from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +152,11 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
             z += y0 @ gamma0.T
             z += y @ gamma1.T
         return State(trained.inverse(z, t - first, u), t, u, memory=(z, first, y))
+
+    def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
+        from pinnobs_gym.estimation.export.kkl import kkl_code
+
+        return kkl_code(self.trained, self.system, code)
 
     def _begin(self, xhat: np.ndarray, y: np.ndarray) -> np.ndarray:
         if self.trained.start == "prior":

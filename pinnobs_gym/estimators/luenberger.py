@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,10 @@ from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.export.algorithm import Algorithm
+    from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 
 @dataclass(frozen=True)
@@ -107,3 +112,14 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
         K = injection(L, H, dt)
         xhat = xhat + (K @ innovation[..., None])[..., 0]
         return State(xhat, t, u, innovation=innovation, memory=(L, last))
+
+    def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
+        from pinnobs_gym.estimation.export.algorithm import Algorithm, model_parts, own
+
+        ny = self.system.ny
+        fields = (
+            f"@real@ innovation[{ny}]; /* outputs less their predictions; 0 where missing */",
+            f"double last[{ny}]; /* time of each output's last sample */",
+        )
+        texts = own("solve.c"), own("between.c"), own("luenberger.c")
+        return Algorithm(model_parts(code), texts, {"gain": self.designed()}, fields)

@@ -18,8 +18,8 @@ import pinnobs_gym
 from benchmarks import Figure, at_most
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.estimation.export.c_files import c_files
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.export.c_files import c_files
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pinnobs_gym.export.c_files import CFiles
+from pinnobs_gym.estimation.export.c_files import CFiles
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from export_figures.built import build, replay
-from pinnobs_gym.export.c_files import CFiles
+from pinnobs_gym.estimation.export.c_files import CFiles
 
 _HEAD = re.compile(r"\b(?:for|if|while|else if) \(")
 _OPERATOR = re.compile(r"(?<=[\w)]) ?[-+*/]=? ?(?=[\w(.-])")

@@ -5,7 +5,7 @@ import pytest
 from export_figures.built import COMPILER, FLAGS, SANITIZERS, csv_of, replay
 from export_figures.built import build as build_files
 
-from pinnobs_gym.export.c_files import c_files
+from pinnobs_gym.estimation.export.c_files import c_files
 
 needs_c = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
 

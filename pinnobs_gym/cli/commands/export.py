@@ -10,8 +10,8 @@ from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.estimation.export.c_files import CFiles, c_files
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.export.c_files import CFiles, c_files
 from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Setup, System

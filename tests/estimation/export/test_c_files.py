@@ -9,13 +9,13 @@ from exported import assert_replays, build, csv_of, needs_c, replay
 from linear import Linear, linear_record, record_of
 
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.export.c_files import c_files
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.robust_ekf import RobustEKF
 from pinnobs_gym.estimators.ukf import UKF
-from pinnobs_gym.export.c_files import c_files
 from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems import SYSTEMS
 

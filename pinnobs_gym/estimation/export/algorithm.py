@@ -20,8 +20,8 @@ class Algorithm:
     export, and ``@place@`` for the text of a place."""
 
     lanes: Sequence[str]
-    """Texts on lanes, see `pinnobs_gym.export.scalar`, with ``predict`` and ``correct`` or whatever
-    ``own`` calls."""
+    """Texts on lanes, see `pinnobs_gym.estimation.export.scalar`, with ``predict`` and ``correct``
+    or whatever ``own`` calls."""
     own: Sequence[str]
     """Texts that follow the numbers, which define ``@name@_init`` and ``advance``."""
     numbers: Mapping[str, np.ndarray]
@@ -41,7 +41,7 @@ class Algorithm:
 @cache
 def own(name: str) -> str:
     """Return the text of a file of the folder ``templates`` beside this module."""
-    return (files("pinnobs_gym.export") / "templates" / name).read_text(encoding="utf-8")
+    return (files("pinnobs_gym.estimation.export") / "templates" / name).read_text(encoding="utf-8")
 
 
 def model_parts(code: PlantCode) -> list[str]:

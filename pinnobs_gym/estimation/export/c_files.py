@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 import re
 import zlib
 from collections.abc import Mapping
@@ -13,10 +11,9 @@ from importlib.metadata import version
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.export import algorithms
-from pinnobs_gym.export.algorithm import Algorithm, own
-from pinnobs_gym.export.pruning import needed_code
-from pinnobs_gym.export.scalar import scalar, single
+from pinnobs_gym.estimation.export.algorithm import Algorithm, own
+from pinnobs_gym.estimation.export.pruning import needed_code
+from pinnobs_gym.estimation.export.scalar import scalar, single
 from pinnobs_gym.simulation.kernels.calls import plan_values
 from pinnobs_gym.simulation.kernels.plant_code import PlantCode, plant_code
 from pinnobs_gym.simulation.kernels.source import read
@@ -61,7 +58,12 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
         raise ValueError(f"name={name!r}; expected a name in C: letters, digits and underscores")
     _check_exportable(estimator)
     code = _equations(estimator.system)
-    found = _algorithm(estimator, code, prior)
+    found = estimator.exported(code, prior)
+    if found is None:
+        raise ValueError(
+            f"estimator {estimator.label!r} is not exported; expected ekf, robust_ekf, ukf, ckf, "
+            "luenberger, or a KKL observer"
+        )
     source = needed_code(_filled(_source(estimator, prior, found, code), found.places))
     if float32:
         source = single(source)
@@ -96,19 +98,6 @@ def _equations(system: System) -> PlantCode:
         raise ValueError(
             f"the equations of {type(system).__name__} cannot be traced: {what}"
         ) from None
-
-
-def _algorithm(estimator: BaseEstimator, code: PlantCode, prior: Prior) -> Algorithm:
-    """Return the algorithm of an estimator, by the first module of `algorithms` that has it."""
-    for module in pkgutil.iter_modules(algorithms.__path__):
-        found = importlib.import_module(f"{algorithms.__name__}.{module.name}")
-        made = found.algorithm(estimator, code, prior)
-        if made is not None:
-            return made
-    raise ValueError(
-        f"estimator {estimator.label!r} is not exported; expected ekf, robust_ekf, ukf, ckf, "
-        "luenberger, or a KKL observer"
-    )
 
 
 def _source(estimator: BaseEstimator, prior: Prior, found: Algorithm, code: PlantCode) -> str:

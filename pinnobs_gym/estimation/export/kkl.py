@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.estimation.export.algorithm import Algorithm, model_parts, own
 from pinnobs_gym.estimation.learned.perceptron import Layers
-from pinnobs_gym.estimators.kkl import KKL
-from pinnobs_gym.export.algorithm import Algorithm, model_parts, own
 from pinnobs_gym.simulation.kernels.plant_code import PlantCode
-from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import System
 
 _ACTIVATIONS = {
     "tanh": "tanh(a)",
@@ -20,19 +19,9 @@ _ACTIVATIONS = {
 }
 
 
-def algorithm(estimator: Any, code: PlantCode, prior: Prior) -> Algorithm | None:
-    """Return the code of an observer.
-
-    Raises:
-        ValueError: in one line, if its class changes how it works.
-    """
-    if not isinstance(estimator, KKL):
-        return None
-    if type(estimator).update is not KKL.update or type(estimator).reset is not KKL.reset:
-        raise ValueError(
-            f"{type(estimator).__name__} defines its own update, which is not exported"
-        )
-    trained, system = estimator.trained, estimator.system
+def kkl_code(trained: Any, system: System, code: PlantCode) -> Algorithm:
+    """Return the code of a trained observer, a `pinnobs_gym.estimators.kkl.TrainedKKL`, of a
+    system, whose equations are given in C."""
     nz, ny, nx = trained.dynamics.size, system.ny, system.nx
     clock = trained.clock
     step = system.setups["benchmark"].dt

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import changed_method
-from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.export.algorithm import Algorithm, own
+from pinnobs_gym.estimation.export.algorithm import Algorithm, own
 from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 from pinnobs_gym.simulation.kernels.source import filter_parts
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
 
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.recursive import RecursiveEstimator
+
 _SIGMA_POINTS = "sigma_points"
-_TEMPLATES = ("ekf", _SIGMA_POINTS)
 
 
-def algorithm(estimator: Any, code: PlantCode, prior: Prior) -> Algorithm | None:
-    """Return the code of a filter.
+def filter_code(estimator: RecursiveEstimator, code: PlantCode, prior: Prior) -> Algorithm:
+    """Return the code of a filter whose class names a template.
 
     Raises:
         ValueError: in one line, if it does something that the template does not.
     """
     cls, system = type(estimator), estimator.system
-    if not isinstance(estimator, RecursiveEstimator) or cls.template not in _TEMPLATES:
-        return None
     if changed := changed_method(cls):
         raise ValueError(f"{cls.__name__} defines {changed}, which exported code does not have")
     if reason := estimator.not_compiled():

@@ -3,8 +3,8 @@
 import pytest
 from export_figures.operations import apart, in_line
 
-from pinnobs_gym.export.pruning import needed_code
-from pinnobs_gym.export.scalar import scalar, single
+from pinnobs_gym.estimation.export.pruning import needed_code
+from pinnobs_gym.estimation.export.scalar import scalar, single
 
 
 @pytest.mark.parametrize(
