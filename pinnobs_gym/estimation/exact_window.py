@@ -28,37 +28,73 @@ class ExactWindow:
     """P̄, the covariance of x̄, shape (nx, nx, batch)."""
     start: np.ndarray
     """The current estimate of the window's first state, shape (batch, nx)."""
-    t: tuple[float, ...] = ()
-    """Times of the window's samples in s."""
-    y: tuple[np.ndarray, ...] = ()
-    """Outputs at these samples, shape (batch, ny) each."""
-    u: tuple[np.ndarray, ...] = ()
-    """Inputs at these samples, shape (batch, nu) each."""
+    t: np.ndarray | None = None
+    """Times of the window's samples in s, shape (num_samples,); None if it has none."""
+    y: np.ndarray | None = None
+    """Outputs at these samples, shape (num_samples, ny, batch)."""
+    u: np.ndarray | None = None
+    """Inputs at these samples, shape (num_samples, nu, batch)."""
+
+    @property
+    def num_samples(self) -> int:
+        """Number of samples in the window."""
+        return 0 if self.t is None else len(self.t)
+
+    def with_sample(
+        self, t: float, y: np.ndarray, u: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the times, the outputs and the inputs of the window with one more sample: y
+        (batch, ny) and u (batch, nu) at time t (s)."""
+        times = np.array([t], dtype=float)
+        outputs, inputs = (np.array(np.asarray(each).T[None], float, order="C") for each in (y, u))
+        if self.t is None or self.y is None or self.u is None:
+            return times, outputs, inputs
+        return (
+            np.concatenate([self.t, times]),
+            np.concatenate([self.y, outputs]),
+            np.concatenate([self.u, inputs]),
+        )
 
     def extended(self, t: float, y: np.ndarray, u: np.ndarray) -> ExactWindow:
-        """Return the window with one more sample."""
-        return replace(self, t=(*self.t, t), y=(*self.y, y), u=(*self.u, u))
+        """Return the window with one more sample; the arguments are those of `with_sample`."""
+        times, outputs, inputs = self.with_sample(t, y, u)
+        return replace(self, t=times, y=outputs, u=inputs)
+
+    def rows(self, rows: np.ndarray) -> ExactWindow:
+        """Return the windows of some rows of the batch."""
+        samples = (None if each is None else each[..., rows] for each in (self.y, self.u))
+        own = self.arrival[rows], self.P[..., rows], self.start[rows]
+        return ExactWindow(*own, self.t, *samples)
+
+    def _sample(self, k: int) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the time, the outputs (batch, ny) and the inputs (batch, nu) of a sample."""
+        assert self.t is not None
+        assert self.y is not None
+        assert self.u is not None
+        return float(self.t[k]), self.y[k].T, self.u[k].T
 
     def shortened(self, system: System, noise: Noise) -> ExactWindow:
         """Return the window without its first sample, with which x̄ and P̄ are updated as in an
         extended Kalman filter linearised about the estimate of the first state from all samples.
         There is a second sample."""
-        start = self.start
-        innovation, H = observe(system, self.t[0], start, self.y[0], self.u[0])
+        start, (t0, y0, u0), (t1, _, u1) = self.start, self._sample(0), self._sample(1)
+        innovation, H = observe(system, t0, start, y0, u0)
         # Update x̄ − x and P̄ with the sample, with the output linearised about x.
         offset = system.state_residual(self.arrival, start)
         innovation = innovation - mapped(H, offset)
-        offset, P, _ = joseph_update(offset, self.P, innovation, H, noise.R(self.t[0], self.y[0]))
+        offset, P, _ = joseph_update(offset, self.P, innovation, H, noise.R(t0, y0))
         # Predict x, x̄ and P̄ to the next sample, which becomes the first of the window.
-        times, inputs = (self.t[0], self.t[1]), (self.u[0], self.u[1])
-        start, P, F, _ = predict(system, times, start, P, noise, inputs)
-        return ExactWindow(start + mapped(F, offset), P, start, self.t[1:], self.y[1:], self.u[1:])
+        start, P, F, _ = predict(system, (t0, t1), start, P, noise, (u0, u1))
+        samples = (None if each is None else each[1:] for each in (self.t, self.y, self.u))
+        return ExactWindow(start + mapped(F, offset), P, start, *samples)
 
     def fit(self, system: System, noise: Noise) -> Fit:
         """Return the model's trajectory through the window from its first state, and the normal
         equations of the outputs about it."""
         X = identity(*self.start.shape[::-1])
-        return linearised(system, noise, self.t, self.y, self.u, self.start, X)
+        samples = [self._sample(k) for k in range(self.num_samples)]
+        t, y, u = zip(*samples, strict=True)
+        return linearised(system, noise, t, y, u, self.start, X)
 
     def step(self, system: System, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         """Return the Gauss-Newton step (batch, nx) of the first state x, within its bounds, and the

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
+from pinnobs_gym.estimation.compiled_window import CompiledWindow, compiled_window
 from pinnobs_gym.estimation.estimator import Estimator, Range, State
 from pinnobs_gym.estimation.exact_window import ExactWindow, innovation_covariance
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
@@ -64,6 +67,8 @@ class MHE(Estimator, GaussianEstimator):
     """Gauss-Newton steps per sample; one is the real-time iteration of Diehl et al. 2005."""
 
     name = "mhe"
+    template: ClassVar[str] = "window"
+    """The template of `pinnobs_gym.simulation.kernels` that computes the same."""
     exempt_from = {"blank_rows": "its window is a number of rows, and each of them takes a step"}
     equations = r"""
 \text{process noise: } & x_{k-N+1}, \ldots, \hat x_k = \arg\min
@@ -110,7 +115,10 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
             say_what_turns(self.label, self.system, sample, state.xhat, P, self.noise.R(t))
         if memory.exact is None:
             return self._by_all_states(memory, t, y, u)
-        after = self._by_first_state(memory, t, y, u)
+        compiled = self.compiled
+        after = None if compiled is None else compiled.update(state, t, y, u)
+        if after is None:
+            after = self.by_first_state(memory, t, y, u)
         if memory.whole is None:
             return after
         # Rows with a very wide prior: their estimates are those with roots.
@@ -142,12 +150,24 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         P = covariance(states.root[-1])
         return State(window.x[-1], t, u, P, innovation, S, replace(memory, whole=window))
 
-    def _by_first_state(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        """Return the state after a sample, if the states of windows follow from their first one."""
+    @cached_property
+    def compiled(self) -> CompiledWindow | None:
+        """The compiled code of windows whose states follow from their first one; None if they are
+        computed in NumPy."""
+        found = compiled_window(self)
+        return None if isinstance(found, str) else found
+
+    def ask_model(self) -> None:
+        if self.compiled is None:  # compiled windows contain the model's steps
+            super().ask_model()
+
+    def by_first_state(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after a sample in NumPy, if the states of windows follow from their
+        first one; compiled code has to agree with it."""
         system, noise, window = self.system, self.noise, memory.exact
         assert window is not None
         window = window.extended(t, y, u)
-        if len(window.t) > self.window:
+        if window.num_samples > self.window:
             window = window.shortened(system, noise)
         fit = window.fit(system, noise)
         # The trajectory from the previous first state ends at the prediction of this sample.

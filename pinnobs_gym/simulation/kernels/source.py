@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
@@ -14,10 +15,34 @@ _WIDE = 8
 _WIDE_FILTER = 4
 """The number in filters. A filter of eight takes a fifth less time where its results fit the cache,
 but one of a single episode, or a second library for that, takes half as long again."""
-_ALONE = ("truth", "model")
-"""Algorithms that are no filters."""
-_SMOOTHERS = {"smoother": "ekf"}
-"""Algorithms that follow a filter, with the template of that."""
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The files of which a library consists beside the plant's equations."""
+
+    entries: tuple[str, ...]
+    """Entries, which choose the number of lanes."""
+    lanes: tuple[str, ...]
+    """What is written for each number of lanes, after the parts of a filter."""
+    algorithm: str = ""
+    """Template of a filter's ``predict`` and ``correct``, or of what takes their place; empty for
+    an algorithm that is no filter."""
+    once: str = ""
+    """Text before all of these."""
+
+
+def _parts(template: str) -> _Parts:
+    """Return the files of an algorithm."""
+    if template in ("truth", "model"):
+        once = coefficients() if template == "truth" else ""
+        return _Parts((f"{template}_entry.c",), (f"{template}.c",), once=once)
+    if template == "smoother":
+        lanes = "filter_rows.c", "smoother.c"
+        return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
+    if template == "window":
+        return _Parts(("given_inputs.c", "window_entry.c"), (), template, read("window.h"))
+    return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)
 
 
 def library_source(plant: PlantCode, template: str) -> str:
@@ -28,13 +53,9 @@ def library_source(plant: PlantCode, template: str) -> str:
         plant: the equations.
         template: name of a template with an algorithm for any number of lanes, such as ``ekf``.
     """
-    alone, smooths = template in _ALONE, template in _SMOOTHERS
-    wide = _WIDE if alone else _WIDE_FILTER
-    parts = [read("common.h"), plant.once]
-    if template == "truth":
-        parts.append(coefficients())
-    if smooths:
-        parts.append("#define SMOOTHED")
+    own = _parts(template)
+    wide = _WIDE_FILTER if own.algorithm else _WIDE
+    parts = [read("common.h"), plant.once, own.once]
     for width in (1, wide):
         parts += [
             f"#undef W\n#undef AT_WIDTH\n#define W {width}\n#define AT_WIDTH(name) name##_{width}",
@@ -42,18 +63,14 @@ def library_source(plant: PlantCode, template: str) -> str:
             read("rows.h"),
             plant.lanes,
         ]
-        if not alone:
-            between = read("inputs.h"), read("marks.h")
-            parts += filter_parts(plant, _SMOOTHERS.get(template, template), between)
-            parts.append(read("filter_rows.c"))
-        if alone or smooths:
-            parts.append(read(f"{template}.c"))
+        if own.algorithm:
+            parts += filter_parts(plant, own.algorithm, (read("inputs.h"), read("marks.h")))
+        parts += map(read, own.lanes)
     called = "".join(
         f"#define {name.upper()}_WIDE {name}_rows_{wide}\n"
-        for name in ("filter", "smooth", "solve", "step", "linearise")
+        for name in ("filter", "smooth", "solve", "step", "linearise", "window")
     )
-    entry = f"{template}_entry.c" if alone or smooths else "filter.c"
-    parts += [f"#define WIDE {wide}\n{called}", read(entry), read("check.c")]
+    parts += [f"#define WIDE {wide}\n{called}", *map(read, own.entries), read("check.c")]
     return "\n".join(parts)
 
 

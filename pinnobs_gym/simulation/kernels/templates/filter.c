@@ -68,33 +68,15 @@ int64_t run(const struct call *c, int64_t *reached)
     return left;
 }
 
-/* Set u (NU,) to the inputs that the plant defines in a row. */
-static void defined_inputs(const struct plan *plan, int64_t batch, int64_t row, double t, double *u)
-{
-    double p[LP];
-    for (int i = 0; i < NP; i++) p[i] = plan->p[plan->p_rows ? i * batch + row : i];
-    plant_input(t, p, 1, u, 1);
-}
-
 /* Leave rows to NumPy, which says what is wrong, at a time between the steps of a map, and those
    whose inputs are not the ones that the plant defines. Returns 0 if there are none. */
 static int64_t mark_unusable(const struct call *c, int64_t *reached)
 {
-    const struct plan *plan = c->plan;
-    double known[LU];
     int64_t found = 0;
-    for (int64_t row = 0; row < c->batch; row++) {
-        int wrong = plan->discrete && c->t[0] != floor(c->t[0]);
-        if (NU && plan->input == 0) {
-            if (row == 0 || plan->p_rows) defined_inputs(plan, c->batch, row, c->t[0], known);
-            for (int i = 0; i < NU; i++) {
-                const double given = c->u[i * c->batch + row];
-                const double size = fmax(fabs(given), fabs(known[i]));
-                wrong |= !(fabs(given - known[i]) <= 1e-6 * size);
-            }
-        }
-        if (wrong) reached[row] = 0, found = 1;
-    }
+    for (int64_t row = 0; row < c->batch; row++)
+        if ((c->plan->discrete && c->t[0] != floor(c->t[0]))
+            || other_inputs(c->plan, c->batch, row, c->t[0], c->u))
+            reached[row] = 0, found = 1;
     return found;
 }
 

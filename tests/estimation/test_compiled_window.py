@@ -1,0 +1,113 @@
+"""Moving windows in compiled code against the same in NumPy, which is the reference."""
+
+import pickle
+from dataclasses import replace
+
+import many_plants
+import numpy as np
+import pytest
+from agreement import assert_near, assert_same
+from fake_compilers import needs_compiler
+from linear import Linear, linear_record, record_of
+
+from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.estimation.compiled_window import compiled_window
+from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.mhe import MHE
+from pinnobs_gym.simulation.noise import SampledLevel
+from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.systems.induction_motor import InductionMotor
+
+pytestmark = needs_compiler
+EXACT = [plant for plant in many_plants.PLANTS if plant is not many_plants.escape]
+
+
+def in_numpy(estimator):
+    """The same estimator without compiled code."""
+    other = replace(estimator)
+    vars(other)["compiled"] = None
+    return other
+
+
+def exact(system, record, **options):
+    """An estimator that is told that the model has no process noise."""
+    level = None if record.noise_std is None else SampledLevel(record.t, record.noise_std)
+    return MHE(system, level, 0.0, **options)
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+@pytest.mark.parametrize("options", [{}, {"window": 4, "steps": 3}, {"window": 1}])
+def test_it_agrees_with_numpy_on_each_system(name, options):
+    source = EpisodeSource(name)
+    record = record_of(source, 2).first_samples(40)
+    estimator = MHE.for_setup(source.system, source.setup, **options)
+    assert estimator.compiled is not None, compiled_window(estimator)
+    assert_near(estimator.run(record), in_numpy(estimator).run(record))
+
+
+@pytest.mark.parametrize("plant", EXACT)
+def test_it_agrees_with_numpy(plant):
+    """Irregular times, missing outputs, maps, inputs, angles, bounds, tables, wide priors."""
+    system, record = plant(7)
+    estimator = exact(system, record, window=5)
+    assert estimator.compiled is not None, compiled_window(estimator)
+    assert_near(estimator.run(record), in_numpy(estimator).run(record))
+
+
+@pytest.mark.parametrize("plant", [many_plants.cart, many_plants.bounded_reactor])
+def test_a_row_is_the_same_alone_and_in_any_batch(plant):
+    system, record = plant(9)
+    whole = exact(system, record, window=5).run(record)
+    for rows in (np.arange(1), np.arange(3, 9), np.array([0, 2, 4, 6, 8])):
+        part = record.rows(rows)
+        found = exact(system, part, window=5).run(part)
+        for name in ("xhat", "P", "innovation", "S"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(whole, name)[rows])
+
+
+def test_either_goes_on_from_a_state_of_the_other():
+    estimator, record = MHE(Linear(), window=4), linear_record(3)
+    other = in_numpy(estimator)
+    whole = other.run(record)
+    for first, second in ((estimator, other), (other, estimator)):
+        state = first.reset(record.prior)
+        for k in range(record.num_samples):
+            own = first if k < 8 else second
+            state = own.update(state, float(record.t[k]), record.y[:, k], record.u[:, k])
+            np.testing.assert_allclose(state.xhat, whole.xhat[:, k], rtol=1e-9, atol=1e-12)
+        state = pickle.loads(pickle.dumps(state))
+        np.testing.assert_allclose(state.xhat, whole.xhat[:, -1], rtol=1e-9, atol=1e-12)
+
+
+def test_a_window_over_the_record_is_the_kalman_filter():
+    """Without process noise, full information of a linear plant is what the filter has."""
+    record = linear_record(2)
+    estimator = MHE(Linear(), process_noise=0.0, assumed_noise=0.0, window=100)
+    assert estimator.compiled is not None
+    found = estimator.run(record)
+    expected = EKF(Linear(), process_noise=0.0, assumed_noise=0.0).run(record)
+    np.testing.assert_allclose(found.xhat, expected.xhat, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(found.P, expected.P, rtol=1e-6, atol=1e-12)
+
+
+def test_a_plant_with_process_noise_has_windows_in_numpy():
+    estimator = MHE(Linear(), process_noise=0.1)
+    assert estimator.compiled is None
+    assert "process noise" in compiled_window(estimator)
+
+
+def test_inputs_that_the_plant_does_not_have_are_refused():
+    estimator = MHE.for_setup(*InductionMotor.configured())
+    record = record_of(EpisodeSource("InductionMotor"), 1)
+    state = estimator.reset(record.prior)
+    for k in range(2):
+        with pytest.raises(ValueError, match=r"is not that of InductionMotor\.input"):
+            estimator.update(state, float(record.t[k]), record.y[:, k], record.u[:, k] + 1.0)
+        state = estimator.update(state, float(record.t[k]), record.y[:, k], record.u[:, k])
+    with pytest.raises(ValueError, match="expected at most 100000 between two samples"):
+        estimator.update(state, 1e9, record.y[:, 2], InductionMotor().input(np.array([1e9])))
+
+
+def test_runs_in_compiled_code_are_the_same_again():
+    estimator, record = MHE(Linear(), window=4), linear_record(3)
+    assert_same(estimator.run(record), estimator.run(record))
