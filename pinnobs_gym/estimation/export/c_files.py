@@ -12,7 +12,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.export.algorithm import Algorithm, own
-from pinnobs_gym.estimation.export.pruning import needed_code
+from pinnobs_gym.estimation.export.pruning import needed_code, needed_fields
 from pinnobs_gym.estimation.export.scalar import scalar, single
 from pinnobs_gym.simulation.kernels.calls import plan_values
 from pinnobs_gym.simulation.kernels.plant_code import PlantCode, plant_code
@@ -65,13 +65,14 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
             "luenberger, or a KKL observer"
         )
     source = needed_code(_filled(_source(estimator, prior, found, code), found.places))
+    source = needed_code(needed_fields(source))  # arrays of fields that are gone
     if float32:
         source = single(source)
     checksum = f"0x{zlib.crc32(source.encode()):08x}"
     values = _values(estimator, found, name, "float" if float32 else "double")
     values["checksum"] = checksum
     head = own("head.c").replace("@math@", "tgmath" if float32 else "math")
-    texts = [own("header.h"), f"{head}\n{source}", own("replay.c")]
+    texts = [own("header.h"), f"{head}\n{source.lstrip()}", own("replay.c")]
     header, source, replay = (_filled(_filled(text, values), values) for text in texts)
     return CFiles(name, header, source, replay, checksum)
 

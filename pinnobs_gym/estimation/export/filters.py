@@ -60,10 +60,13 @@ def filter_code(estimator: RecursiveEstimator, code: PlantCode, prior: Prior) ->
             "before": _BEFORE,
             "after": "filter->beyond = (int32_t)memory.beyond[0];\n    ",
         }
+    ekf = cls.template != _SIGMA_POINTS
+    angles = "angles.c" if ekf and system.state_period is not None else "no_angles.c"
+    bounds = "no_bounds.c" if system.state_box is None else "bounds.c"
     lanes = filter_parts(code, cls.template, (own("leaves.c"), own(f"{cls.template}.c")))
     return Algorithm(
         ["#define RESTARTS" if gate else "", *lanes],
-        [own(f"{cls.template}_after.c"), own("between.c"), own("filter.c")],
+        [own(angles), own(bounds), own("between.c"), own("filter.c")],
         numbers,
         fields,
         settings,

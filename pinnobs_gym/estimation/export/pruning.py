@@ -54,3 +54,22 @@ def needed_code(text: str) -> str:
 def _bare(text: str) -> str:
     """Return code without comments."""
     return re.sub(r"/\*.*?\*/", " ", text, flags=re.S)
+
+
+_STRUCT = re.compile(r"^struct plan \{\n(.*?)^\};\n", re.M | re.S)
+_FIELD = re.compile(r"\*?(\w+)(?=[,;])")
+
+
+def needed_fields(text: str) -> str:
+    """Return code whose ``struct plan`` has the fields that are used alone, of which each has a
+    line of its own in the initialisation."""
+    found = _STRUCT.search(text)
+    assert found is not None
+    used = set(re.findall(r"(?:->|plan\.)(\w+)", text))
+    kept = [line for line in found[1].splitlines() if set(_FIELD.findall(_bare(line))) & used]
+    unused = set(_FIELD.findall(_bare(found[1]))) - used
+    kept_names = {name for line in kept for name in _FIELD.findall(_bare(line))}
+    text = text.replace(found[1], "".join(f"{line}\n" for line in kept), 1)
+    for name in unused - kept_names:
+        text = re.sub(rf"^    \.{name} = [^\n]*\n", "", text, flags=re.M)
+    return text

@@ -18,12 +18,26 @@ _TYPE = re.compile(r"^typedef double lanes\[W\];\n#define EACH_LANE .*\n", re.M)
 _DECLARED = re.compile(
     r"(?<![\w*(] )(?<![\w*(])\blanes ((?:\w+(?:\[[^\];]*\])*(?: = [^;,]*)?,?\s*)+);"
 )
+_SENTENCE = re.compile(r"(?<=[.:])\s+(?=[A-Z`])")
+_OF_MANY = re.compile(
+    r"\b(lanes?|NumPy|batch(es)?|rows?|episodes?|W|pinnobs_gym|step_code)\b", re.I
+)
+"""Words of comments on what code for a single episode does not have."""
 _SCALAR = re.compile(r"^\w+$")
 _LITERAL = re.compile(r"(?<![\w.])(?:\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 
 
 def scalar(text: str) -> str:
     """Return code on lanes as code for a single one, whose numbers are of the type ``real``."""
+    parts = re.split(r"(/\*.*?\*/)", text, flags=re.S)  # code and comments in turn
+    parts[1::2] = [_comment(part) for part in parts[1::2]]
+    parts[::2] = [_code(part) for part in parts[::2]]
+    lines = "".join(parts).splitlines()
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(line.rstrip() for line in lines) + "\n")
+
+
+def _code(text: str) -> str:
+    """Return code without comments for a single lane."""
     text = _TYPE.sub("", text)
     text = _NAME.sub(r"\1", text)
     text = _ALIAS.sub("", text)
@@ -32,6 +46,13 @@ def scalar(text: str) -> str:
     text = re.sub(r"(?<!typedef )\bdouble\b", "real", text)
     text = text.replace("][l]", "]").replace("[l]", "[0]").replace("[W]", "[1]")
     return text.replace("EACH_LANE ", "")
+
+
+def _comment(text: str) -> str:
+    """Return a comment without the sentences on what this code does not have."""
+    body = text[2:-2].strip()
+    kept = [part for part in _SENTENCE.split(body) if not _OF_MANY.search(part)]
+    return f"/* {' '.join(kept)} */" if kept else ""
 
 
 def _declared(found: re.Match[str]) -> str:

@@ -21,7 +21,21 @@ from pinnobs_gym.estimation.export.scalar import scalar, single
     ],
 )
 def test_lanes_become_numbers(lanes, expected):
-    assert scalar(lanes) == expected
+    assert scalar(lanes) == expected + "\n"
+
+
+def test_comments_on_many_episodes_are_left_out():
+    lines = (
+        "/* Lower triangular L with L L^T = P. Lanes without one are marked. */",
+        "double f(double a); /* the double of a */",
+        "/* What NumPy does in each row */",
+    )
+    found = scalar("\n".join(lines)).split("\n")
+    assert found[:2] == [
+        "/* Lower triangular L with L L^T = P. */",
+        "real f(real a); /* the double of a */",
+    ]
+    assert not any(found[2:])
 
 
 def test_literals_of_single_precision():

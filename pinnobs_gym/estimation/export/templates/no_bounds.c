@@ -1,5 +1,3 @@
-static void after_prediction(const struct plan *plan, real *P) { (void)plan, (void)P; }
-
 static void after_correction(const struct plan *plan, real *x, const real *P)
 {
     (void)plan, (void)x, (void)P;
