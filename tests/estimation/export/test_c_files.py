@@ -1,6 +1,7 @@
 """Exported estimators against the same in Python, under sanitizers and with all warnings."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import many_plants
 import numpy as np
@@ -16,7 +17,7 @@ from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.robust_ekf import RobustEKF
 from pinnobs_gym.estimators.ukf import UKF
-from pinnobs_gym.simulation.system import stack
+from pinnobs_gym.simulation.system import Setup, System, stack
 from pinnobs_gym.systems import SYSTEMS
 
 pytestmark = needs_c
@@ -71,6 +72,30 @@ def test_plants_of_many_kinds(plant, tmp_path):
     # Bounds that are met are the work of NumPy here, whose sums have another order.
     tolerance = 1e-12 if system.state_box is None else 1e-9
     assert_replays(build(tmp_path, estimator, record.prior), estimator, record, tolerance)
+
+
+@dataclass(frozen=True)
+class Chain(System):
+    """Seven masses in a row, the last one measured: more states than straight code is written
+    for."""
+
+    state_names = tuple(f"x{i}" for i in range(7))
+    output_names = ("end",)
+    scale = (1.0,) * 7
+    setups: ClassVar = {"benchmark": Setup((-1,) * 7, (1,) * 7, dt=0.1, noise_std=0.1)}
+
+    def f(self, t, x, u):
+        ahead = [x[..., (i + 1) % 7] - x[..., i] for i in range(7)]
+        return stack(x, *(d - 0.3 * x[..., i] ** 3 for i, d in enumerate(ahead)))
+
+    def h(self, t, x, u):
+        return x[..., 6:]
+
+
+@pytest.mark.parametrize("kind", [EKF, UKF])
+def test_a_plant_with_many_states(kind, tmp_path):
+    estimator, record = kind(Chain()), record_of(EpisodeSource(Chain), 1).first_samples(50)
+    assert_replays(build(tmp_path, estimator, record.prior), estimator, record, 1e-12)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ static inline void AT_WIDTH(runge_kutta)(const struct rk_step *s, const lanes *p
         if (q == 0) memcpy(point, x, sizeof point);
         else
             for (int i = 0; i < NX; i++) EACH_LANE point[i][l] = part[q] * k[q - 1][i][l] + x[i][l];
-        AT_WIDTH(plant_f)(s->t[STAGE[q]], point, s->u[STAGE[q]], p, k[q]);
+        AT_WIDTH(plant_f)((const double *)(s->t + STAGE[q]), point, s->u[STAGE[q]], p, k[q]);
     }
     for (int i = 0; i < NX; i++)
         EACH_LANE x[i][l] += h / 6 * ((k[1][i][l] + k[2][i][l]) * 2 + k[0][i][l] + k[3][i][l]);
@@ -28,7 +28,8 @@ static inline void AT_WIDTH(runge_kutta_linearised)(const struct rk_step *s, con
         if (q == 0) memcpy(point, x, sizeof point);
         else
             for (int i = 0; i < NX; i++) EACH_LANE point[i][l] = part[q] * k[q - 1][i][l] + x[i][l];
-        AT_WIDTH(plant_f_linearised)(s->t[STAGE[q]], point, s->u[STAGE[q]], p, k[q],
+        AT_WIDTH(plant_f_linearised)((const double *)(s->t + STAGE[q]), point,
+                                     s->u[STAGE[q]], p, k[q],
                                      q == 0 ? A_first : q == 3 ? A_last : A);
         if (q == 0) { /* Phi = I at the start */
             memcpy(K, A_first, sizeof K);
