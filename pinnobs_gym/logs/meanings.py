@@ -128,10 +128,14 @@ def early_facts(tests: Sequence[OutputTests]) -> list[str]:
 
 def _seen(tests: OutputTests, verdict: str) -> str:
     """Return the numbers that a verdict rests on, in words."""
-    if verdict in ("outliers", "bursts"):
-        share = f"{100 * tests.outliers.share:.2g} % of its samples"
-        span = "" if verdict == "outliers" else f", t = {tests.when[0]:.6g} to {tests.when[1]:.6g}"
-        return f"{tests.name} ({share}{span})"
+    out = tests.outliers
+    if verdict == "outliers":
+        share = f"{100 * out.single:.2g} % of its samples"
+        worst = f"{_rounded(out.largest)} standard deviations at t = {tests.when[2]:.6g}"
+        return f"{tests.name} ({share}, the largest {worst})"
+    if verdict == "bursts":
+        share = f"{100 * out.share:.2g} % of its samples"
+        return f"{tests.name} ({share}, t = {tests.when[0]:.6g} to {tests.when[1]:.6g})"
     if verdict == "driven":
         return f"{tests.name} (correlation {tests.driven.value:.2f} with {tests.driven.input_name})"
     parts = [f"squares {_rounded(tests.size.median)} times the expected"]

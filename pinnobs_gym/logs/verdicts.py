@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pinnobs_gym.logs.innovation_tests import Correlation, Drift, Outliers, Size
+from pinnobs_gym.logs.innovation_tests import Correlation, Drift, Size
 from pinnobs_gym.logs.input_tests import Driven
+from pinnobs_gym.logs.outlier_tests import Outliers
 
 CHANCE = 1e-4
 """Probability, over all outputs, below which something is not taken for chance."""
@@ -21,6 +22,9 @@ DRIFTING = 3.0
 """Variance of means of blocks, over that of white values, from which on it matters."""
 MANY = 0.01
 """Share of values beyond the bound of outliers from which on it matters."""
+EXTREME = 20.0
+"""Standard deviations of a value from which on even a single one matters: the next estimate is off
+by more than its own standard deviations say, unless outputs hardly move it."""
 DISTURBED = 0.5
 """Largest correlation of neighbours that single wrong outputs explain."""
 SINGLE = 3.0
@@ -46,8 +50,8 @@ class OutputTests:
     """That of means of blocks."""
     outliers: Outliers
     """Those among them."""
-    when: tuple[float, float]
-    """Times of the first and the last outlier."""
+    when: tuple[float, float, float]
+    """Times of the first, the last and the largest outlier."""
     driven: Driven
     """How well an input tells the values."""
     small_tells: bool
@@ -79,6 +83,7 @@ class OutputTests:
         chances = [self.drift.chance, self.driven.chance]
         chances += [self.correlation.chance] if self.correlation.value > 0 else []
         usual = USUAL[0] <= self.size.median <= USUAL[1] and self.outliers.share <= MANY
+        usual &= self.outliers.largest <= EXTREME
         return usual and min(chances) >= _HINT
 
     def _verdict(self, chance: float) -> str:
@@ -92,6 +97,7 @@ class OutputTests:
         large, small = told and size.median > USUAL[1], told and size.median < USUAL[0]
         small &= self.small_tells
         far = out.chance < chance and out.share > MANY
+        far |= out.largest > EXTREME
         # Outliers disturb the next estimates, but do not make values much alike or much larger.
         others = size.median < USUAL[1] ** 2 and not (alike and (large or r.value > DISTURBED))
         if far and out.memory < SINGLE and others:
