@@ -96,11 +96,10 @@ class Fit:
         print_table([[table(made.found)]])
         for name, own in zip(made.system.output_names, made.residuals, strict=True):
             if math.isfinite(own.ratio):
-                console.print(
-                    f"residuals of {name}: {own.ratio:.3g} of the expected size, correlation "
-                    f"{own.serial:.2f} from one sample to the next",
-                    soft_wrap=True,
-                )
+                line = f"residuals of {name}: {own.ratio:.3g} of the expected size"
+                if math.isfinite(own.serial):
+                    line += f", correlation {own.serial:.2f} from one sample to the next"
+                console.print(line, soft_wrap=True)
         for warning in made.warnings:
             console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
         for line in to_paste(made):
