@@ -18,6 +18,7 @@ from pinnobs_gym.logs.input_tests import driven_by
 from pinnobs_gym.logs.meanings import early_facts, warnings_of
 from pinnobs_gym.logs.normalised import Normalised, normalised
 from pinnobs_gym.logs.outlier_tests import outliers_of
+from pinnobs_gym.logs.times import instant
 from pinnobs_gym.logs.unseen import Seen, seen
 from pinnobs_gym.logs.verdicts import OutputTests
 from pinnobs_gym.simulation.record import Record
@@ -111,12 +112,12 @@ def _tests_of(
         correlation_of(values, t),
         drift_of(values),
         outliers,
-        (float(t[outliers.first]), float(t[outliers.last]), float(t[outliers.worst])),
+        tuple(instant(t[k], record.t) for k in (outliers.first, outliers.last, outliers.worst)),
         driven_by(values, rows, record.u[0], system.input_names),
         bool(found.small_tells[i]),
         bool(found.white[i]),
         found.of_filter,
-        float(t[0]),
+        instant(t[0], record.t),
     )
 
 
@@ -126,7 +127,8 @@ def _unseen(system: System, told: Seen, estimates: Estimates) -> list[str]:
         return []
     return [
         f"{', '.join(names)}: the variance never fell, as these outputs tell nothing of it; the "
-        "estimate is the model's alone; measure more, or fix it by a small --P0-std"
+        "estimate is the model's alone; measure more, or fix it by a small standard deviation "
+        "(--P0-std, or that of a constant in --also)"
     ]
 
 
@@ -170,4 +172,4 @@ def _diverged(system: System, record: Record, estimates: Estimates, fits: bool) 
 
 def _not_finite(record: Record, estimates: Estimates) -> str:
     k = int(np.flatnonzero(~np.isfinite(estimates.xhat[0]).all(axis=1))[0])
-    return f"the estimates leave the finite numbers at t = {record.t[k]:.6g}"
+    return f"the estimates leave the finite numbers at t = {instant(record.t[k], record.t)}"

@@ -50,7 +50,7 @@ class OutputTests:
     """That of means of blocks."""
     outliers: Outliers
     """Those among them."""
-    when: tuple[float, float, float]
+    when: tuple[str, ...]
     """Times of the first, the last and the largest outlier."""
     driven: Driven
     """How well an input tells the values."""
@@ -60,7 +60,7 @@ class OutputTests:
     """Whether values of a right model are uncorrelated."""
     of_filter: bool
     """Whether these are innovations with covariances; otherwise residuals."""
-    begin: float
+    begin: str
     """Time of the first value."""
     later: OutputTests | None = None
     """The tests of the second half of the values, if they are enough."""
@@ -89,12 +89,15 @@ class OutputTests:
     def _verdict(self, chance: float) -> str:
         """Return the verdict on all values; see `verdict`."""
         size, r, out = self.size, self.correlation, self.outliers
-        alike = self.white and r.chance < chance and r.value > CORRELATED
+        lasting = r.chance < chance and r.value > CORRELATED
+        alike = self.white and lasting
         alike |= self.white and self.drift.chance < chance and self.drift.ratio > DRIFTING
         opposite = self.of_filter and r.chance < chance and r.value < -CORRELATED
         # Values that are alike are few independent ones, but already told by their likeness.
         told = alike or size.chance < chance
-        large, small = told and size.median > USUAL[1], told and size.median < USUAL[0]
+        # Residuals as large as the noise may last, but not larger ones, as noise is white.
+        large, small = told or lasting, told and size.median < USUAL[0]
+        large &= size.median > USUAL[1]
         small &= self.small_tells
         far = out.chance < chance and out.share > MANY
         far |= out.largest > EXTREME

@@ -189,6 +189,17 @@ def test_covariances_that_are_none_are_left_out():
     assert warned(record, replace(estimates, S=S)) == ()
 
 
+def test_slow_residuals_that_exceed_white_noise_are_told_of_few_samples():
+    """Estimates at zero, without covariances, of outputs that walk with twice the noise."""
+    walks = summed(right(300)[1], 0.99).innovation[0]
+    y = 0.2 * walks / np.sqrt(np.mean(walks**2, axis=0))
+    record = replace(right(300)[0], y=y[None])
+    (line,) = warned(record, Estimates(np.zeros((1, 300, 2))))
+    assert "estimates differ from the outputs by more than the noise" in line
+    small = replace(record, y=record.y / 4)  # within the noise, as of a right model
+    assert warned(small, Estimates(np.zeros((1, 300, 2)))) == ()
+
+
 def test_estimates_far_away_or_not_finite_are_told():
     record, estimates = right(200)
     estimates.xhat[0, 7, 1] = -2e3
