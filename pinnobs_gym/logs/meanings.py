@@ -56,8 +56,8 @@ MEANINGS = {
     ),
     "outliers": (
         "single outputs are far beyond their noise",
-        "these are outliers, not a wrong noise; try --estimator robust_ekf, or leave their cells "
-        "empty",
+        "these are outliers, or a filter that fails at times, not a wrong noise; compare with "
+        "--estimator ukf, and for outliers try --estimator robust_ekf, or leave their cells empty",
     ),
     "bursts": (
         "{values} far beyond the others come together",
