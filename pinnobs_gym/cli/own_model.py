@@ -50,6 +50,12 @@ class ModelOptions:
         if self.process_noise:
             setup = replace(setup, process_noise=_level(self.process_noise))
             system.noise(setup.noise_std, setup.process_noise)
+        for option, values in (("--xhat0", self.xhat0), ("--P0-std", self.P0_std)):
+            if values is not None and len(values) != system.nx:
+                raise ValueError(
+                    f"{option} has {len(values)} number(s); expected {system.nx}, one for each of "
+                    f"{', '.join(system.state_names)}"
+                )
         if self.xhat0:
             setup = replace(setup, xhat0=self.xhat0)
         if self.P0_std:

@@ -7,6 +7,7 @@ import numpy as np
 from pinnobs_gym.logs.innovation_tests import CONFIDENCE, Size
 from pinnobs_gym.logs.meanings import NAMED
 from pinnobs_gym.logs.normalised import Normalised
+from pinnobs_gym.logs.times import instant
 from pinnobs_gym.logs.unseen import Seen
 from pinnobs_gym.logs.verdicts import OutputTests
 from pinnobs_gym.simulation.record import Record
@@ -47,7 +48,8 @@ def common_facts(system: System, setup: Setup, record: Record) -> tuple[str, ...
         k = int(np.argmax(steps))
         lines.append(
             f"steps of t: median {np.median(steps):.4g} {unit}, smallest {steps.min():.4g}, "
-            f"largest {steps[k]:.4g} after t = {record.t[k]:.6g}; the setup has {setup.dt:g} {unit}"
+            f"largest {steps[k]:.4g} after t = {instant(record.t[k], record.t)}; the setup has "
+            f"{setup.dt:g} {unit}"
         )
     share = np.isnan(record.y[0]).mean(axis=0)
     named = zip(system.output_names, share, strict=True)

@@ -15,6 +15,8 @@ _CLOSE = 0.95
 """Correlation of two estimates, in size, from which on it is told."""
 _USUAL = (0.5, 2.0)
 """Range of the residuals over their expected standard deviation."""
+_TAIL = 2.0
+"""Root mean square of residuals over their robust standard deviation from which on it is told."""
 _SERIAL = 0.3
 """Correlation of residuals from one sample to the next, in size, from which on it is told."""
 
@@ -79,6 +81,13 @@ def doubts_of_residuals(
         lines.append(
             f"residuals over the noise that is told: {', '.join(small)}; it is told too large, and "
             "standard errors are those of the told noise"
+        )
+    if far := [(name, own) for name, own in named if own.far and own.tail > _TAIL]:
+        parts = [f"{100 * own.far:.2g} % of {name} ({own.tail:.2g} times)" for name, own in far]
+        lines.append(
+            f"residuals far beyond the others: {', '.join(parts)} make the root mean square that "
+            "many times as large as of the rest; outliers, or a model that fails at times, decide "
+            "what was found; leave the cells of outliers empty"
         )
     if serial := [(name, own.serial) for name, own in named if abs(own.serial) > _SERIAL]:
         lines.append(_of_serial(serial, larger is not None))

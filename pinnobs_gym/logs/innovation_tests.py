@@ -14,8 +14,6 @@ import numpy as np
 
 CONFIDENCE = 0.95
 """Probability of the bands that are shown."""
-FAR = 1e-3
-"""Probability of a value beyond the bound from which on it may be an outlier."""
 _BOUNDED = 3.0
 """Number of robust standard deviations to which values are cut for correlations."""
 _LONGEST_STEP = 2.0
@@ -60,23 +58,6 @@ class Drift:
     """Number of values in a block."""
     chance: float
     """Probability of a ratio so large, over all lengths tried."""
-
-
-@dataclass(frozen=True)
-class Outliers:
-    """Values far beyond the others."""
-
-    share: float
-    """Their share; `FAR` is expected."""
-    memory: float
-    """Number of samples over which they come together, n over `effective_number`; 1 if each comes
-    by itself."""
-    first: int
-    """Index of the first."""
-    last: int
-    """Index of the last."""
-    chance: float
-    """Probability of so many of them, or more, among independent normal values."""
 
 
 def size_of(squares: np.ndarray, degrees: np.ndarray) -> Size:
@@ -165,21 +146,7 @@ def drift_of(values: np.ndarray) -> Drift:
     return Drift(largest.ratio, largest.length, chance)
 
 
-def outliers_of(values: np.ndarray) -> Outliers:
-    """Return the share of values (n,) that are, by their robust standard deviation, beyond the
-    bound of a normal value with probability `FAR`, of which the number is binomial."""
-    from scipy.special import bdtrc, ndtri
-
-    far = abs(values) > float(ndtri(1 - FAR / 2)) * _robust_std(values)
-    rows = np.flatnonzero(far)
-    if not len(rows):
-        return Outliers(0.0, 1.0, 0, 0, 1.0)
-    chance = float(bdtrc(len(rows) - 1, len(values), FAR))
-    memory = len(values) / effective_number(far)
-    return Outliers(float(far.mean()), memory, int(rows[0]), int(rows[-1]), chance)
-
-
-def _robust_std(values: np.ndarray) -> float:
+def robust_std(values: np.ndarray) -> float:
     """Return the standard deviation of normal values of mean zero, from their median size."""
     return float(np.median(abs(values))) / 0.6745
 
@@ -187,5 +154,5 @@ def _robust_std(values: np.ndarray) -> float:
 def bounded(values: np.ndarray) -> np.ndarray:
     """Return values cut at some robust standard deviations, so that outliers do not hide the
     correlation of the others."""
-    most = _BOUNDED * _robust_std(values)
+    most = _BOUNDED * robust_std(values)
     return np.clip(values, -most, most) if most > 0 else values

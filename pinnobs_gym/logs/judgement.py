@@ -12,12 +12,13 @@ from pinnobs_gym.logs.innovation_tests import (
     Size,
     correlation_of,
     drift_of,
-    outliers_of,
     size_of,
 )
 from pinnobs_gym.logs.input_tests import driven_by
 from pinnobs_gym.logs.meanings import early_facts, warnings_of
 from pinnobs_gym.logs.normalised import Normalised, normalised
+from pinnobs_gym.logs.outlier_tests import outliers_of
+from pinnobs_gym.logs.times import instant
 from pinnobs_gym.logs.unseen import Seen, seen
 from pinnobs_gym.logs.verdicts import OutputTests
 from pinnobs_gym.simulation.record import Record
@@ -25,6 +26,8 @@ from pinnobs_gym.simulation.system import Setup, System, vector
 
 _FAR = 1e3
 """Distance of an estimate from the prior's mean, in scales, from which on it counts as diverged."""
+_KNOWN = 0.1
+"""Standard deviation over that distance below which the estimate of such a state is a known one."""
 _ENOUGH = 100
 """Least number of samples of its second half by which a log may fit later."""
 _UNLIKELY = 6.0
@@ -65,7 +68,9 @@ def judge(system: System, setup: Setup, record: Record, estimates: Estimates) ->
     told = seen(system, setup, record, estimates)
     facts = [*innovation_facts(found, tests, together), *early_facts(tests)]
     facts += common_facts(system, setup, record)
-    warnings = [*_diverged(system, record, estimates), *warnings_of(tests, together)]
+    warnings = warnings_of(tests, together)
+    fits = bool(tests) and not warnings
+    warnings = [*_diverged(system, record, estimates, fits), *warnings]
     warnings += _first(system, record, found)
     if told is not None:
         facts.append(state_fact(system, told))
@@ -107,12 +112,12 @@ def _tests_of(
         correlation_of(values, t),
         drift_of(values),
         outliers,
-        (float(t[outliers.first]), float(t[outliers.last])),
+        tuple(instant(t[k], record.t) for k in (outliers.first, outliers.last, outliers.worst)),
         driven_by(values, rows, record.u[0], system.input_names),
         bool(found.small_tells[i]),
         bool(found.white[i]),
         found.of_filter,
-        float(t[0]),
+        instant(t[0], record.t),
     )
 
 
@@ -122,7 +127,8 @@ def _unseen(system: System, told: Seen, estimates: Estimates) -> list[str]:
         return []
     return [
         f"{', '.join(names)}: the variance never fell, as these outputs tell nothing of it; the "
-        "estimate is the model's alone; measure more, or fix it by a small --P0-std"
+        "estimate is the model's alone; measure more, or fix it by a small standard deviation "
+        "(--P0-std, or that of a constant in --also)"
     ]
 
 
@@ -144,9 +150,17 @@ def _first(system: System, record: Record, found: Normalised) -> list[str]:
     ]
 
 
-def _diverged(system: System, record: Record, estimates: Estimates) -> list[str]:
+def _diverged(system: System, record: Record, estimates: Estimates, fits: bool) -> list[str]:
+    """Return whether an estimate is so far from the start that it has probably diverged. A plant
+    may go far, too: where the innovations fit, a state that is known well is where it is said to
+    be."""
     xhat = estimates.xhat[0]
     far = abs(xhat - record.prior.mean[0]) / vector(system.scale, system.nx, "scale")
+    if fits and estimates.P is not None:
+        with np.errstate(all="ignore"):
+            std = np.sqrt(np.einsum("kii->ki", estimates.P[0]))
+        known = std < _KNOWN * abs(xhat - record.prior.mean[0])
+        far = np.where(known, 0.0, far)
     k, i = np.unravel_index(np.argmax(far), far.shape)
     if far[k, i] <= _FAR:
         return []
@@ -158,4 +172,4 @@ def _diverged(system: System, record: Record, estimates: Estimates) -> list[str]
 
 def _not_finite(record: Record, estimates: Estimates) -> str:
     k = int(np.flatnonzero(~np.isfinite(estimates.xhat[0]).all(axis=1))[0])
-    return f"the estimates leave the finite numbers at t = {record.t[k]:.6g}"
+    return f"the estimates leave the finite numbers at t = {instant(record.t[k], record.t)}"

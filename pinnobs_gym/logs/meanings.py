@@ -56,8 +56,8 @@ MEANINGS = {
     ),
     "outliers": (
         "single outputs are far beyond their noise",
-        "these are outliers, not a wrong noise; try --estimator robust_ekf, or leave their cells "
-        "empty",
+        "these are outliers, or a filter that fails at times, not a wrong noise; compare with "
+        "--estimator ukf, and for outliers try --estimator robust_ekf, or leave their cells empty",
     ),
     "bursts": (
         "{values} far beyond the others come together",
@@ -113,7 +113,7 @@ def early_facts(tests: Sequence[OutputTests]) -> list[str]:
     """Return a line on outputs that fit from the second half of their values on only. A filter that
     has to find the state from a wide prior first is no fault of a log."""
     early = [
-        f"{each.name} before t = {each.later.begin:.6g}"
+        f"{each.name} before t = {each.later.begin}"
         for each in tests
         if each.later is not None and each.verdict(CHANCE / len(tests)) == "early"
     ]
@@ -128,10 +128,14 @@ def early_facts(tests: Sequence[OutputTests]) -> list[str]:
 
 def _seen(tests: OutputTests, verdict: str) -> str:
     """Return the numbers that a verdict rests on, in words."""
-    if verdict in ("outliers", "bursts"):
-        share = f"{100 * tests.outliers.share:.2g} % of its samples"
-        span = "" if verdict == "outliers" else f", t = {tests.when[0]:.6g} to {tests.when[1]:.6g}"
-        return f"{tests.name} ({share}{span})"
+    out = tests.outliers
+    if verdict == "outliers":
+        share = f"{100 * out.single:.2g} % of its samples"
+        worst = f"{_rounded(out.largest)} standard deviations at t = {tests.when[2]}"
+        return f"{tests.name} ({share}, the largest {worst})"
+    if verdict == "bursts":
+        share = f"{100 * out.share:.2g} % of its samples"
+        return f"{tests.name} ({share}, t = {tests.when[0]} to {tests.when[1]})"
     if verdict == "driven":
         return f"{tests.name} (correlation {tests.driven.value:.2f} with {tests.driven.input_name})"
     parts = [f"squares {_rounded(tests.size.median)} times the expected"]

@@ -94,10 +94,18 @@ def fit_noise(
         progress: is told in a few words what is being done.
 
     Raises:
-        ValueError: in one line, if the filter's estimates are not finite at any of the first
-            values.
+        ValueError: in one line, if the logs have no more outputs than there are unknowns, or if
+            the filter's estimates are not finite at any of the first values.
     """
-    likelihood = _Likelihood(FilterRows(logs, setup, parameters, noise), parameters)
+    filters = FilterRows(logs, setup, parameters, noise)
+    outputs = sum(int(np.count_nonzero(~np.isnan(log.record.y))) for log in logs)
+    if outputs <= sum(filters.sizes):
+        p, r, q = filters.sizes
+        raise ValueError(
+            f"the logs have {outputs} output(s) in all; expected more than the {p + r + q} "
+            f"unknown(s): {p} parameter(s) and {r + q} of the noise"
+        )
+    likelihood = _Likelihood(filters, parameters)
     progress("first values")
     v = likelihood.first(starts)
     count = 0

@@ -7,12 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pinnobs_gym.logs.innovation_tests import robust_std
+from pinnobs_gym.logs.outlier_tests import outliers_of
 from pinnobs_gym.simulation.matrices import cholesky
 
 _LOST = 1e-10
 """Eigenvalue of the scaled information below which the logs say nothing of a direction."""
 _SHARE = 0.1
 """Share of an unknown in such a direction, squared, from which it is named."""
+_CHANCE = 1e-4
+"""Probability of so many residuals far beyond the others below which they are not chance."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,10 @@ class Residuals:
     """Their root mean square over the expected standard deviation; NaN without any output."""
     serial: float
     """Their correlation from one sample to the next; NaN if there are too few."""
+    far: float
+    """Share of those far beyond the others, zero where they may be chance."""
+    tail: float
+    """Their root mean square over that of normal values with the same median size; 1 if unknown."""
 
 
 def residuals_of(whitened: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> list[Residuals]:
@@ -65,19 +73,27 @@ def residuals_of(whitened: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> lis
             (num_samples, ny).
         y: outputs, of the same shape; NaN marks a missing one.
     """
-    found = []
-    for j in range(y[0].shape[1]):
-        squares, products, count, pairs = 0.0, 0.0, 0, 0
-        for r, outputs in zip(whitened, y, strict=True):
-            present = ~np.isnan(outputs[:, j])
-            both = present[1:] & present[:-1]
-            squares += float((r[present, j] ** 2).sum())
-            products += float((r[1:, j] * r[:-1, j])[both].sum())
-            count, pairs = count + int(present.sum()), pairs + int(both.sum())
-        ratio = float(np.sqrt(squares / count)) if count else np.nan
-        serial = products / pairs * count / squares if pairs > 2 and squares else np.nan
-        found.append(Residuals(ratio, serial))
-    return found
+    return [
+        _residuals([r[:, j] for r in whitened], [~np.isnan(each[:, j]) for each in y])
+        for j in range(y[0].shape[1])
+    ]
+
+
+def _residuals(whitened: Sequence[np.ndarray], present: Sequence[np.ndarray]) -> Residuals:
+    """Return what the residuals of an output, present or not in each log, say."""
+    products, pairs = 0.0, 0
+    for r, known in zip(whitened, present, strict=True):
+        both = known[1:] & known[:-1]
+        products += float((r[1:] * r[:-1])[both].sum())
+        pairs += int(both.sum())
+    values = np.concatenate([r[known] for r, known in zip(whitened, present, strict=True)])
+    if not len(values):
+        return Residuals(np.nan, np.nan, 0.0, 1.0)
+    squares, outliers, usual = float(values @ values), outliers_of(values), robust_std(values)
+    ratio = float(np.sqrt(squares / len(values)))
+    serial = products / pairs * len(values) / squares if pairs > 2 and squares else np.nan
+    far = outliers.share if outliers.chance < _CHANCE else 0.0
+    return Residuals(ratio, serial, far, ratio / usual if usual > 0 else 1.0)
 
 
 def whitened_innovations(y: np.ndarray, e: np.ndarray, S: np.ndarray) -> np.ndarray:

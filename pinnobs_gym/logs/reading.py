@@ -72,7 +72,7 @@ def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[s
     outputs = [values[f"y{i + 1}"] for i in range(system.ny)]
     y = np.stack(outputs, axis=-1)[None]
     if np.isnan(y).all():
-        names = [formulas[f"y{i + 1}"].text for i in range(system.ny)]
+        names = listed([formulas[f"y{i + 1}"].text for i in range(system.ny)])
         raise ValueError(f"log {path} has no output at all: every cell of {names} is empty")
     measured = "u1" in values
     u = _inputs(system, table, values) if measured else system.input(t)

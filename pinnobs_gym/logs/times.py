@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from datetime import datetime
 
@@ -90,6 +91,15 @@ def _seconds(table: Table, name: str, cells: list[str]) -> tuple[np.ndarray, dat
     seconds = np.array([(instant - whole[0]).total_seconds() for instant in whole])
     start = whole[0].replace(microsecond=min(999_999, round(part[0] * 1e6)))
     return seconds + (part - part[0]), start
+
+
+def instant(t: float, times: np.ndarray) -> str:
+    """Return one of the times (num_samples,) of a log with six digits, or with as many more as tell
+    it from its neighbours."""
+    step, digits = float(np.median(np.diff(times))) if len(times) > 1 else 0.0, 6
+    if t and step > 0:
+        digits = max(6, min(15, 2 + math.floor(math.log10(abs(t))) - math.floor(math.log10(step))))
+    return f"{t:.{digits}g}"
 
 
 def without_rounding(t: np.ndarray) -> np.ndarray:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pinnobs_gym.logs.innovation_tests import Correlation, Drift, Outliers, Size
+from pinnobs_gym.logs.innovation_tests import Correlation, Drift, Size
 from pinnobs_gym.logs.input_tests import Driven
+from pinnobs_gym.logs.outlier_tests import Outliers
 
 CHANCE = 1e-4
 """Probability, over all outputs, below which something is not taken for chance."""
@@ -21,6 +22,9 @@ DRIFTING = 3.0
 """Variance of means of blocks, over that of white values, from which on it matters."""
 MANY = 0.01
 """Share of values beyond the bound of outliers from which on it matters."""
+EXTREME = 20.0
+"""Standard deviations of a value from which on even a single one matters: the next estimate is off
+by more than its own standard deviations say, unless outputs hardly move it."""
 DISTURBED = 0.5
 """Largest correlation of neighbours that single wrong outputs explain."""
 SINGLE = 3.0
@@ -46,8 +50,8 @@ class OutputTests:
     """That of means of blocks."""
     outliers: Outliers
     """Those among them."""
-    when: tuple[float, float]
-    """Times of the first and the last outlier."""
+    when: tuple[str, ...]
+    """Times of the first, the last and the largest outlier."""
     driven: Driven
     """How well an input tells the values."""
     small_tells: bool
@@ -56,7 +60,7 @@ class OutputTests:
     """Whether values of a right model are uncorrelated."""
     of_filter: bool
     """Whether these are innovations with covariances; otherwise residuals."""
-    begin: float
+    begin: str
     """Time of the first value."""
     later: OutputTests | None = None
     """The tests of the second half of the values, if they are enough."""
@@ -79,19 +83,24 @@ class OutputTests:
         chances = [self.drift.chance, self.driven.chance]
         chances += [self.correlation.chance] if self.correlation.value > 0 else []
         usual = USUAL[0] <= self.size.median <= USUAL[1] and self.outliers.share <= MANY
+        usual &= self.outliers.largest <= EXTREME
         return usual and min(chances) >= _HINT
 
     def _verdict(self, chance: float) -> str:
         """Return the verdict on all values; see `verdict`."""
         size, r, out = self.size, self.correlation, self.outliers
-        alike = self.white and r.chance < chance and r.value > CORRELATED
+        lasting = r.chance < chance and r.value > CORRELATED
+        alike = self.white and lasting
         alike |= self.white and self.drift.chance < chance and self.drift.ratio > DRIFTING
         opposite = self.of_filter and r.chance < chance and r.value < -CORRELATED
         # Values that are alike are few independent ones, but already told by their likeness.
         told = alike or size.chance < chance
-        large, small = told and size.median > USUAL[1], told and size.median < USUAL[0]
+        # Residuals as large as the noise may last, but not larger ones, as noise is white.
+        large, small = told or lasting, told and size.median < USUAL[0]
+        large &= size.median > USUAL[1]
         small &= self.small_tells
         far = out.chance < chance and out.share > MANY
+        far |= out.largest > EXTREME
         # Outliers disturb the next estimates, but do not make values much alike or much larger.
         others = size.median < USUAL[1] ** 2 and not (alike and (large or r.value > DISTURBED))
         if far and out.memory < SINGLE and others:

@@ -162,8 +162,9 @@ def test_several_logs_are_estimated_each_by_itself(folder, capsys):
         (["--log", "a.csv", "--also", "k=nan,1"], "two numbers"),
         (
             ["--log", "a.csv", "--also", "k", "--xhat0", "0", "0", "4"],
-            "xhat0",
+            "--xhat0 has 3 number(s); expected 2, one for each of p, v",
         ),
+        (["--log", "a.csv", "--P0-std", "1"], "--P0-std has 1 number(s); expected 2, one for each"),
         (["--log", "a.csv", "--trained", "x.pt"], "estimator 'ekf' is not one that is trained fir"),
         (["--log", "a.csv", "--trained", "x.pt"], "name that of the file, --estimator NAME"),
         (["--log", "a.csv", "--estimator", "pinn_gain"], "give its file, --trained FILE"),

@@ -143,3 +143,15 @@ def test_the_frequency_of_a_real_pendulum(folder, start):
     found = json.loads((folder / "fit.json").read_text())
     assert found["found"]["omega2"]["value"] == pytest.approx(64.22, rel=0.005)
     assert any("correlated" in line for line in found["warnings"])
+
+
+def test_what_is_to_be_pasted_is_of_the_plant_without_further_states(folder, capsys):
+    """With a bias as a further state, class and process noise are still those of the model."""
+    write_log(folder / "a.csv", (1.0, 0.0))
+    given = ["--parameters", "omega2", "--noise", "--also", "bias_angle=0,0.01"]
+    assert run("fit", *GIVEN, *given, "--process-noise", 0, 0.1) == 0
+    printed = capsys.readouterr().out
+    assert "in Python: Swing(omega2=" in printed
+    (line,) = [line for line in printed.splitlines() if line.startswith("as options: ")]
+    assert len(line.partition("--process-noise ")[2].split()) in (1, 2)
+    assert "Setup.process_noise" not in printed

@@ -1,4 +1,4 @@
-"""The tests of normalised innovations, on values whose law is known."""
+"""The tests of normalised innovations, and of outliers among them, on values whose law is known."""
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from pinnobs_gym.logs.innovation_tests import (
     correlation_of,
     drift_of,
     effective_number,
-    outliers_of,
     size_of,
 )
 from pinnobs_gym.logs.input_tests import driven_by
+from pinnobs_gym.logs.outlier_tests import outliers_of
 
 
 def autoregressive(correlation, number, seed=0):
@@ -156,3 +156,18 @@ def test_constant_inputs_tell_nothing():
     values = np.random.default_rng(0).standard_normal(200)
     found = driven_by(values, np.arange(200), np.full((200, 1), 3.0), ("a",))
     assert found.chance == 1
+
+
+def test_echoes_of_an_outlier_are_none_themselves():
+    """The innovations of the filter with the constant gain K, whose error a wrong output makes
+    −K(1 − K)ʲ times as large as itself: far beyond the others for many samples."""
+    rng, K = np.random.default_rng(0), 0.1
+    values = rng.standard_normal(2000)
+    for k, size in zip(range(50, 2000, 150), 80 * (-1.0) ** np.arange(13), strict=True):
+        values[k] += size
+        values[k + 1 : k + 100] -= K * size * (1 - K) ** np.arange(99)
+    found = outliers_of(values)
+    assert found.single == pytest.approx(13 / 2000, rel=0.5)
+    assert found.share > 5 * found.single
+    assert found.memory < 2
+    assert found.largest == pytest.approx(80, abs=4)

@@ -131,6 +131,17 @@ def test_outliers_are_not_taken_for_a_wrong_noise():
     assert "the model fails" in line
 
 
+def test_even_one_extreme_output_is_told():
+    """A normal value beyond 20 standard deviations has a chance of 1e-88."""
+    record, estimates = right()
+    e = estimates.innovation.copy()
+    e[0, 300, 0] = 9 * np.sqrt(2.0)
+    assert warned(record, replace(estimates, innovation=e)) == ()
+    e[0, 300, 0] = 50 * np.sqrt(2.0)
+    (line,) = warned(record, replace(estimates, innovation=e))
+    assert "the largest 50 standard deviations at t = 30): single outputs are far" in line
+
+
 def test_the_start_does_not_count_but_its_first_sample_tells_the_prior():
     record, estimates = right()
     wrong = estimates.innovation.copy()
@@ -178,6 +189,17 @@ def test_covariances_that_are_none_are_left_out():
     assert warned(record, replace(estimates, S=S)) == ()
 
 
+def test_slow_residuals_that_exceed_white_noise_are_told_of_few_samples():
+    """Estimates at zero, without covariances, of outputs that walk with twice the noise."""
+    walks = summed(right(300)[1], 0.99).innovation[0]
+    y = 0.2 * walks / np.sqrt(np.mean(walks**2, axis=0))
+    record = replace(right(300)[0], y=y[None])
+    (line,) = warned(record, Estimates(np.zeros((1, 300, 2))))
+    assert "estimates differ from the outputs by more than the noise" in line
+    small = replace(record, y=record.y / 4)  # within the noise, as of a right model
+    assert warned(small, Estimates(np.zeros((1, 300, 2)))) == ()
+
+
 def test_estimates_far_away_or_not_finite_are_told():
     record, estimates = right(200)
     estimates.xhat[0, 7, 1] = -2e3
@@ -185,6 +207,18 @@ def test_estimates_far_away_or_not_finite_are_told():
     assert line.startswith("x2 is estimated as -2000, 2e+03 times its scale away from the start")
     estimates.xhat[0, 8, 0] = np.inf
     assert warned(record, estimates) == ("the estimates leave the finite numbers at t = 0.8",)
+
+
+def test_a_plant_that_goes_far_has_not_diverged():
+    """The innovations fit, and the estimate is a thousand scales away, but known."""
+    record, estimates = right(200)
+    estimates.xhat[0, :, 1] = np.linspace(0, 5e3, 200)
+    P = np.tile(np.eye(2), (1, 200, 1, 1))
+    assert warned(record, replace(estimates, P=P)) == ()
+    unsure = P * np.array([1.0, 1e8])[:, None]
+    assert "probably diverged" in "\n".join(warned(record, replace(estimates, P=unsure)))
+    wrong = replace(estimates, P=P, innovation=5 * estimates.innovation)
+    assert "probably diverged" in warned(record, wrong)[0]
 
 
 def test_a_noise_that_is_told_as_zero_is_no_noise_told_too_large():

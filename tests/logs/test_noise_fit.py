@@ -162,3 +162,20 @@ def test_the_drift_of_a_point_of_known_noise():
     by_trajectory = fit([log], setup, unknown_parameters(Drift(), ["b=2"])).found[0]
     by_likelihood = fit_noise([log], setup, unknown_parameters(Drift(), ["b=2"]), noise=False)
     assert 2 + 2 * by_likelihood.unknowns[0] == pytest.approx(by_trajectory.value, rel=1e-5)
+
+
+def test_outliers_that_decide_the_noise_are_told():
+    """A right log has none; three of its outputs wrong by 50 standard deviations are told."""
+    log = noisy_log(400, seed=5)
+    assert not any("far beyond" in line for line in fit([log], SETUP, NONE, noise=True).warnings)
+    log.record.y[0, [80, 190, 310], 0] += 5.0
+    made = fit([log], SETUP, NONE, noise=True)
+    assert made.found[0].value > 3 * 0.1
+    (line,) = [line for line in made.warnings if "far beyond" in line]
+    assert "% of y1" in line
+
+
+def test_as_many_unknowns_as_outputs_are_refused():
+    log = noisy_log(2)
+    with pytest.raises(ValueError, match=r"2 output\(s\) in all; expected more than the 3 unknown"):
+        fit([log], SETUP, unknown_parameters(Oscillator(), ["k"]), noise=True)

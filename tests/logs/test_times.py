@@ -9,6 +9,7 @@ import pytest
 from linear import Linear
 
 from pinnobs_gym.logs.reading import read_log
+from pinnobs_gym.logs.times import instant
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import stack
 
@@ -200,3 +201,19 @@ def test_a_formula_of_the_times_of_a_map_may_round(tmp_path):
 def test_times_of_a_map_are_whole_numbers(tmp_path):
     said = refusal(tmp_path, [0, 1, 2.5], cls=Counted)
     assert ", line 4: t=2.5; Counted is a map, whose times count steps; expected a whole" in said
+
+
+@pytest.mark.parametrize(
+    ("t", "step", "text"),
+    [
+        (1764262839.9, 0.1, "1764262839.9"),
+        (123456.78, 0.01, "123456.78"),
+        (2.5, 0.1, "2.5"),
+        (1 / 3, 1.0, "0.333333"),
+        (0.0, 0.1, "0"),
+        (86400.0, 60.0, "86400"),
+    ],
+)
+def test_a_time_is_shown_with_the_digits_that_tell_it_from_the_next(t, step, text):
+    assert instant(t, t + step * np.arange(5)) == text
+    assert float(instant(t + step, t + step * np.arange(5))) > float(text)

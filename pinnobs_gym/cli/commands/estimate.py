@@ -18,6 +18,7 @@ from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.logs.judgement import judge
 from pinnobs_gym.logs.reading import Log, read_log
+from pinnobs_gym.logs.times import instant
 from pinnobs_gym.simulation.augmented_system import Augmented
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Setup
@@ -130,7 +131,7 @@ def _estimate(log: Log, estimator: BaseEstimator, setup: Setup, out: Path) -> bo
         f"{name} = {value:.6g}"
         for name, value in zip(system.state_names, estimates.xhat[0, -1], strict=True)
     )
-    time = f"{record.t[-1]:g}" + ("" if system.discrete else " s")
+    time = instant(record.t[-1], record.t) + ("" if system.discrete else " s")
     counted = f"{log.path.name}: {record.num_samples} samples"
     console.print(f"{counted}; at t = {time}: {last}", soft_wrap=True)
     if isinstance(system, Augmented):

@@ -21,6 +21,7 @@ from pinnobs_gym.logs.fit import Fit as Fitted
 from pinnobs_gym.logs.fit import Found, fit
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.logs.unknown import unknown_parameters
+from pinnobs_gym.simulation.augmented_system import Augmented
 from pinnobs_gym.simulation.record import Prior
 
 
@@ -96,11 +97,10 @@ class Fit:
         print_table([[table(made.found)]])
         for name, own in zip(made.system.output_names, made.residuals, strict=True):
             if math.isfinite(own.ratio):
-                console.print(
-                    f"residuals of {name}: {own.ratio:.3g} of the expected size, correlation "
-                    f"{own.serial:.2f} from one sample to the next",
-                    soft_wrap=True,
-                )
+                line = f"residuals of {name}: {own.ratio:.3g} of the expected size"
+                if math.isfinite(own.serial):
+                    line += f", correlation {own.serial:.2f} from one sample to the next"
+                console.print(line, soft_wrap=True)
         for warning in made.warnings:
             console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
         for line in to_paste(made):
@@ -130,19 +130,22 @@ def table(found: Sequence[Found]) -> Grid:
 
 def to_paste(made: Fitted) -> list[str]:
     """Return lines with what was found, as code and as options of commands."""
-    lines, parameters = [], made.system.parameters
+    lines, parameters, plant = [], made.system.parameters, made.system
+    while isinstance(plant, Augmented):
+        plant = plant.plant
     named = [f"{each.name}={each.value:.8g}" for each in made.found if each.name in parameters]
     if named:
-        lines.append(f"in Python: {type(made.system).__name__}({', '.join(named)})")
+        lines.append(f"in Python: {type(plant).__name__}({', '.join(named)})")
     if made.noise is not None:
         told = " ".join(f"{value:.4g}" for value in made.noise.noise_std)
-        L = made.noise.process_noise
+        L = made.noise.process_noise[: plant.nx]  # that of the plant's own states
+        L = L if L[:, plant.nx :].any() else L[:, : plant.nx]
         diagonal = L.shape[0] == L.shape[1] and np.count_nonzero(L) == np.count_nonzero(np.diag(L))
         if made.noise.perhaps_none:
             lines.append(f"as options: --noise-std {told} --process-noise 0")
         elif diagonal:
             std = {each.name: each.std for each in made.found}
-            known = [std.get(f"process noise of {name}", 0.0) for name in made.system.state_names]
+            known = [std.get(f"process noise of {name}", 0.0) for name in plant.state_names]
             process = " ".join(
                 f"{value if error < value else 0:.4g}"
                 for value, error in zip(np.diag(L), known, strict=True)
