@@ -72,9 +72,10 @@ def _values(system: System, name: str, value: Any, count: int) -> list[float]:
 
 
 def _unusual(system: System, name: str, value: Any, count: int) -> list[float]:
-    """Return the same of values that may be missing, huge, or none at all."""
+    """Return the same of values that may be missing, masked, huge, or none at all."""
+    masked = name == "y" and isinstance(value, np.ma.MaskedArray) and value.dtype.kind in _REAL
     try:
-        array = np.asarray(value)
+        array = np.asarray(value.astype(float).filled(np.nan) if masked else value)
     except ValueError:  # rows of different lengths
         array = np.asarray(None)
     if array.size and array.dtype.kind not in _REAL:
