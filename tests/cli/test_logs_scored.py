@@ -196,6 +196,7 @@ def test_a_gain_is_trained_on_several_logs(folder, capsys):
         ("pinn_gain", ["--log", "a.csv", "short.csv"], "30 and 2 samples"),
         ("pinn_gain", ["--log", "short.csv", "late.csv"], "late.csv, line 3: t=0.3; expected"),
         ("pinn_gain", ["--log", "a.csv", "b.csv"], "irregular"),
+        ("pinn_gain", ["--log", "a.csv", "copy.csv"], "a.csv and copy.csv have the same outputs"),
         ("pinn_obs", ["--log", "a.csv", "--condition", "noise5"], "--condition and --log"),
         ("pinn_obs", ["--log", "a.csv", "--episode", "3"], "--episode and --log"),
         ("pinn_obs", ["--columns", "t=ms"], "--columns without --log"),
@@ -205,6 +206,7 @@ def test_a_gain_is_trained_on_several_logs(folder, capsys):
 def test_mistakes_of_trainings_on_logs(folder, capsys, trainer, arguments, expected):
     (folder / "short.csv").write_text("t,q,force\n0,1,2\n0.1,1,2\n")
     (folder / "late.csv").write_text("t,q,force\n0,1,2\n0.3,1,2\n")
+    (folder / "copy.csv").write_bytes((folder / "a.csv").read_bytes())
     assert run("train", trainer, *SPRING, *arguments) == 2
     told = capsys.readouterr().err
     assert expected in told
