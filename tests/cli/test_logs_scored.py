@@ -84,7 +84,7 @@ def test_the_page_shows_the_reference_and_the_commands(folder, capsys):
     assert command in page
 
 
-def test_the_options_of_a_log_are_those_of_estimate(folder):
+def test_the_options_of_a_log_are_those_of_estimate(folder, capsys):
     write_csv(folder / "ms.csv", ("ms", "q", "force"), *_columns(folder / "a.csv", 1000.0))
     told = ["--noise-std", 0.2, "--xhat0", 0.9, 1.2, "--P0-std", 0.1, 0.1, "--process-noise", 0.3]
     log = ["--log", "ms.csv", "--columns", "t=ms*1e-3", "--reference", "a-ref.csv"]
@@ -95,6 +95,10 @@ def test_the_options_of_a_log_are_those_of_estimate(folder):
     assert own["nrmse"] == pytest.approx(same["nrmse"], rel=1e-6)
     assert run("evaluate", *SPRING, *ONE, "--out", "again") == 0
     assert rows.read(rows_path("again"))[1]["nrmse"] != same["nrmse"]
+    capsys.readouterr()
+    assert run("tables", rows_path("again")) == 0
+    left = "log, nominal are left out: they are of another noise or prior that estimators are told"
+    assert left in capsys.readouterr().err
 
 
 def test_unknown_constants_are_states_without_a_reference(folder):
