@@ -161,6 +161,12 @@ class Live:
         latest, point = self._ring.kept[-1]
         return Estimate(point, latest.y)
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        raise TypeError(
+            "a Live is neither copied nor pickled, as copies would share its state; save() it, and "
+            "Live.load() the file"
+        )
+
     def save(self, path: str | Path) -> None:
         """Write the filter to a file: arrays and plain values, with what the estimator and its
         model are. A file of that name is replaced at once, or stays as it is.

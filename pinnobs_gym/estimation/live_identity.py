@@ -114,13 +114,13 @@ def _shown(value: Any) -> str:
 
 
 def _same(found: Any, expected: Any) -> bool:
-    """Return whether values of equations agree but for rounding, which other versions of NumPy may
-    do otherwise."""
+    """Return whether values of equations, rows of components, agree but for rounding, which other
+    versions of NumPy may do otherwise. Components may be of very different units."""
     try:
         a, b = np.asarray(found, dtype=float), np.asarray(expected, dtype=float)
     except (TypeError, ValueError):
         return False
     if a.shape != b.shape:
         return False
-    size = abs(b[np.isfinite(b)]).max(initial=0.0)
-    return bool(np.allclose(a, b, rtol=0.0, atol=_SAME * size, equal_nan=True))
+    size = abs(np.where(np.isfinite(b), b, 0.0)).max(axis=0, initial=0.0)
+    return bool(np.isclose(a, b, rtol=0.0, atol=_SAME * size, equal_nan=True).all())

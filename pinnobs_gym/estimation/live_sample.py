@@ -72,8 +72,10 @@ def _values(system: System, name: str, value: Any, count: int) -> list[float]:
 
 
 def _unusual(system: System, name: str, value: Any, count: int) -> list[float]:
-    """Return the same of values that may be missing, huge, or none at all."""
+    """Return the same of values that may be missing, masked, huge, or none at all."""
     try:
+        if name == "y" and isinstance(value, np.ma.MaskedArray) and value.dtype.kind in _REAL:
+            value = np.ma.filled(value.astype(float), np.nan)
         array = np.asarray(value)
     except ValueError:  # rows of different lengths
         array = np.asarray(None)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from pinnobs_gym.scoring.log_game import LOG_SETUP
 from pinnobs_gym.scoring.recency import LastUse, facts_of
 from pinnobs_gym.scoring.rows import Row, game_of
 from pinnobs_gym.scoring.tuned import TUNED
@@ -67,11 +68,16 @@ def _of_present_games(rows: Sequence[Row], last_use: LastUse) -> tuple[list[Row]
         if row["game_hash"] != present[game_of(row)]
     )
     return kept, tuple(
-        f"{count} episodes of {', '.join(game)} are left out: they are of other code or settings "
-        f"of the system, the simulation or the scores (hash {other[:_SHOWN]}) than those used last "
-        f"({present[game][:_SHOWN]})."
+        f"{count} episodes of {', '.join(game)} are left out: they are of {_other(game)} (hash "
+        f"{other[:_SHOWN]}) than those used last ({present[game][:_SHOWN]})."
         for (game, other), count in sorted(older.items())
     )
+
+
+def _other(game: tuple[str, str, str]) -> str:
+    """Return in what the episodes of a game may differ."""
+    told = "another noise or prior that estimators are told, or of " if game[1] == LOG_SETUP else ""
+    return f"{told}other code or settings of the system, the simulation or the scores"
 
 
 def _named_by_difference(rows: Sequence[Row], dates: Sequence[str]) -> list[Row]:

@@ -57,7 +57,7 @@ def read_reference(path: str | Path, log: Log) -> ReferencedLog:
             than the log's or no whole numbers for a map, or no state is known at any time of the
             log.
     """
-    table, system = read_table(Path(path)), log.system
+    table, system = read_table(Path(path), "reference"), log.system
     states = [name for name in system.state_names if name in table.header]
     _check_names(table, system, states)
     measured = [name for name in states if name in system.output_names]

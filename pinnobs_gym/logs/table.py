@@ -32,10 +32,12 @@ class Table:
     """The line of each row in the file, shape (num_rows,)."""
     separator: str = ","
     """The character between cells."""
+    kind: str = "log"
+    """What the file is, as messages begin."""
 
     def place(self, row: int) -> str:
         """Return file and line of a row, as messages begin."""
-        return f"log {self.path}, line {self.lines[row]}"
+        return f"{self.kind} {self.path}, line {self.lines[row]}"
 
     def cells(self, name: str) -> list[str]:
         """Return the cells of a column, without blanks around them.
@@ -44,7 +46,7 @@ class Table:
             ValueError: in one line, if several columns have that name.
         """
         if self.header.count(name) > 1:
-            raise ValueError(f"log {self.path} has column {name} twice")
+            raise ValueError(f"{self.kind} {self.path} has column {name} twice")
         column = self.header.index(name)
         return [row[column].strip() for row in self.rows]
 
@@ -86,12 +88,16 @@ def _float(cell: str) -> float:
         return math.inf
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, kind: str = "log") -> Table:
     """Read a CSV file with a header. Its cells are separated by commas, semicolons or tabs: by what
     the header has most of. Lines without any text in their cells are left out.
 
     Each line is parsed by itself, as no cell of a log extends over several lines: a quote that is
     not closed is thus found in its own line, rather than at the end of the file.
+
+    Args:
+        path: the file.
+        kind: what it is, as messages begin.
 
     Raises:
         ValueError: in one line that names the file and the line.
@@ -103,25 +109,27 @@ def read_table(path: Path) -> Table:
             for number, line in enumerate(file, 1):
                 if not header and line.strip():
                     separator = max(_SEPARATORS, key=line.count)
-                cells = _parsed(line, separator, f"log {path}, line {number}")
+                cells = _parsed(line, separator, f"{kind} {path}, line {number}")
                 if not any(cell.strip() for cell in cells):
                     continue
                 if not header:
                     header = [name.strip() for name in cells]
                     continue
                 if len(cells) != len(header):
-                    raise ValueError(_miscounted(path, number, cells, header, separator))
+                    raise ValueError(
+                        _miscounted(f"{kind} {path}, line {number}", cells, header, separator)
+                    )
                 rows.append(cells)
                 lines.append(number)
     except UnicodeDecodeError as error:
-        raise ValueError(f"cannot read log {path}: {error}; expected a text in UTF-8") from None
+        raise ValueError(f"cannot read {kind} {path}: {error}; expected a text in UTF-8") from None
     except OSError as error:
-        raise ValueError(f"cannot read log {path}: {error}") from None
+        raise ValueError(f"cannot read {kind} {path}: {error}") from None
     if not header:
-        raise ValueError(f"log {path} is empty; expected a header and rows of numbers")
+        raise ValueError(f"{kind} {path} is empty; expected a header and rows of numbers")
     if not rows:
-        raise ValueError(f"log {path} has a header but no rows")
-    return Table(path, header, rows, np.array(lines), separator)
+        raise ValueError(f"{kind} {path} has a header but no rows")
+    return Table(path, header, rows, np.array(lines), separator, kind)
 
 
 def _parsed(line: str, separator: str, place: str) -> list[str]:
@@ -134,13 +142,9 @@ def _parsed(line: str, separator: str, place: str) -> list[str]:
         ) from None
 
 
-def _miscounted(
-    path: Path, number: int, cells: list[str], header: list[str], separator: str
-) -> str:
+def _miscounted(place: str, cells: list[str], header: list[str], separator: str) -> str:
     """Return the message for a line of too few or too many cells."""
-    text = (
-        f"log {path}, line {number}: {len(cells)} cells; expected {len(header)}, as in the header"
-    )
+    text = f"{place}: {len(cells)} cells; expected {len(header)}, as in the header"
     if len(header) == 1:
         text += f", which is {shown(header[0])}"
     if separator == "," and len(cells) > len(header) > 1:

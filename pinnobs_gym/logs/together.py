@@ -18,18 +18,19 @@ def together(logs: Sequence[Log]) -> tuple[System, Record]:
     """Return the model and the record of several logs, at least one, a row for each.
 
     Raises:
-        ValueError: in one line that names two of the logs, if their sample times differ, or only
-            one of them has inputs.
+        ValueError: in one line that names two of the logs, if their sample times differ, only one
+            of them has inputs, or both have the same outputs.
     """
     first, records = logs[0], [log.record for log in logs]
     t = first.record.t
-    for log in logs[1:]:
+    for i, log in enumerate(logs[1:], 1):
         if log.system.measured_input != first.system.measured_input:
             raise ValueError(
                 f"only one of logs {first.path} and {log.path} has columns of inputs; expected "
                 "them in all logs, or none"
             )
         _check_times(first, log)
+        _check_new(logs[:i], log)
     levels = None
     if any(record.noise_std is not None for record in records):
         unknown = np.full(records[0].y.shape, np.nan)
@@ -60,3 +61,13 @@ def _check_times(first: Log, log: Log) -> None:
             f"log {log.path}, line {log.lines[k]}: t={own[k]:.9g}; expected t={t[k]:.9g}, as log "
             f"{first.path} has, since logs that are learned from together need the same times"
         )
+
+
+def _check_new(earlier: Sequence[Log], log: Log) -> None:
+    """Raise ValueError, in one line, if a log has the outputs of an earlier one: one that is held
+    out would be learned from."""
+    for other in earlier:
+        if np.array_equal(other.record.y, log.record.y, equal_nan=True):
+            raise ValueError(
+                f"logs {other.path} and {log.path} have the same outputs; expected each log once"
+            )

@@ -75,6 +75,9 @@ def evaluate_logs(
         ValueError: in one line, if a file cannot be read or does not fit the system, an option is
             unknown, or the estimator does not take the system or a log.
     """
+    for name, paths in (("logs", logs), ("references", references)):
+        if isinstance(paths, str | Path):
+            raise ValueError(f"{name}={str(paths)!r}; expected a list of files")
     if isinstance(system, System):
         model, own = system, type(system).setups["benchmark"]
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -15,6 +15,7 @@ from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.logs.reference import ReferencedLog, read_reference
 from pinnobs_gym.scoring.known_states import counted
+from pinnobs_gym.scoring.metrics import windows
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Setup, System
 
@@ -103,7 +104,16 @@ class LogGame:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the user should know of the logs and references, a line each."""
-        return tuple(note for log in self.logs.values() for note in (*log.log.notes, *log.notes))
+        return tuple(
+            note
+            for log in self.logs.values()
+            for note in (
+                *log.log.notes,
+                *log.notes,
+                *_copied_outputs(log),
+                *_empty_windows(log, self.transient_end(log)),
+            )
+        )
 
     def transient_end(self, log: ReferencedLog) -> float:
         """Return the end of a log's transient window in s from its first sample: `Setup.transient`
@@ -137,3 +147,40 @@ def _check(log: ReferencedLog) -> None:
             f"reference {log.reference} has only states of {type(system).__name__} that the "
             "outputs do not determine there (System.observable); expected others"
         )
+
+
+def _copied_outputs(log: ReferencedLog) -> Iterator[str]:
+    """Yield a note for each state whose reference has the values of an output of the log."""
+    system, y, x = log.log.system, log.record.y[0], log.truth[0]
+    for i, state in enumerate(system.state_names):
+        for j, output in enumerate(system.output_names):
+            both = ~np.isnan(x[:, i]) & ~np.isnan(y[:, j])
+            if both.sum() > 1 and np.allclose(x[both, i], y[both, j], rtol=1e-9, atol=0.0):
+                yield (
+                    f"reference {log.reference}: {state} has the values of output {output} at all "
+                    f"{both.sum()} samples in common; if it is that sensor itself, errors of "
+                    f"{state} are those to its noisy values"
+                )
+
+
+def _empty_windows(log: ReferencedLog, end: float) -> Iterator[str]:
+    """Yield a note for each window that has no known state, whose errors are thus of another one.
+
+    Args:
+        log: the log.
+        end: the end of the transient window, in s from the first sample.
+    """
+    known = (~np.isnan(log.truth[0])).any(axis=1)
+    t, start = log.record.t[known], float(log.record.t[0])
+    part = windows(t, end, start)
+    unit = log.log.system.time_unit
+    for name, where, empty in (
+        ("transient", "up to", t[part["transient"].start] - start > end),
+        ("steady", "after", t[-1] - start <= end),
+    ):
+        if empty:
+            yield (
+                f"reference {log.reference} has no state {where} t={start + end:g} {unit}, where "
+                f"the transient ends; {name} errors are those at "
+                f"t={t[part[name].start]:g} {unit} instead"
+            )

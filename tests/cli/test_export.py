@@ -41,10 +41,11 @@ def test_its_files_compile_and_replay_a_log(folder, capsys):
 def test_measured_inputs(folder):
     assert run("export", "ekf", "--system", "InductionMotor", "--out", "own.c") == 0
     assert (
-        run("export", "ekf", "--system", "InductionMotor", "--out", "m.c", "--measured-input") == 0
+        run("export", "ekf", "--system", "InductionMotor", "--out", "given.c", "--measured-input")
+        == 0
     )
     assert "#define OWN_INPUTS 0" in (folder / "own.h").read_text()
-    assert "#define M_INPUTS 2" in (folder / "m.h").read_text()
+    assert "#define GIVEN_INPUTS 2" in (folder / "given.h").read_text()
 
 
 @pytest.mark.parametrize(
@@ -54,11 +55,26 @@ def test_measured_inputs(folder):
         (["ekf", "--system", "Academic", "--out", "a.py"], "out=a.py; expected the name of a C"),
         (["ekf", "--system", "Academic", "--out", "b.c"], "b.h already exists; expected"),
         (["ekf", "--system", "Academic", "--out", "2a.c"], "name='2a'; expected a name in C"),
+        (["ekf", "--system", "Academic", "--out", "filter.c"], "filter is taken by C or the code"),
         (["mhe", "--system", "Academic", "--out", "a.c"], "estimator 'mhe' is not exported"),
         (["kkl_pinn", "--system", "Academic", "--out", "a.c"], "give the file with --trained FILE"),
         (
             ["ekf", "--system", "Academic", "--out", "a.c", "--trained", "a.pt"],
             "trained=a.pt: estimator 'ekf' is not trained",
+        ),
+        (
+            [
+                "kkl_pinn",
+                "--system",
+                "Academic",
+                "--out",
+                "a.c",
+                "--trained",
+                "a.pt",
+                "--set",
+                "a=1",
+            ],
+            "set=a=1: the settings of 'kkl_pinn' are those of its trained file",
         ),
     ],
 )

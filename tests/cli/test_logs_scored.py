@@ -84,7 +84,7 @@ def test_the_page_shows_the_reference_and_the_commands(folder, capsys):
     assert command in page
 
 
-def test_the_options_of_a_log_are_those_of_estimate(folder):
+def test_the_options_of_a_log_are_those_of_estimate(folder, capsys):
     write_csv(folder / "ms.csv", ("ms", "q", "force"), *_columns(folder / "a.csv", 1000.0))
     told = ["--noise-std", 0.2, "--xhat0", 0.9, 1.2, "--P0-std", 0.1, 0.1, "--process-noise", 0.3]
     log = ["--log", "ms.csv", "--columns", "t=ms*1e-3", "--reference", "a-ref.csv"]
@@ -95,6 +95,10 @@ def test_the_options_of_a_log_are_those_of_estimate(folder):
     assert own["nrmse"] == pytest.approx(same["nrmse"], rel=1e-6)
     assert run("evaluate", *SPRING, *ONE, "--out", "again") == 0
     assert rows.read(rows_path("again"))[1]["nrmse"] != same["nrmse"]
+    capsys.readouterr()
+    assert run("tables", rows_path("again")) == 0
+    left = "log, nominal are left out: they are of another noise or prior that estimators are told"
+    assert left in capsys.readouterr().err
 
 
 def test_unknown_constants_are_states_without_a_reference(folder):
@@ -196,6 +200,7 @@ def test_a_gain_is_trained_on_several_logs(folder, capsys):
         ("pinn_gain", ["--log", "a.csv", "short.csv"], "30 and 2 samples"),
         ("pinn_gain", ["--log", "short.csv", "late.csv"], "late.csv, line 3: t=0.3; expected"),
         ("pinn_gain", ["--log", "a.csv", "b.csv"], "irregular"),
+        ("pinn_gain", ["--log", "a.csv", "copy.csv"], "a.csv and copy.csv have the same outputs"),
         ("pinn_obs", ["--log", "a.csv", "--condition", "noise5"], "--condition and --log"),
         ("pinn_obs", ["--log", "a.csv", "--episode", "3"], "--episode and --log"),
         ("pinn_obs", ["--columns", "t=ms"], "--columns without --log"),
@@ -205,6 +210,7 @@ def test_a_gain_is_trained_on_several_logs(folder, capsys):
 def test_mistakes_of_trainings_on_logs(folder, capsys, trainer, arguments, expected):
     (folder / "short.csv").write_text("t,q,force\n0,1,2\n0.1,1,2\n")
     (folder / "late.csv").write_text("t,q,force\n0,1,2\n0.3,1,2\n")
+    (folder / "copy.csv").write_bytes((folder / "a.csv").read_bytes())
     assert run("train", trainer, *SPRING, *arguments) == 2
     told = capsys.readouterr().err
     assert expected in told

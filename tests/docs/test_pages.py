@@ -174,6 +174,11 @@ def test_the_cells_of_a_guide_run_and_take_few_lines(path, tmp_path):
     assert len([line for text in own for line in text.splitlines() if line.strip()]) < 60
 
 
+@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.stem)
+def test_no_place_of_a_page_is_left_to_be_filled(path):
+    assert not re.search(r"^[A-Z]+(_[A-Z]+)+$", path.read_text(encoding="utf-8"), re.MULTILINE)
+
+
 def test_there_are_guides_to_many_kinds_of_plants():
     assert len(PLANTS) > 6
 

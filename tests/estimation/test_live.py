@@ -1,6 +1,7 @@
 """A live filter gives what its estimator gives on the whole record, and refuses what is no
 sample."""
 
+import copy
 import pickle
 import re
 import threading
@@ -130,6 +131,13 @@ def test_what_is_told_is_computed_once_and_is_not_the_filters_own():
         estimate.std[:] = 0.0
 
 
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+@pytest.mark.parametrize("late", ["refuse", "replay"])
+def test_it_is_not_copied_since_copies_would_share_its_state(copied, late):
+    with pytest.raises(TypeError, match=r"a Live is neither copied nor pickled.*Live.load\(\)"):
+        copied(Live(EKF(Linear()), late=late))
+
+
 @pytest.mark.parametrize("name", ["ekf", "mhe", "open_loop"])
 def test_an_estimate_goes_to_other_processes(name):
     estimator, record = online(name)
@@ -196,6 +204,9 @@ def test_a_number_is_one_output_and_what_is_like_an_array_is_taken():
         np.testing.assert_array_equal(estimate.xhat, first.xhat)
     whole = begun(estimator, record).update(np.int64(0), np.float32(1.0)).xhat
     np.testing.assert_array_equal(whole, begun(estimator, record).update(0, 1).xhat)
+    masked = np.ma.masked_array([1.0], mask=[True])
+    missing = begun(estimator, record).update(0.0, np.nan).xhat
+    np.testing.assert_array_equal(begun(estimator, record).update(0.0, masked).xhat, missing)
     huge = begun(estimator, record).update(0.0, [1e308])
     assert huge.t == 0.0
 

@@ -22,6 +22,7 @@ from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.robust_ekf import RobustEKF
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.noise import SampledLevel
+from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems.harmonic_oscillator import HarmonicOscillator
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 
@@ -203,6 +204,23 @@ def test_rounding_of_equations_is_no_other_model(tmp_path, monkeypatch):
     own = Linear.f
     monkeypatch.setattr(Linear, "f", lambda self, t, x, u: own(self, t, x, u) * (1 + 1e-15))
     Live.load(tmp_path / "x", EKF(Linear()))
+
+
+@dataclass(frozen=True)
+class Uneven(Linear):
+    """The first state in a unit that is a billionth of the usual one."""
+
+    def f(self, t, x, u):
+        return stack(x, 1e9 * x[..., 1], -2e-9 * x[..., 0] - 0.3 * x[..., 1])
+
+
+def test_another_equation_of_small_values_is_another_model(tmp_path, monkeypatch):
+    Live(EKF(Uneven())).save(tmp_path / "x")
+    own = Uneven.f
+    factor = np.array([1.0, 1.01])
+    monkeypatch.setattr(Uneven, "f", lambda self, t, x, u: own(self, t, x, u) * factor)
+    with pytest.raises(ValueError, match=r"was saved with other values of equations.f"):
+        Live.load(tmp_path / "x", EKF(Uneven()))
 
 
 def _edited(path, change):

@@ -152,3 +152,21 @@ def test_a_map_has_whole_times(tmp_path):
     (tmp_path / "ref.csv").write_text("t,n\n3.5,1\n")
     with pytest.raises(ValueError, match=r"line 2: t=3.5; Counter is a map"):
         read_reference(tmp_path / "ref.csv", log)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "reference {} is empty; expected"),
+        ("t,v\n", "reference {} has a header but no rows"),
+        ("t,v\n1,2\n2,fast\n", "reference {}, line 3: v='fast' is not a finite number"),
+        ("t,v\n1,2,3\n", "reference {}, line 2: 3 cells; expected 2, as in the header"),
+        ("t,v,v\n1,2,3\n", "reference {} has column v twice"),
+        ("t,v\n2,2\n1,3\n", "reference {}, line 3: t=1.0 after 2.0; t must increase"),
+    ],
+)
+def test_messages_say_that_the_file_is_the_reference(tmp_path, log, text, message):
+    path = tmp_path / "ref.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=re.escape(message.format(path))):
+        read_reference(path, log)

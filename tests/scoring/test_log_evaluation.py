@@ -316,3 +316,36 @@ def test_the_transient_window_is_a_quarter_of_the_log_from_its_first_sample(tmp_
     )
     early = times - drive.t[0] <= 0.6 * span
     assert own["nrmse_steady"] == pytest.approx(np.sqrt(scaled[~early].mean()), rel=1e-4)
+
+
+@pytest.mark.parametrize(("window", "other"), [("transient", "up to"), ("steady", "after")])
+def test_a_window_without_a_state_is_noted(tmp_path, window, other):
+    drive = Drive()
+    end = drive.t[0] + (drive.t[-1] - drive.t[0]) / 4
+    times = between(drive)
+    times = times[times > end] if window == "transient" else times[times <= end]
+    game = LogGame.of(DrivenSpring(), SETUP, *files(tmp_path, drive, times))
+    (note,) = game.notes
+    assert f"has no state {other} t={end:g} s, where the transient ends; {window} errors" in note
+    place = times[1] if window == "transient" else times[-1]
+    assert note.endswith(f"at t={place:g} s instead")
+    assert not LogGame.of(DrivenSpring(), SETUP, *files(tmp_path, drive, between(drive))).notes
+
+
+def test_a_reference_with_the_values_of_an_output_is_noted(tmp_path):
+    drive = Drive()
+    log = drive.write_log(tmp_path / "a.csv")
+    x = np.array([drive.at(t) for t in drive.t])
+    reference = write_csv(tmp_path / "b.csv", ("t", "q", "v"), drive.t, drive.y, x[:, 1])
+    (note,) = LogGame.of(DrivenSpring(), SETUP, [log], [reference]).notes
+    assert "q has the values of output q at all 60 samples in common" in note
+    reference = write_csv(tmp_path / "c.csv", ("t", "q", "v"), drive.t, *x.T)
+    assert not LogGame.of(DrivenSpring(), SETUP, [log], [reference]).notes
+
+
+def test_a_file_in_place_of_a_list_is_refused(tmp_path):
+    logs, references = files(tmp_path, Drive(), between(Drive()))
+    with pytest.raises(ValueError, match=r"logs='.*a.csv'; expected a list of files"):
+        evaluate_logs("ekf", DrivenSpring(), str(logs[0]), references)
+    with pytest.raises(ValueError, match=r"references='.*'; expected a list of files"):
+        evaluate_logs("ekf", DrivenSpring(), logs, references[0])

@@ -73,6 +73,10 @@ class Export:
             raise ValueError(
                 f"estimator {name!r} is trained first; give the file with --trained FILE"
             )
+        if self.set:
+            raise ValueError(
+                f"set={' '.join(self.set)}: the settings of {name!r} are those of its trained file"
+            )
         from pinnobs_gym.estimation.learned.trained import LearnedEstimator
 
         assert issubclass(cls, LearnedEstimator)
@@ -82,6 +86,8 @@ class Export:
         header, source, replay = paths
         lines = files.source.count("\n")
         console.print(f"{source} ({lines} lines), {header}, {replay}", soft_wrap=True)
+        for note in files.notes:
+            console.print(note, soft_wrap=True, highlight=False)
         program = replay.with_suffix("")
         console.print(
             f"checksum {files.checksum}; to replay a record: cc -std=c99 -O2 {source} {replay} -lm "

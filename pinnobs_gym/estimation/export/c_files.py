@@ -11,7 +11,8 @@ from importlib.metadata import version
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.estimation.export.algorithm import Algorithm, own
+from pinnobs_gym.estimation.export.algorithm import Algorithm, notes_of, own
+from pinnobs_gym.estimation.export.names import check_name
 from pinnobs_gym.estimation.export.pruning import needed_code, needed_fields
 from pinnobs_gym.estimation.export.scalar import scalar, single
 from pinnobs_gym.simulation.kernels.calls import plan_values
@@ -22,7 +23,6 @@ from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
 
 _PLACE = re.compile(r"@(\w+)@")
-_IDENTIFIER = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _INCLUDES = re.compile(r"^#include <.*>\n", re.M)
 _A_LINE = 4
 """Number of numbers in a line."""
@@ -40,6 +40,8 @@ class CFiles:
     """A main program that replays a CSV file."""
     checksum: str
     """Of the source, which has the model and the settings."""
+    notes: tuple[str, ...] = ()
+    """What the user should know, a line each."""
 
 
 def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool = False) -> CFiles:
@@ -54,8 +56,6 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
     Raises:
         ValueError: in one line, if the estimator or its model cannot be exported.
     """
-    if not _IDENTIFIER.fullmatch(name):
-        raise ValueError(f"name={name!r}; expected a name in C: letters, digits and underscores")
     _check_exportable(estimator)
     code = _equations(estimator.system)
     found = estimator.exported(code, prior)
@@ -64,17 +64,20 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
             f"estimator {estimator.label!r} is not exported; expected ekf, robust_ekf, ukf, ckf, "
             "luenberger, or a KKL observer"
         )
-    source = needed_code(_filled(_source(estimator, prior, found, code), found.places))
+    source = _filled(_source(estimator, prior, found, code), found.places)
+    check_name(name, [source, own("replay.c")])
+    source = needed_code(source)
     source = needed_code(needed_fields(source))  # arrays of fields that are gone
     if float32:
         source = single(source)
     checksum = f"0x{zlib.crc32(source.encode()):08x}"
     values = _values(estimator, found, name, "float" if float32 else "double")
-    values["checksum"] = checksum
+    values |= {"checksum": checksum}
     head = own("head.c").replace("@math@", "tgmath" if float32 else "math")
     texts = [own("header.h"), f"{head}\n{source.lstrip()}", own("replay.c")]
     header, source, replay = (_filled(_filled(text, values), values) for text in texts)
-    return CFiles(name, header, source, replay, checksum)
+    notes = notes_of(code, float32, estimator.system.measured_input)
+    return CFiles(name, header, source, replay, checksum, notes)
 
 
 def _check_exportable(estimator: BaseEstimator) -> None:

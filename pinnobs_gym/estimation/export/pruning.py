@@ -26,7 +26,7 @@ def needed_code(text: str) -> str:
     """Return code without the static functions that its other parts do not use, directly or through
     others, and without the comments before these."""
     functions = [
-        _Function(f[1] or f[2], f.start(), f.end(), frozenset(_NAME.findall(_bare(f[0]))))
+        _Function(f[1] or f[2], f.start(), f.end(), frozenset(_NAME.findall(bare(f[0]))))
         for f in _FUNCTION.finditer(text)
     ]
     rest, last = [], 0
@@ -34,7 +34,7 @@ def needed_code(text: str) -> str:
         rest.append(text[last : function.start])
         last = function.end
     rest.append(text[last:])
-    used = set(_NAME.findall(_bare("".join(rest))))
+    used = set(_NAME.findall(bare("".join(rest))))
     known = {function.name: function for function in functions}
     waiting = [name for name in used if name in known]
     while waiting:
@@ -51,7 +51,7 @@ def needed_code(text: str) -> str:
     return re.sub(r"\n{3,}", "\n\n", "".join(kept))
 
 
-def _bare(text: str) -> str:
+def bare(text: str) -> str:
     """Return code without comments."""
     return re.sub(r"/\*.*?\*/", " ", text, flags=re.S)
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 import many_plants
 import numpy as np
 import pytest
+from array_api_compat import array_namespace
 from exported import assert_replays, build, csv_of, needs_c, replay
 from linear import Linear, linear_record, record_of
 
@@ -125,6 +126,19 @@ def test_a_refused_sample_leaves_the_filter_as_it_was(tmp_path):
         assert said == f"line 4: status {status}\n"
 
 
+@pytest.mark.parametrize(
+    ("wrong", "cell"),
+    [('0.3,"1",1', 2), ("0.3;1;1", 1), ("2024-01-01,1,1", 1), ("0.3,1", 2), ("0.3,1,1,1", 3)],
+)
+def test_a_replay_refuses_lines_of_other_cells(wrong, cell, tmp_path):
+    estimator, record = EKF(Linear()), linear_record(1)
+    program = build(tmp_path, estimator, record.prior)
+    head, *lines = csv_of(record, Linear()).splitlines()
+    found, said = replay(program, "\n".join([head, *lines[:2], "", "0.25, ,1\r", wrong]) + "\n")
+    assert len(found) == 3
+    assert said == f"line 6: cell {cell} is no number, or not all 3 cells are there\n"
+
+
 @dataclass(frozen=True)
 class Branching(Linear):
     """Its equations depend on data."""
@@ -178,6 +192,30 @@ def test_sigma_points_of_a_plant_with_bounds_and_very_wide_priors():
 def test_names_are_those_of_c(name):
     with pytest.raises(ValueError, match="expected a name in C"):
         c_files(EKF(Linear()), linear_record(1).prior, name)
+
+
+@pytest.mark.parametrize("name", ["int", "class", "sin", "main", "filter", "plan", "kalman"])
+def test_names_of_the_language_and_of_the_code_are_refused(name):
+    """The code has a function kalman_update, as an export of that name would."""
+    with pytest.raises(
+        ValueError, match=rf"name='{name}': {name}(_update)? is taken by C or the c"
+    ):
+        c_files(EKF(Linear()), linear_record(1).prior, name)
+
+
+class Shaken(Linear):
+    """The linear plant with an excitation of a known time."""
+
+    def f(self, t, x, u):
+        return stack(x, x[..., 1], array_namespace(x).cos(t) - x[..., 0])
+
+
+def test_equations_with_time_in_single_precision_are_told():
+    prior = linear_record(1).prior
+    (note,) = c_files(EKF(Shaken()), prior, "plant", float32=True).notes
+    assert note.startswith("the equations contain t, of which single precision keeps 7 digits")
+    assert not c_files(EKF(Shaken()), prior, "plant").notes
+    assert not c_files(EKF(Linear()), prior, "plant", float32=True).notes
 
 
 class Sum(Linear):

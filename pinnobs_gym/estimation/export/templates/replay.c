@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "@name@.h"
 
@@ -19,13 +20,19 @@ int main(void)
         @real@ y[@NAME@_OUTPUTS], u[@NAME@_INPUTS + 1];
         char *at = line;
         number++;
+        if (!line[strspn(line, " \t\r\n")]) continue; /* a blank line */
         for (int i = 0; i < 1 + @NAME@_OUTPUTS + @NAME@_INPUTS; i++) {
             char *end;
             cells[i] = strtod(at, &end);
             if (end == at) cells[i] = NAN;
-            at = end;
-            while (*at && *at != ',') at++;
-            if (*at) at++;
+            at = end + strspn(end, " \t");
+            const int last = i == @NAME@_OUTPUTS + @NAME@_INPUTS;
+            if (last ? *at && !strchr("\r\n", *at) : *at != ',') {
+                fprintf(stderr, "line %ld: cell %d is no number, or not all %d cells are there\n",
+                        number, i + 1, 1 + @NAME@_OUTPUTS + @NAME@_INPUTS);
+                return 1;
+            }
+            at++;
         }
         for (int i = 0; i < @NAME@_OUTPUTS; i++) y[i] = (@real@)cells[1 + i];
         for (int i = 0; i < @NAME@_INPUTS; i++) u[i] = (@real@)cells[1 + @NAME@_OUTPUTS + i];
