@@ -66,9 +66,9 @@ def needed_fields(text: str) -> str:
     found = _STRUCT.search(text)
     assert found is not None
     used = set(re.findall(r"(?:->|plan\.)(\w+)", text))
-    kept = [line for line in found[1].splitlines() if set(_FIELD.findall(_bare(line))) & used]
-    unused = set(_FIELD.findall(_bare(found[1]))) - used
-    kept_names = {name for line in kept for name in _FIELD.findall(_bare(line))}
+    kept = [line for line in found[1].splitlines() if set(_FIELD.findall(bare(line))) & used]
+    unused = set(_FIELD.findall(bare(found[1]))) - used
+    kept_names = {name for line in kept for name in _FIELD.findall(bare(line))}
     text = text.replace(found[1], "".join(f"{line}\n" for line in kept), 1)
     for name in unused - kept_names:
         text = re.sub(rf"^    \.{name} = [^\n]*\n", "", text, flags=re.M)
