@@ -11,8 +11,9 @@ from importlib.metadata import version
 import numpy as np
 
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.estimation.export.algorithm import Algorithm, notes_of, own
+from pinnobs_gym.estimation.export.algorithm import Algorithm, own
 from pinnobs_gym.estimation.export.names import check_name
+from pinnobs_gym.estimation.export.notes import notes_of
 from pinnobs_gym.estimation.export.pruning import needed_code
 from pinnobs_gym.estimation.export.scalar import scalar, single
 from pinnobs_gym.simulation.kernels.calls import plan_values
