@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from pinnobs_gym.simulation.kernels.calls import address
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.record import check_use
 
-if TYPE_CHECKING:
-    from pinnobs_gym.estimators.mhe import MHE
-
 _SHAPES = ("mean_after", "P_after", "start_after", "x", "P_x", "innovation", "S")
 """The results, in the order of their places in one array."""
 
@@ -39,8 +36,9 @@ class _WindowStructure(ctypes.Structure):
     ]
 
 
-def compiled_window(estimator: MHE) -> CompiledWindow | str:
-    """Return the compiled code of an estimator, or the reason in one line why there is none."""
+def compiled_window(estimator: Any) -> CompiledWindow | str:
+    """Return the compiled code of an estimator, a `pinnobs_gym.estimators.mhe.MHE`, or the reason in
+    one line why there is none."""
     if estimator.noise.told.stochastic:
         return "its windows have process noise"
     made = library_of(estimator)
@@ -55,7 +53,7 @@ class CompiledWindow:
         made: the library.
     """
 
-    def __init__(self, estimator: MHE, made: PlantLibrary) -> None:
+    def __init__(self, estimator: Any, made: PlantLibrary) -> None:
         system = estimator.system
         self._estimator = estimator
         self._sizes = system.nx, system.ny, system.nu
