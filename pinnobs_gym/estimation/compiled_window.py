@@ -37,8 +37,8 @@ class _WindowStructure(ctypes.Structure):
 
 
 def compiled_window(estimator: Any) -> CompiledWindow | str:
-    """Return the compiled code of an estimator, a `pinnobs_gym.estimators.mhe.MHE`, or the reason in
-    one line why there is none."""
+    """Return the compiled code of an estimator, a `pinnobs_gym.estimators.mhe.MHE`, or the reason
+    in one line why there is none."""
     if estimator.noise.told.stochastic:
         return "its windows have process noise"
     made = library_of(estimator)
