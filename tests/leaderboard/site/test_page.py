@@ -48,7 +48,13 @@ def scored(tmp_path_factory):
 @pytest.fixture(scope="module")
 def site(scored, tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
-    assert main(["report", str(scored), "-o", str(folder)]) == 0
+    floor = {"estimator": "exact_bayes", "estimator_hash": "floor", "track": "floor"}
+    floor |= {"effective_sample_size": 900.0}
+    played = [row for row in rows.read(scored) if row["env_id"] == DUFFING]
+    played = [row for row in played if row["estimator"] == "ekf" and row["condition"] == "nominal"]
+    floors = tmp_path_factory.mktemp("floors") / "rows.jsonl"
+    rows.append(floors, [row | floor for row in played])
+    assert main(["report", str(scored), str(floors), "-o", str(folder)]) == 0
     return folder / "index.html"
 
 
