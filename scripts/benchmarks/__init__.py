@@ -24,12 +24,12 @@ class Figure:
 def at_least(figure: str, value: float, unit: str, bound: float | None) -> Figure:
     """Return a figure with a lower bound, or without a bound."""
     asked = "" if bound is None else f">= {bound:g}"
-    return Figure(figure, value, unit, asked, None if bound is None else value >= bound)
+    return Figure(figure, value, unit, asked, None if bound is None else bool(value >= bound))
 
 
 def at_most(figure: str, value: float, unit: str, bound: float) -> Figure:
     """Return a figure with an upper bound."""
-    return Figure(figure, value, unit, f"<= {bound:g}", value <= bound)
+    return Figure(figure, value, unit, f"<= {bound:g}", bool(value <= bound))
 
 
 def cpu_seconds(run: Callable[[], object]) -> float:
