@@ -7,29 +7,13 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 from linear import Linear
+from other_motions import Counted, Exact
 
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.logs.times import instant
 from pinnobs_gym.simulation.record import Prior
-from pinnobs_gym.simulation.system import stack
 
 SETUP = Linear.setups["benchmark"]
-
-
-@dataclass(frozen=True)
-class Counted(Linear):
-    discrete = True
-    setups = {"benchmark": replace(SETUP, dt=1.0)}
-
-    def f(self, t, x, u):
-        return 0.5 * x
-
-
-@dataclass(frozen=True)
-class Exact(Linear):
-    def flow(self, t0, t1, x, u):
-        rest = np.exp(-np.asarray(t1 - t0))
-        return stack(x, rest * x[..., 0], rest * x[..., 1])
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from linear import Linear, linear_record
+from other_motions import Counted, Exact
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
@@ -14,7 +15,6 @@ from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.motion import MOST_STEPS
 from pinnobs_gym.simulation.record import Prior
-from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.simulation.truth import disturbed_truth, truth
 
 SETUP = Linear.setups["benchmark"]
@@ -29,24 +29,6 @@ class Switched(Linear):
 @dataclass(frozen=True)
 class Stiff(Linear):
     stiff = True
-
-
-@dataclass(frozen=True)
-class Counted(Linear):
-    discrete = True
-    setups = {"benchmark": replace(SETUP, dt=1.0)}
-
-    def f(self, t, x, u):
-        return 0.5 * x
-
-
-@dataclass(frozen=True)
-class Exact(Linear):
-    """Its own flow takes one call through any gap."""
-
-    def flow(self, t0, t1, x, u):
-        rest = np.exp(-np.asarray(t1 - t0))
-        return stack(x, rest * x[..., 0], rest * x[..., 1])
 
 
 def line(kind, end, count, longest=" of at most 0.1 s", unit=" s", start="0"):
