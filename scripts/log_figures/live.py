@@ -90,12 +90,16 @@ def of_ekf(name: str, repeats: int, missing: list[str]) -> Iterator[Figure]:
 
 
 def of_all(name: str, repeats: int) -> Iterator[Figure]:
-    """Measure all estimators of a system beside their own updates."""
+    """Measure all estimators of a system but the EKF beside their own updates."""
     record = repeated(name, 1, 61)
     for estimator in estimators(EpisodeSource(name)):
+        if type(estimator) is EKF:
+            continue
         calls = [played(estimator, record), updated(estimator, record)]
         live, own = medians(calls, repeats) / record.num_samples * 1e6
-        what = f"{estimator.label}, {name}: one sample"
+        window = estimator.options.get("window")
+        label = estimator.label if window is None else f"{estimator.label}, window {window}"
+        what = f"{label}, {name}: one sample"
         yield Figure(f"{what}, live", float(live), "us", "", None)
         yield Figure(f"{what}, estimator's update", float(own), "us", "", None)
 
