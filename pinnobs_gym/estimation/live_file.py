@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimation.live_identity import check_identity, identity
 from pinnobs_gym.estimation.live_tree import Tree, in_memory_order
 from pinnobs_gym.files import replacing
+from pinnobs_gym.files.archive import Damaged, arrays_of, json_in, read_parts
 
 FORMAT = "pinnobs-gym live filter"
 VERSION = 1
@@ -43,12 +44,8 @@ def write(path: Path, estimator: Estimator, content: Mapping[str, Any]) -> None:
     }
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     arrays: dict[str, Any] = {f"array{i}": array for i, (array, _) in enumerate(ordered)}
-    with replacing(path) as temporary:
-        try:
-            with temporary.open("wb") as file:
-                np.savez(file, header=text, **arrays)
-        except OSError as error:
-            raise ValueError(f"cannot write {path}: {error}") from None
+    with replacing(path, durable=True) as temporary, temporary.open("wb") as file:
+        np.savez(file, header=text, **arrays)
 
 
 def read(path: Path, estimator: Estimator) -> dict[str, Any]:
@@ -82,21 +79,18 @@ def read(path: Path, estimator: Estimator) -> dict[str, Any]:
 
 def damaged(path: Path, error: Exception) -> ValueError:
     """Return the error of one line that says that a file cannot be used."""
-    reason = " ".join(f"{type(error).__name__}: {error}".split())
+    kind = "" if isinstance(error, Damaged) else f"{type(error).__name__}: "
+    reason = " ".join(f"{kind}{error}".split())[:300]
     return ValueError(f"{path} is damaged or no file of a live filter ({reason})")
 
 
 def _loaded(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the header and the arrays of a file."""
     try:
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            arrays = {name: loaded[name] for name in loaded.files}
-        header = json.loads(arrays["header"].tobytes())
+        arrays = arrays_of(read_parts(path))
+        header = json_in(arrays["header"].tobytes())
         if header["format"] != FORMAT or not isinstance(header["identity"], dict):
             raise TypeError("another format")
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from None
-    except Exception as error:  # zip files and NumPy raise many kinds for what they cannot read
+    except (Damaged, LookupError, TypeError) as error:
         raise damaged(path, error) from None
     return header, arrays

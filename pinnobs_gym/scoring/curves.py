@@ -4,7 +4,6 @@ rows."""
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from pinnobs_gym.envs.figures import drawn_outputs, measured_states
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import file_name, replacing
+from pinnobs_gym.files.archive import Damaged, arrays_of, json_in, read_parts
 from pinnobs_gym.scoring.metrics import by_sample
 from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.rows import Row, game_of
@@ -144,15 +144,24 @@ def read(folder: Path, game: GameName) -> dict[tuple[str, str], list[Curves]]:
     """
     by_estimator: dict[tuple[str, str], list[Curves]] = {}
     for path in sorted(_folder_of_game(folder, game).glob("*.npz")):
-        try:
-            with path.open("rb") as file, np.load(file) as data:
-                about = json.loads(str(data["about"]))
-                curves = _from_arrays(about, {name: data[name] for name in data.files})
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"cannot read curves from {path}: {error}; delete it") from None
-        game_hash, estimator_hash = about["hashes"]
-        by_estimator.setdefault((game_hash, estimator_hash), []).append(curves)
+        hashes, curves = _read(path)
+        by_estimator.setdefault(hashes, []).append(curves)
     return {name: sorted(parts, key=lambda c: c.seeds[0]) for name, parts in by_estimator.items()}
+
+
+def _read(path: Path) -> tuple[tuple[str, str], Curves]:
+    """Read a file: the hashes of game and estimator, and the curves."""
+    try:
+        arrays = arrays_of(read_parts(path, compressed=True))
+        about = json_in(str(arrays["about"]))
+        game_hash, estimator_hash = map(str, about["hashes"])
+        curves = _from_arrays(about, arrays)
+        if curves.error.shape != (len(curves.seeds), len(curves.t)):
+            raise Damaged(f"errors of shape {curves.error.shape}")
+    except (Damaged, LookupError, TypeError, ValueError, AttributeError) as error:
+        reason = str(error).removeprefix(f"cannot read {path}: ")
+        raise ValueError(f"cannot read curves from {path}: {reason}; delete it") from None
+    return (game_hash, estimator_hash), curves
 
 
 def merged(parts: Iterable[Curves], seeds: Iterable[int]) -> Curves | None:

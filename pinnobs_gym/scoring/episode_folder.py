@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 
 from pinnobs_gym.envs.game import Game, GameName
+from pinnobs_gym.files import replacing_folder
+from pinnobs_gym.files.archive import Damaged, json_in
+from pinnobs_gym.files.seal import sealed, unsealed
 from pinnobs_gym.scoring.episode_table import writing
 from pinnobs_gym.scoring.evaluation import BATCH, seeds_of
 from pinnobs_gym.scoring.issue import FORMAT, Issue
@@ -53,12 +53,12 @@ def write_folder(
     facts = issue.facts()
     if is_there(folder, facts):
         return False
-    with _new_folder(folder) as made:
+    with replacing_folder(folder) as made:
         _write_tables(made, issue, progress)
         for name, text in texts.items():
             (made / name).write_text(text, encoding="utf-8", newline="\n")
         facts |= {_HASHES: {name: _sha256(made / name) for name in issue.tables}}
-        text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(sealed(facts), indent=2, ensure_ascii=False, allow_nan=False)
         (made / GAME_FILE).write_text(text + "\n", encoding="utf-8", newline="\n")
     return True
 
@@ -104,23 +104,6 @@ def _sha256(path: Path) -> str | None:
         return None
 
 
-@contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that becomes ``folder`` at the end, or is removed after an error."""
-    temporary = folder.with_name(f".{folder.name}.{uuid4().hex}")
-    try:
-        temporary.mkdir(parents=True)
-        try:
-            yield temporary
-            if folder.exists():
-                folder.rmdir()  # it is empty
-            os.replace(temporary, folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-    except OSError as error:
-        raise ValueError(f"cannot write folder {folder}: {error}") from None
-
-
 def _write_tables(folder: Path, issue: Issue, progress: Callable[[int], None] | None) -> None:
     """Play the episodes batch by batch, and write their samples."""
     source = issue.game.source
@@ -157,12 +140,12 @@ def _read_facts(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"there is no {path}; expected a folder that pinnobs episodes wrote")
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        facts = json_in(path.read_bytes())
+        if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+            raise ValueError(f"{path} is no file of pinnobs episodes of format {FORMAT}")
+        return unsealed(facts)
+    except (OSError, Damaged) as error:
         raise ValueError(f"cannot read {path}: {error}") from None
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise ValueError(f"{path} is no file of pinnobs episodes of format {FORMAT}")
-    return facts
 
 
 def read_folder(folder: Path, system: str | None = None) -> tuple[Game, range]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.files import json_line, locked, replacing, write_whole
+from pinnobs_gym.files import CannotWrite, json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.scoring.present import Present, present_in
 from pinnobs_gym.scoring.row_format import KEY, LOG_FILES, OPTIONAL, SCHEMA, Row, checked
@@ -57,10 +57,6 @@ class Stored(NamedTuple):
     """The rows of kind ``use``, in the order of the file."""
 
 
-class CannotWrite(ValueError):
-    """Rows could not be written; the content of the file is unchanged."""
-
-
 key: Callable[[Row], tuple[Any, ...]] = itemgetter(*KEY)
 """Return the values of `KEY` of a row."""
 
@@ -91,7 +87,8 @@ def append(path: Path, rows: Iterable[Row], *, replace: bool = False) -> None:
             present = present_in(path, file, _key_in)
             _write(file, b"".join(_line(row) for row in _new(rows, present)))
     except OSError as error:
-        raise CannotWrite(f"cannot write rows to {path}: {error}") from None
+        reason = error.strerror or error
+        raise CannotWrite(f"cannot write rows to {path}: {reason}; it is unchanged") from None
 
 
 def _new(rows: Iterable[Row], present: Present) -> Iterator[Row]:
@@ -114,7 +111,7 @@ def _replace(path: Path, file: FileIO, rows: Sequence[Row]) -> None:
     lines += [] if _is_cut(tail) or not tail else [tail]
     file.close()  # Windows replaces no open file
     kept = [line + b"\n" for line in lines if _key_in(line) not in keys]
-    with replacing(path) as temporary:
+    with replacing(path, durable=True) as temporary:
         temporary.write_bytes(b"".join(kept) + b"".join(_line(row) for row in rows))
 
 

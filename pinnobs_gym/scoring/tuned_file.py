@@ -1,7 +1,8 @@
 """Files of tuned settings, one for each system, in the folder of its module.
 
 The file of the class ``ReverseDuffing`` is ``ReverseDuffing.tuned.json``, a list with an entry for
-each setup and estimator.
+each setup and estimator. An entry has a digest of its values: settings that were changed since do
+not have the error that was found for them.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from typing import Any
 
 from pinnobs_gym.estimation.hints import check_field, field_hints
 from pinnobs_gym.files import file_name, holding, replacing
+from pinnobs_gym.files.archive import Damaged, json_in
+from pinnobs_gym.files.seal import SEAL, sealed, unsealed
 from pinnobs_gym.simulation.system import System
 
 
@@ -91,8 +94,8 @@ def store(system: type[System], entry: TunedEntry) -> Path:
     try:
         with holding(path):
             kept = [e for e in read(path) if e.env_id == entry.env_id and e.key != entry.key]
-            entries = [asdict(each) for each in sorted([*kept, entry], key=lambda e: e.key)]
-            with replacing(path) as temporary:
+            entries = [sealed(asdict(each)) for each in sorted([*kept, entry], key=lambda e: e.key)]
+            with replacing(path, durable=True) as temporary:
                 text = json.dumps(entries, indent=2, ensure_ascii=False, allow_nan=False)
                 temporary.write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -104,11 +107,11 @@ def store(system: type[System], entry: TunedEntry) -> Path:
 def _read(path: Path, _changed: int, _size: int) -> tuple[TunedEntry, ...]:
     """Read a file; time of change and size tell whether it is the one that was read before."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json_in(path.read_bytes())
         if not isinstance(content, list):
             raise ValueError("expected a list of entries")
         return tuple(map(_entry, content))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, Damaged) as error:
         raise ValueError(f"cannot read tuned settings from {path}: {error}") from None
 
 
@@ -117,11 +120,12 @@ def _entry(content: Any) -> TunedEntry:
 
     Raises:
         ValueError: in one line, if it lacks a field, or has another one, or one of a wrong type.
+        Damaged: if it is not as it was written.
     """
-    names = {field.name for field in fields(TunedEntry)}
+    names = {SEAL, *(field.name for field in fields(TunedEntry))}
     if not isinstance(content, dict) or content.keys() != names:
         found = sorted(content) if isinstance(content, dict) else content
         raise ValueError(f"an entry with {found!r:.200}; expected {', '.join(sorted(names))}")
     for name, hint in field_hints(TunedEntry).items():
         check_field(name, content[name], hint)
-    return TunedEntry(**content)
+    return TunedEntry(**unsealed(content))

@@ -18,6 +18,7 @@ from pinnobs_gym.cli import main
 from pinnobs_gym.cli.model_code import equations_text, matlab_model
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.files.seal import sealed
 from pinnobs_gym.scoring.metrics import SCORES
 from pinnobs_gym.scoring.submitted import check_name
 from pinnobs_gym.simulation.system import stack
@@ -476,9 +477,12 @@ def test_records_of_other_code_are_refused(folder, submitted, capsys):
         ({"episodes": "3"}, "episodes='3'; it is not as it was written"),
         ({"format": 9}, "is no file of pinnobs episodes of format 1"),
     ):
-        path.write_text(json.dumps(facts | change))
+        path.write_text(json.dumps(sealed(facts | change)))
         assert score("records/estimates.csv", "records") == 2
         assert said in error(capsys)
+    path.write_text(json.dumps(facts | {"first_episode": 1}))
+    assert score("records/estimates.csv", "records") == 2
+    assert "game.json: its values are not those that were written" in error(capsys)
     path.unlink()
     assert score("records/estimates.csv", "records") == 2
     assert error(capsys).startswith(f"there is no {path.relative_to(folder)}; expected a folder")

@@ -324,7 +324,7 @@ def test_objects_in_arrays_are_not_read(tmp_path):
     with path.open("wb") as file:
         np.savez(file, **arrays)
     with pytest.raises(
-        ValueError, match=r"is damaged or no file of a live filter \(ValueError: Ob"
+        ValueError, match=r"is damaged or no file of a live filter \(an array of object; expected"
     ):
         Live.load(path, estimator)
 

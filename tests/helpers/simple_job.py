@@ -5,7 +5,7 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.scoring import rows
+from pinnobs_gym.files import CannotWrite
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Simple:
         if self.what == "fail":
             raise RuntimeError("out\nof luck")
         if self.what == "fill":
-            raise rows.CannotWrite("the disk is full")
+            raise CannotWrite("the disk is full")
         self._note("done")
 
     def anew(self):

@@ -7,6 +7,7 @@ import signal
 import pytest
 from stored_rows import row, write_fifty
 
+from pinnobs_gym.files import CannotWrite
 from pinnobs_gym.scoring import row_format, rows
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 
@@ -363,9 +364,9 @@ def test_a_full_disk_leaves_no_half_line(tmp_path):
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 100, hard))
     try:
-        with pytest.raises(rows.CannotWrite, match="only 100 of") as caught:
+        with pytest.raises(CannotWrite, match="only 100 of") as caught:
             rows.append(path, [row(1)])
-        with pytest.raises(rows.CannotWrite, match="only 100 of"):
+        with pytest.raises(CannotWrite, match="only 100 of"):
             rows.append(path, [row(1)])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -10,6 +10,7 @@ from pinnobs_gym.cli import main
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.files.seal import sealed
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.plan import jobs_of
 from pinnobs_gym.leaderboard.suites import Entry, Suite
@@ -40,7 +41,7 @@ ENTRY = TunedEntry(
     versions={"numpy": "2"},
     date="2030-01-02",
 )
-TUNED = [{**vars(ENTRY), "settings": dict(ENTRY.settings), "versions": {"numpy": "2"}}]
+TUNED = sealed(vars(ENTRY))
 
 
 @pytest.fixture
@@ -61,7 +62,7 @@ def test_a_file_has_one_entry_for_each_setup_and_estimator(spring, tmp_path):
     for entry in (replace(ENTRY, error=0.5), other, ENTRY):
         assert store(spring, entry) == path
     assert read(path) == (ENTRY, other)
-    assert json.loads(path.read_text()) == [TUNED[0], {**TUNED[0], "setup": "paper"}]
+    assert json.loads(path.read_text()) == [TUNED, sealed(TUNED | {"setup": "paper"})]
     later = replace(ENTRY, env_id="pinnobs/Spring-v1")
     store(spring, later)  # what was found for another version is of no use
     assert read(path) == (later,)
@@ -74,9 +75,11 @@ def test_a_file_has_one_entry_for_each_setup_and_estimator(spring, tmp_path):
         ("{", "Expecting property name"),
         ("{}", "expected a list of entries"),
         ("[3]", "an entry with 3; expected condition, date, "),
-        (json.dumps([{**TUNED[0], "more": 1}]), "'more'"),
-        (json.dumps([{**TUNED[0], "trials": 1.5}]), "trials=1.5; expected a whole number"),
-        (json.dumps([{**TUNED[0], "settings": [1]}]), "settings=[1]; expected"),
+        (json.dumps([sealed(TUNED | {"more": 1})]), "'more'"),
+        (json.dumps([sealed(TUNED | {"trials": 1.5})]), "trials=1.5; expected a whole number"),
+        (json.dumps([sealed(TUNED | {"settings": [1]})]), "settings=[1]; expected"),
+        (json.dumps([TUNED | {"error": 0.001}]), "their digest differs"),
+        ("[" * 500 + "]" * 500, "nested deeper"),
     ],
 )
 def test_a_damaged_file_is_named_in_one_line(spring, capsys, text, message):

@@ -98,8 +98,11 @@ class Trained(ABC):
             trained = from_content(cls, saved["fields"])
             found = {"system": trained.system, "parameters": trained.parameters}
             check_same(path, found, {name: identity(system)[name] for name in found})
-            trained.check_fits(path, system)
-        except (KeyError, TypeError, IndexError, AttributeError, RuntimeError) as error:
+            try:
+                trained.check_fits(path, system)
+            except ValueError as error:
+                raise error if str(path) in str(error) else TypeError(error) from None
+        except (LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
             reason = str(error).partition("\n")[0]
             raise ValueError(f"{path} is not a saved {cls.__name__}: {reason}") from None
         if trainer is not None:

@@ -1,4 +1,5 @@
-"""Files of trained weights: written atomically, read without running code, and checked.
+"""Files of trained weights: written atomically, read without running code, and checked against
+their own checksums.
 
 Torch is imported only when a file is read or written, so that importing this module is cheap.
 """
@@ -7,15 +8,15 @@ from __future__ import annotations
 
 import io
 import json
-import os
+import pickletools
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 
+from pinnobs_gym.files import replacing
+from pinnobs_gym.files.archive import Damaged, check_depth, damaged, plain_archive, read_parts
 from pinnobs_gym.simulation.system import System
 
 
@@ -86,23 +87,14 @@ def write(path: str | Path, content: Mapping[str, Any]) -> None:
     """Write tensors and plain values to a file atomically.
 
     Raises:
-        ValueError: in one line, if the file cannot be written.
+        CannotWrite: in one line, if the file cannot be written.
     """
     import torch
 
-    path = Path(path)
-    temporary = path.with_name(f"{path.name}.{uuid4().hex}.part")
     buffer = io.BytesIO()
     torch.save(dict(content), buffer)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(Path(path), durable=True) as temporary:
         temporary.write_bytes(buffer.getbuffer())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ValueError(f"cannot write {path}: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -111,15 +103,64 @@ def read(path: str | Path) -> dict[str, Any]:
     Raises:
         ValueError: in one line, if the file does not exist, is damaged or of another kind.
     """
-    import torch
-
+    path = Path(path)
     try:
-        content = torch.load(Path(path), map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from None
-    except Exception as error:  # torch raises many kinds for a file it does not understand
-        kind = type(error).__name__
-        raise ValueError(f"{path} is damaged or no file of saved weights ({kind})") from None
+        parts = read_parts(path)
+        content = _loaded(parts)
+        _check_sizes(content, sum(map(len, parts.values())))
+        check_depth(content)
+    except Damaged as error:
+        raise ValueError(f"{path} is damaged or no file of saved weights ({error})") from None
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds a {type(content).__name__}; expected a dict of weights")
     return content
+
+
+_MADE = ("collections OrderedDict", "torch._utils _rebuild_tensor_v2")
+"""What torch's files of weights make, beside storages of tensors, dicts, lists and numbers."""
+_SHARED = 16
+"""Largest number of tensors that share their numbers, on average."""
+
+
+def _loaded(parts: Mapping[str, bytes]) -> Any:
+    """Return the content of checked parts.
+
+    Torch makes only what its list of safe names has. Of these a file of weights needs few; with
+    others it could ask for any amount of memory.
+    """
+    import torch
+
+    try:
+        (plan,) = (part for name, part in parts.items() if name.endswith("/data.pkl"))
+        for opcode, name, _ in pickletools.genops(plan):
+            storage = str(name).startswith("torch ") and str(name).endswith("Storage")
+            if "GLOBAL" in opcode.name and name not in _MADE and not storage:
+                raise Damaged(f"it holds a {name!r:.80}; expected weights")
+        return torch.load(plain_archive(parts), map_location="cpu", weights_only=True)
+    except Damaged:
+        raise
+    except Exception as error:  # torch raises many kinds for a file it does not understand
+        raise damaged(error) from None
+
+
+def _check_sizes(content: Any, size: int) -> None:
+    """Check that the content of a file of some number of bytes is not much larger than these:
+    tensors may be views that repeat their numbers, and a part may occur often.
+
+    Raises:
+        Damaged: otherwise.
+    """
+    import torch
+
+    waiting, left = [content], _SHARED * size
+    while waiting:
+        value = waiting.pop()
+        left -= 1
+        if isinstance(value, torch.Tensor):
+            left -= value.numel() * value.element_size()
+        elif isinstance(value, Mapping):
+            waiting += [*value.keys(), *value.values()]
+        elif isinstance(value, tuple | list):
+            waiting += value
+        if left < len(waiting):
+            raise Damaged(f"its content is more than {_SHARED} times its {size} bytes")

@@ -21,10 +21,9 @@ from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 from uuid import uuid4
 
-from pinnobs_gym.files import holding, is_held
+from pinnobs_gym.files import CannotWrite, holding, is_held
 from pinnobs_gym.leaderboard.jobs.pool import Pool, ThisProcess, WorkerLost
 from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob
-from pinnobs_gym.scoring.rows import CannotWrite
 
 LISTEN = 0.5
 """Seconds between two checks for Ctrl-C while no job ends: Windows does not interrupt a wait."""

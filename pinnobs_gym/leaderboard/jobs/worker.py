@@ -13,12 +13,10 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
-from uuid import uuid4
 
 from threadpoolctl import threadpool_limits
 
-from pinnobs_gym.files import is_held
-from pinnobs_gym.scoring.rows import CannotWrite
+from pinnobs_gym.files import CannotWrite, is_held, replacing
 
 SEEN_AFTER = 5.0
 """Longest time in s until other machines of a shared folder see a new file."""
@@ -127,14 +125,12 @@ def _earlier_outcome(number: int, mark: Path) -> Outcome | None:
 
 def _note(number: int, outcome: Outcome, mark: Path) -> None:
     """Record that a job has ended."""
-    unfinished = mark / f"{number}.{uuid4().hex}"
     try:
-        unfinished.write_text(outcome.error or "", encoding="utf-8")
-        os.replace(unfinished, mark / str(number))
-    except FileNotFoundError:  # the client no longer waits for the outcome
-        return
-    except OSError as cause:
-        raise CannotWrite(f"cannot write {mark / str(number)}: {cause}") from None
+        with replacing(mark / str(number), create_folder=False) as unfinished:
+            unfinished.write_text(outcome.error or "", encoding="utf-8")
+    except CannotWrite:
+        if mark.is_dir():  # else the client no longer waits for the outcome
+            raise
 
 
 def _prepare(origin: Origin) -> None:

@@ -13,6 +13,8 @@ from typing import Any
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.estimation.hints import as_tuple, check_field, field_hints
 from pinnobs_gym.files import replacing
+from pinnobs_gym.files.archive import Damaged, json_in
+from pinnobs_gym.files.seal import sealed, unsealed
 
 FOLDER = Path(__file__).parent
 """The folder of the results that ship with the package."""
@@ -21,6 +23,8 @@ FORMAT = 1
 CURVES = "curves"
 """The folder of errors over time, as `pinnobs_gym.scoring.curves` writes it."""
 _NAME = "published.json"
+_LARGEST = 2**28
+"""Largest number of bytes of a file when it is unpacked."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,27 +108,29 @@ class Manifest:
         """
         path = folder / _NAME
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json_in(path.read_bytes())
         except FileNotFoundError:
             return None
         except OSError as error:
             raise ValueError(f"cannot read {path}: {error.strerror or error}") from None
-        except (ValueError, RecursionError):
+        except Damaged:
             content = None
         if not isinstance(content, dict):
             raise ValueError(f"{path} is damaged: it is no JSON object")
-        if content.pop("format", None) != FORMAT:
+        if content.get("format") != FORMAT:
             raise ValueError(
                 f"{path} is of another version of pinnobs-gym; this one reads format {FORMAT}: "
                 "install the package again"
             )
         try:
+            content = unsealed(content)
+            del content["format"]
             parts = {
                 name: tuple(_made(kind, entry) for entry in content.pop(name))
                 for name, kind in _KINDS.items()
             }
             return _made(cls, content | parts | {"folder": folder})
-        except (KeyError, TypeError, ValueError) as error:
+        except (Damaged, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged: {error}") from None
 
     def write(self) -> None:
@@ -135,8 +141,9 @@ class Manifest:
         """
         content = {"format": FORMAT, **asdict(self)}
         del content["folder"]
-        with replacing(self.folder / _NAME) as temporary:
-            temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        with replacing(self.folder / _NAME, durable=True) as temporary:
+            text = json.dumps(sealed(content), indent=1)
+            temporary.write_text(text + "\n", encoding="utf-8")
 
     def content(self, entry: PublishedFile) -> bytes:
         """Return the content of a published file, after a check of its size and hash.
@@ -158,7 +165,13 @@ class Manifest:
             raise ValueError(
                 f"{path} is not the published file: its SHA-256 differs; install the package again"
             )
-        return lzma.decompress(data)
+        try:
+            content = lzma.LZMADecompressor().decompress(data, _LARGEST + 1)
+        except lzma.LZMAError as error:
+            raise ValueError(f"{path} is damaged: {error}") from None
+        if len(content) > _LARGEST:
+            raise ValueError(f"{path} has more than {_LARGEST} bytes when it is unpacked")
+        return content
 
 
 _KINDS = {"rows": PublishedRows, "trained": PublishedTraining, "curves": PublishedFile}

@@ -75,7 +75,7 @@ def pack(
     files = [*rows_files, *_trained_files(jobs, seeds[0]), *curves_files]
     _check_size(files, largest)
     for file in files:
-        with replacing(to / file.entry.file) as temporary:
+        with replacing(to / file.entry.file, durable=True) as temporary:
             temporary.write_bytes(file.data)
     entries = [file.entry for file in files]
     manifest = Manifest(

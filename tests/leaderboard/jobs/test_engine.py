@@ -14,6 +14,7 @@ from simple_job import Simple
 from waiting import PATIENCE, heed_ctrl_c, until
 
 from pinnobs_gym.cli import main
+from pinnobs_gym.files import CannotWrite
 from pinnobs_gym.leaderboard.jobs import cluster, worker
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.worker import Origin
@@ -250,7 +251,7 @@ def test_what_cannot_be_written_ends_the_run(tmp_path):
     jobs = [Simple(tmp_path, 0), Simple(tmp_path, 1, "fill"), Simple(tmp_path, 2)]
     ended = Engine(Workers(1)).run(jobs)
     assert next(ended).job.number == 0
-    with pytest.raises(rows.CannotWrite, match="the disk is full"):
+    with pytest.raises(CannotWrite, match="the disk is full"):
         next(ended)
     assert (tmp_path / "notes").read_text() == "0 done\n"
 

@@ -8,6 +8,7 @@ from made_published import KKL, SUITE
 
 import pinnobs_gym
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.files.seal import sealed
 from pinnobs_gym.leaderboard.against import compare, opponents
 from pinnobs_gym.leaderboard.jobs import plan, trainings
 from pinnobs_gym.leaderboard.jobs.job import run_job
@@ -40,7 +41,7 @@ def listed(folder, change):
     path = folder / "published.json"
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(sealed(content)))
 
 
 @pytest.mark.parametrize("name", ["kkl_supervised", "pinn_obs"])
