@@ -13,7 +13,7 @@ import gymnasium as gym
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.files import check_writable
+from pinnobs_gym.files import check_writable, replacing
 
 FPS = 30.0
 """Largest number of frames per second."""
@@ -83,14 +83,14 @@ def write_video(path: Path, estimator: BaseEstimator, game: Game, seed: int) -> 
             break
     drawn.close()
     frames += frames[-1:] * round(pace.fps)
-    try:
-        with tempfile.TemporaryDirectory(prefix=".video", dir=path.parent) as folder:
-            # save_video chooses the file's name.
-            save_video(frames, folder, episode_trigger=lambda _: True, fps=pace.fps)
-            (written,) = Path(folder).iterdir()
-            os.replace(written, path)
-    except OSError as error:
-        raise ValueError(f"cannot write {path}: {' '.join(str(error).split())}") from None
+    with (
+        replacing(path) as temporary,
+        tempfile.TemporaryDirectory(prefix=".video", dir=path.parent) as folder,
+    ):
+        # save_video chooses the file's name.
+        save_video(frames, folder, episode_trigger=lambda _: True, fps=pace.fps)
+        (written,) = Path(folder).iterdir()
+        os.replace(written, temporary)
     return pace
 
 

@@ -31,6 +31,7 @@ from pinnobs_gym.files.appending import (
 )
 from pinnobs_gym.files.names import file_name
 from pinnobs_gym.files.writing import (
+    NO_SPACE,
     CannotWrite,
     cannot_write,
     check_writable,
@@ -39,6 +40,7 @@ from pinnobs_gym.files.writing import (
 )
 
 __all__ = [
+    "NO_SPACE",
     "CannotWrite",
     "append_lines",
     "cannot_write",

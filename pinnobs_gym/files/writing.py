@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
@@ -11,6 +12,13 @@ from pathlib import Path
 
 _SHOWN = 40
 """Largest number of characters of a name that are part of a temporary one."""
+
+
+NO_SPACE = frozenset(
+    getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EROFS") if hasattr(errno, name)
+)
+"""Errors that say that nothing more can be written: the disk or the quota is full, or the disk may
+only be read."""
 
 
 class CannotWrite(ValueError):

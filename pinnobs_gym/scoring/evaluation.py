@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from pinnobs_gym.envs.game import AnyGame, Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.files import CannotWrite
 from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring import rows as rows_module
 from pinnobs_gym.scoring.curves import curves_of, folder_of, save
@@ -33,6 +34,7 @@ from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.scoring.tuned import SUFFIX, TUNED, is_tuned, required_settings
 from pinnobs_gym.simulation.conditions import canonical_name
+from pinnobs_gym.simulation.notices import say_first
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.by_name import LOGS
 from pinnobs_gym.training.log import SILENT, Log
@@ -264,7 +266,7 @@ def score_episodes(
             done = [{**row, **further} for row, further in zip(done, more(played), strict=True)]
         if results is not None:
             # Curves first: if a crash follows, episodes without rows are run again.
-            save(folder_of(results.path), done[0], curves_of(played))
+            _save_curves(results.path, done[0], played)
             rows_module.append(results.path, done, replace=results.fresh)
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
@@ -273,6 +275,15 @@ def score_episodes(
         results.note_use(common)
     rows = [stored[rows_module.key(row)] for row in wanted]
     return Evaluated(rows, first_played, len(wanted) - len(missing))
+
+
+def _save_curves(results: Path, row: Row, played: Played) -> None:
+    """Save the errors over time beside a rows file. Scores do not depend on them: if they cannot be
+    written, a line is logged, once in each process."""
+    try:
+        save(folder_of(results), row, curves_of(played))
+    except CannotWrite as error:
+        say_first("curves", f"{error}; scores are stored without these errors over time")
 
 
 def _scored(played: Played) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Lines in the log about what an estimator had to do on its own, each said once."""
+"""Lines in the log about what was done otherwise than asked, each said once."""
 
 from __future__ import annotations
 
@@ -12,3 +12,14 @@ _LOGGER = logging.getLogger(__name__)
 def say_once(line: str) -> None:
     """Log a warning the first time that this process says this line."""
     _LOGGER.warning(line)
+
+
+_SUBJECTS: set[str] = set()
+"""What `say_first` was called about."""
+
+
+def say_first(subject: str, line: str) -> None:
+    """Log a warning the first time that this process says anything about a subject."""
+    if subject not in _SUBJECTS:
+        _SUBJECTS.add(subject)
+        _LOGGER.warning(line)

@@ -4,52 +4,44 @@ from __future__ import annotations
 
 import hashlib
 import io
-import tempfile
-import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from pinnobs_gym.files import CannotWrite, cannot_write, check_writable
+from pinnobs_gym.simulation.notices import say_first
+from pinnobs_gym.training.event_file import EventFile
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 
 class Log:
     """TensorBoard log of one run, in one folder; usable as a context manager.
 
-    Without a folder every method does nothing, so that callers need not test for None. TensorBoard
-    is imported at the first write.
+    Without a folder every method does nothing, so that callers need not test for None. The same
+    holds from the first error of the disk on, of which a line is logged, once in each process: a
+    result does not depend on its log. TensorBoard is imported at the first write.
 
     Args:
         folder: folder of the event files; it is created if it does not exist.
-
-    Raises:
-        ValueError: in one line, if the folder cannot be created or written to.
     """
 
     def __init__(self, folder: str | Path | None) -> None:
         self._folder = None if folder is None else Path(folder)
-        self._opened: EventFileWriter | None = None
-        if self._folder is None:
-            return
-        try:  # fail now: the writer's own thread would fail much later
-            self._folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=self._folder).close()
-        except OSError as error:
-            reason = error.strerror or error
-            raise ValueError(f"cannot write a log to {self._folder}: {reason}") from None
+        self._opened: EventFile | None = None
+        if self._folder is not None:
+            try:
+                check_writable(self._folder)
+            except CannotWrite as error:
+                self._give_up(error)
 
     @property
     def active(self) -> bool:
         """Whether anything is written; if not, callers can skip costly figures."""
         return self._folder is not None
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder of the event files, for libraries that write their own."""
-        return self._folder
 
     def scalar(self, tag: str, value: float, step: int) -> None:
         """Add a point to the curve ``tag``."""
@@ -78,9 +70,12 @@ class Log:
 
     def close(self) -> None:
         """Flush and close the event file; later writes open a new one."""
-        if self._opened is not None:
-            self._opened.close()
-            self._opened = None
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            try:
+                opened.close()
+            except OSError as error:
+                self._give_up(error)
 
     def __enter__(self) -> Self:
         return self
@@ -95,14 +90,23 @@ class Log:
 
     def _add(self, value: Any, step: int) -> None:
         """Write one value at a step."""
-        from tensorboard.compat.proto import event_pb2
-        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+        if self._folder is None:  # an error came before
+            return
+        try:
+            if self._opened is None:
+                self._opened = EventFile(self._folder)
+            self._opened.add(value, step)
+        except OSError as error:
+            self._give_up(error)
 
-        if self._opened is None:
-            self._opened = EventFileWriter(str(self._folder))
-        summary = _summary()(value=[value])
-        events: Any = event_pb2
-        self._opened.add_event(events.Event(wall_time=time.time(), step=step, summary=summary))
+    def _give_up(self, error: OSError | CannotWrite) -> None:
+        """Write nothing from now on, and say why."""
+        reason = error if isinstance(error, CannotWrite) else cannot_write(self._folder, error)
+        say_first("TensorBoard", f"{reason}; what follows is done without this TensorBoard log")
+        opened, self._opened, self._folder = self._opened, None, None
+        if opened is not None:
+            with suppress(OSError):
+                opened.close()
 
 
 def _summary() -> Any:

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pinnobs_gym.estimation.learned.trained import Trained
+from pinnobs_gym.files import CannotWrite
+from pinnobs_gym.simulation.notices import say_first
 from pinnobs_gym.training.checkpoint import load_checkpoint, save_checkpoint
 from pinnobs_gym.training.log import SILENT, Log
 from pinnobs_gym.training.trainer import Trainer
@@ -36,7 +38,7 @@ def train(
         trainer: the trainer, which may have made iterations already.
         log: destination of curves, figures and settings.
         checkpoint: file of the training's state, rewritten every ``checkpoint_every`` iterations
-            and at the end.
+            and at the end; where that fails, a line is logged, and the training goes on.
         resume: resume from the checkpoint, exactly unless the trainer says otherwise.
         progress: show a progress bar in the terminal.
 
@@ -61,11 +63,11 @@ def train(
                     _show(trainer, log, show if progress else None)
                     shown = trainer.iteration
                 if checkpoint is not None and trainer.iteration % config.checkpoint_every == 0:
-                    save_checkpoint(trainer, checkpoint)
+                    _save(trainer, checkpoint)
             if trainer.iteration not in (0, shown):
                 _show(trainer, log, show if progress else None)
         if checkpoint is not None:
-            save_checkpoint(trainer, checkpoint)
+            _save(trainer, checkpoint)
     except KeyboardInterrupt:  # within an iteration: the last checkpoint stays valid
         if not trainer.iteration:
             raise
@@ -74,6 +76,15 @@ def train(
     if log.active:
         _log_end(trainer, trained, log)
     return trained
+
+
+def _save(trainer: Trainer[Any, Any], checkpoint: Path) -> None:
+    """Write a checkpoint. If it cannot be written, the training goes on, and the one before stays;
+    a line is logged, once in each process."""
+    try:
+        save_checkpoint(trainer, checkpoint)
+    except CannotWrite as error:
+        say_first("checkpoint", f"{error}; the training goes on, and an earlier checkpoint is kept")
 
 
 class Interrupt:

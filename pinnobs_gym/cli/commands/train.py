@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import tyro
 
@@ -17,7 +17,7 @@ from pinnobs_gym.cli.training_task import Task, on_episodes, on_logs
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.files import check_writable
+from pinnobs_gym.files import CannotWrite, check_writable
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.registry import TRAINERS, trainer_name
 from pinnobs_gym.scoring import acceptance
@@ -27,6 +27,11 @@ from pinnobs_gym.training.by_name import load
 from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import train
 from pinnobs_gym.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from pinnobs_gym.estimation.learned.trained import Trained
 
 ConfigType = TypeVar("ConfigType")
 _SIMULATED = ("--setup", "--condition", "--episode", "--episodes")
@@ -84,17 +89,14 @@ def run(arguments: Sequence[str]) -> int:
     trainer = task.make()
     with Log(chosen.out / "tensorboard" / task.stem.name) as log:
         result = train(trainer, log=log, checkpoint=checkpoint, resume=chosen.resume, progress=True)
-    result.save(path)
-    pictures = {task.file(f"-{kind}.png"): each for kind, each in trainer.figures(result).items()}
-    for picture, figure in pictures.items():
-        write_figure(picture, figure)
+    _save(result, path, checkpoint)
     by = {"budget": ", all of its budget", "interrupted": "; stopped by Ctrl-C"}
     console.print(
         f"loss {result.loss:.3g} after {result.iterations} iterations, {result.seconds:.1f} CPU s"
         + by.get(result.ending, "")
     )
-    for picture in pictures:
-        console.print(f"picture: {picture}", soft_wrap=True)
+    for kind, figure in trainer.figures(result).items():
+        _write_picture(task.file(f"-{kind}.png"), figure)
     if task.game is not None:
         for label, kind in estimators.items():
             picture = task.file(f"-{label}.png")
@@ -104,6 +106,29 @@ def run(arguments: Sequence[str]) -> int:
         console.print(f"checkpoint: {checkpoint} (--resume continues it)", soft_wrap=True)
     console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
     return 0
+
+
+def _save(result: Trained, path: Path, checkpoint: Path) -> None:
+    """Write the result of a training.
+
+    Raises:
+        CannotWrite: in one line, if it cannot be written; the line says what is left of it.
+    """
+    try:
+        result.save(path)
+    except CannotWrite as error:
+        left = f"; {checkpoint} is kept, and --resume goes on from it"
+        raise CannotWrite(f"{error}{left if checkpoint.exists() else ''}") from None
+
+
+def _write_picture(path: Path, figure: Figure) -> None:
+    """Write a picture of a training and print its path; or, if it cannot be written, why not."""
+    try:
+        write_figure(path, figure)
+    except CannotWrite as error:
+        console.print(f"warning: no picture: {error}", style="yellow", soft_wrap=True)
+    else:
+        console.print(f"picture: {path}", soft_wrap=True)
 
 
 def _task(cls: type[Trainer[Any, Any]], chosen: Train[Any]) -> Task:
@@ -154,8 +179,7 @@ def _replay(
     """Print the scores of a trained estimator's replays, and draw that of its own record."""
     estimator = load(kind, path, game)
     own = _report_training(label, estimator, game, episode, loss)
-    write_figure(picture, own.figure(f"{label}: {game.name.file_stem}"))
-    console.print(f"picture: {picture}", soft_wrap=True)
+    _write_picture(picture, own.figure(f"{label}: {game.name.file_stem}"))
 
 
 def _report_training(
