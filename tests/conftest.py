@@ -45,6 +45,18 @@ def nothing_published(monkeypatch, no_results):
     monkeypatch.setattr("pinnobs_gym.leaderboard.published.manifest.FOLDER", no_results)
 
 
+@pytest.fixture(autouse=True)
+def no_power_cuts(monkeypatch):
+    """No test waits for the disk: what it writes is gone with it."""
+    monkeypatch.setattr("os.fsync", lambda number: None)
+
+
+@pytest.fixture(autouse=True)
+def nothing_said(monkeypatch):
+    """What is said once in a process is said once in each test."""
+    monkeypatch.setattr("pinnobs_gym.simulation.notices._SUBJECTS", set())
+
+
 @pytest.fixture
 def ticking(monkeypatch):
     """CPU time goes on by 0.01 s whenever it is looked at, on a machine of any speed."""

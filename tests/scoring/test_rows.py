@@ -1,10 +1,9 @@
 import json
 import multiprocessing
 import re
-import resource
-import signal
 
 import pytest
+from damage import full_disk
 from stored_rows import row, write_fifty
 
 from pinnobs_gym.files import CannotWrite
@@ -360,17 +359,10 @@ def test_a_full_disk_leaves_no_half_line(tmp_path):
     path = tmp_path / "rows.jsonl"
     rows.append(path, [row(0)])
     before = path.read_bytes()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 100, hard))
-    try:
-        with pytest.raises(CannotWrite, match="only 100 of") as caught:
-            rows.append(path, [row(1)])
-        with pytest.raises(CannotWrite, match="only 100 of"):
-            rows.append(path, [row(1)])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, handler)
+    with full_disk(len(before) + 100):
+        for _ in range(2):
+            with pytest.raises(CannotWrite, match=r"only 100 of .* fitted; it is unch") as caught:
+                rows.append(path, [row(1)])
     assert "\n" not in str(caught.value)
     assert path.read_bytes() == before
 

@@ -1,6 +1,8 @@
+import re
 import sys
 
 import pytest
+from damage import full_disk
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -55,7 +57,7 @@ def test_a_closed_log_goes_on_when_written_again(tmp_path):
 def test_without_a_folder_nothing_happens(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(
-        sys.modules, "tensorboard.summary.writer.event_file_writer", None
+        sys.modules, "tensorboard.summary.writer.record_writer", None
     )  # importing it would raise
     with Log(None) as log:
         log.scalar("a", 1.0, 0)
@@ -67,15 +69,35 @@ def test_without_a_folder_nothing_happens(monkeypatch, tmp_path):
 
 
 def test_tensorboard_is_imported_on_the_first_write(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.event_file_writer", None)
+    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.record_writer", None)
     log = Log(tmp_path)
     with pytest.raises(ImportError):
         log.scalar("a", 1.0, 0)
 
 
-def test_an_unwritable_folder_is_refused_in_one_line(tmp_path):
+def test_without_a_place_to_write_to_one_line_is_logged_and_the_run_goes_on(tmp_path, caplog):
     (tmp_path / "file").write_text("in the way")
     for folder in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(ValueError, match=r"cannot write a log to .*file") as caught:
-            Log(folder)
-        assert "\n" not in str(caught.value)
+        with Log(folder) as log:
+            log.scalar("a", 1.0, 0)
+            log.hparams({"e": 1}, {"f": 2.0})
+            assert not log.active
+    (line,) = caplog.messages
+    assert line.startswith(f"cannot write to folder {tmp_path / 'file'}: ")
+    assert "\n" not in line
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_a_full_disk_ends_the_log_and_nothing_else(tmp_path, caplog):
+    log = Log(tmp_path)
+    log.scalar("a", 1.0, 0)
+    log.close()
+    with full_disk(3000), log:
+        for step in range(1, 1000):
+            log.scalar("a", 1.0, step)
+    assert not log.active
+    (line,) = caplog.messages
+    assert re.match(r"cannot write .*: File too large; what follows is done without", line)
+    read = {e.step for e in events(tmp_path).Scalars("a")}
+    assert {0, 1} < read  # what was written before is read
+    assert len(read) < 100

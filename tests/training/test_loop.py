@@ -1,13 +1,17 @@
 """The loop of all trainings."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from damage import damaged, full_disk, is_one_line_about
 
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.estimation.learned.trained_file import with_arrays
 from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.registry import TRAINERS
+from pinnobs_gym.simulation.code_hash import content
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.training.checkpoint import load_checkpoint, save_checkpoint
 from pinnobs_gym.training.loop import train
@@ -65,3 +69,39 @@ def test_an_interrupted_training_on_a_record_is_no_estimate(monkeypatch):
     interrupted_at(monkeypatch, 5)
     with pytest.raises(KeyboardInterrupt):
         estimator.run(RECORD)
+
+
+def test_a_training_outlives_a_checkpoint_that_cannot_be_written(tmp_path, caplog):
+    checkpoint = tmp_path / "checkpoint.pt"
+    train(trainer(iterations=2), checkpoint=checkpoint)
+    before = checkpoint.read_bytes()
+    with full_disk(100):
+        trained = train(
+            trainer(iterations=4, checkpoint_every=1), checkpoint=checkpoint, resume=True
+        )
+    assert (trained.ending, trained.iterations) == ("finished", 4)
+    (line,) = caplog.messages
+    assert line.startswith(f"cannot write {checkpoint}: ")
+    assert line.endswith("the training goes on, and an earlier checkpoint is kept")
+    assert checkpoint.read_bytes() == before
+    assert os.listdir(tmp_path) == ["checkpoint.pt"]
+
+
+def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path):
+    checkpoint = tmp_path / "checkpoint.pt"
+    first = trainer(iterations=4)
+    first.step()
+    save_checkpoint(first, checkpoint)
+    refused, same = [], 0
+    other = trainer(iterations=4)
+    for change in damaged(checkpoint, 24):
+        try:
+            load_checkpoint(other, checkpoint)
+        except ValueError as error:
+            refused.append(error)
+        else:
+            state, expected = (content(with_arrays(each.state())) for each in (other, first))
+            assert state == expected, change
+            same += 1
+    assert len(refused) > same
+    assert all(is_one_line_about(error, checkpoint) for error in refused)

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from pinnobs_gym.files import append_lines, holding, is_held, locked, replacing, write_whole
+from pinnobs_gym.files import append_lines, holding, is_held, locked, write_whole
 
 WITHOUT_FCNTL = "import sys; sys.modules['fcntl'] = None\n"
 """As on Windows, where filelock warns of nothing."""
@@ -26,31 +26,6 @@ from pinnobs_gym.files import append_lines, is_held
 path = Path(sys.argv[1])
 print(is_held(path))
 """
-
-
-def test_replacing_leaves_the_old_file_after_an_error(tmp_path):
-    path = tmp_path / "deep" / "file"
-    with replacing(path) as temporary:
-        temporary.write_text("old")
-        assert not path.exists()
-    assert path.read_text() == "old"
-    with pytest.raises(FileNotFoundError), replacing(path) as temporary:
-        temporary.write_bytes(path.with_name("none").read_bytes())
-    assert path.read_text() == "old"
-    assert os.listdir(path.parent) == ["file"]
-
-
-def test_where_nothing_can_be_put_replacing_says_so_in_one_line(tmp_path):
-    (tmp_path / "folder").mkdir()
-    with (
-        pytest.raises(ValueError, match=r"cannot write .*folder"),
-        replacing(tmp_path / "folder") as temporary,
-    ):
-        temporary.write_text("a file cannot take a folder's place")
-    assert os.listdir(tmp_path) == ["folder"]
-    (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="cannot write"), replacing(tmp_path / "file" / "in it"):
-        pass
 
 
 def test_lines_begin_a_line_of_their_own(tmp_path):
