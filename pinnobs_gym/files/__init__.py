@@ -31,16 +31,15 @@ from pinnobs_gym.files.appending import (
 )
 from pinnobs_gym.files.names import file_name
 from pinnobs_gym.files.writing import (
-    NO_SPACE,
     CannotWrite,
     cannot_write,
     check_writable,
+    noticing_full_disks,
     replacing,
     replacing_folder,
 )
 
 __all__ = [
-    "NO_SPACE",
     "CannotWrite",
     "append_lines",
     "cannot_write",
@@ -50,6 +49,7 @@ __all__ = [
     "is_held",
     "json_line",
     "locked",
+    "noticing_full_disks",
     "replacing",
     "replacing_folder",
     "write_whole",

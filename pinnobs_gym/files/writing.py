@@ -14,7 +14,7 @@ _SHOWN = 40
 """Largest number of characters of a name that are part of a temporary one."""
 
 
-NO_SPACE = frozenset(
+_NO_SPACE = frozenset(
     getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EROFS") if hasattr(errno, name)
 )
 """Errors that say that nothing more can be written: the disk or the quota is full, or the disk may
@@ -88,6 +88,18 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         raise cannot_write(path, error) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def noticing_full_disks() -> Iterator[None]:
+    """Raise an error of the system that says that nothing more can be written as `CannotWrite`, of
+    whatever library it comes."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _NO_SPACE:
+            raise
+        raise CannotWrite(f"cannot write: {' '.join(str(error).split())}") from None
 
 
 def temporary_name(path: Path) -> Path:

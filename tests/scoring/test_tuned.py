@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from damage import damaged, is_one_line_about
 
 from pinnobs_gym.cli import main
 from pinnobs_gym.envs.game import Game
@@ -14,7 +15,7 @@ from pinnobs_gym.files.seal import sealed
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.plan import jobs_of
 from pinnobs_gym.leaderboard.suites import Entry, Suite
-from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring import rows, tuned_file
 from pinnobs_gym.scoring.evaluation import evaluate
 from pinnobs_gym.scoring.tuned import is_tuned, required_settings, tuned_settings
 from pinnobs_gym.scoring.tuned_file import TunedEntry, path_of, read, store
@@ -92,6 +93,20 @@ def test_a_damaged_file_is_named_in_one_line(spring, capsys, text, message):
     with pytest.raises(ValueError, match="cannot read tuned settings"):
         store(spring, ENTRY)
     assert path_of(spring).read_text() == text
+
+
+def test_every_flipped_bit_of_a_file_is_noticed(spring):
+    path = store(spring, ENTRY)
+    refused, same = [], 0
+    for change in damaged(path, 200):
+        tuned_file._read.cache_clear()  # changes within one tick of the clock
+        try:
+            assert read(path) == (ENTRY,), change
+            same += 1
+        except ValueError as error:
+            refused.append(error)
+    assert len(refused) > 100
+    assert all(is_one_line_about(error, path) for error in refused)
 
 
 def test_settings_are_those_of_the_version_the_setup_and_the_estimator(spring):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import itertools
 import json
+import pickle
 import re
 import runpy
 import sys
@@ -55,6 +56,16 @@ def begun(system: str, config: RLConfig) -> Any:
 def train_rl(config: RLConfig, game: Game, **options: Any) -> Any:
     """The agent that comes of a training."""
     return train_by_name("rl", config, game, **options)
+
+
+class Bomb:
+    """What writes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return open, (str(self.path), "w")
 
 
 @pytest.fixture(scope="module")
@@ -166,10 +177,20 @@ def test_ends_on_its_budget() -> None:
 def test_resumes(tmp_path: Path) -> None:
     checkpoint = tmp_path / "agent.pt"
     first = train_rl(small(), DUFFING, checkpoint=checkpoint)
+    pickled = pickle.dumps(Bomb(tmp_path / "it ran"))
+    for name in ("agent.pkl", "agent.vecnormalize.pkl", "agent.zip"):
+        (tmp_path / name).write_bytes(pickled)
     more = train_rl(small(steps=1024), DUFFING, checkpoint=checkpoint, resume=True)
     assert (first.steps, more.steps) == (512, 1024)
     assert more.loss <= first.loss
     assert more.seconds > first.seconds
+    torch.save({"checkpoint": Bomb(tmp_path / "it ran")}, checkpoint)
+    with pytest.raises(ValueError, match=r"agent.pt is damaged .*it holds a '\w+ open'; expected"):
+        train_rl(small(), DUFFING, checkpoint=checkpoint, resume=True)
+    checkpoint.write_bytes(pickled)
+    with pytest.raises(ValueError, match="is damaged or no file of saved weights"):
+        train_rl(small(), DUFFING, checkpoint=checkpoint, resume=True)
+    assert not (tmp_path / "it ran").exists()
 
 
 # Files
@@ -203,6 +224,8 @@ def test_through_the_command(tmp_path: Path, capsys: Any) -> None:
     assert cli(["train", "rl", *common, *steps]) == 0
     path = next(p for p in tmp_path.glob("*.pt") if "checkpoint" not in p.name)
     assert "sb3 on own record" in capsys.readouterr().out
+    kinds = {path.suffix for path in tmp_path.iterdir() if path.is_file()}
+    assert kinds == {".pt", ".png"}
     chosen = ["--estimator", "sb3", "--trained", str(path), "--episodes", "2"]
     assert cli(["evaluate", *common, *chosen]) == 0
     assert "true states in training" in capsys.readouterr().out

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.files import noticing_full_disks
 from pinnobs_gym.scoring.floor import run_floor
 
 EPISODES = 10
@@ -43,7 +44,9 @@ class FloorJob:
 
     def run(self) -> None:
         """Compute the missing rows and append them."""
-        run_floor(self.game, range(self.seed, self.seed + self.episodes), self.rows, self.fresh)
+        seeds = range(self.seed, self.seed + self.episodes)
+        with noticing_full_disks():
+            run_floor(self.game, seeds, self.rows, self.fresh)
 
     def anew(self) -> Self:
         """Return the same job: what it stored is not computed again."""

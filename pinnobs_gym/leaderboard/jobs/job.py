@@ -11,6 +11,7 @@ from typing import Any, Self
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator, labelled
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.files import noticing_full_disks
 from pinnobs_gym.leaderboard.jobs import trainings
 from pinnobs_gym.leaderboard.published.trained import Training, opened
 from pinnobs_gym.registry import trainer_class
@@ -97,7 +98,8 @@ class Job:
 
     def run(self) -> None:
         """Append the missing rows; see `run_job`."""
-        run_job(self)
+        with noticing_full_disks():
+            run_job(self)
         if self.failed:
             rows_module.append(self.rows, [self._event("recovery")])
 

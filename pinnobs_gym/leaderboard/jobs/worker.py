@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, Self
 
 from threadpoolctl import threadpool_limits
 
-from pinnobs_gym.files import NO_SPACE, CannotWrite, is_held, replacing
+from pinnobs_gym.files import CannotWrite, is_held, replacing
 
 SEEN_AFTER = 5.0
 """Longest time in s until other machines of a shared folder see a new file."""
@@ -108,8 +108,6 @@ def _run(job: PicklableJob) -> str | None:
     except CannotWrite:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in NO_SPACE:
-            raise CannotWrite(f"{job.name}: cannot write: {error}") from None
         message = " ".join(f"{type(error).__name__}: {error}".split())[:1000]
         job.fail(message)
         return message

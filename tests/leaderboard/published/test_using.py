@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+from damage import damaged, is_one_line_about
 from made_published import KKL, SUITE
 
 import pinnobs_gym
@@ -186,6 +187,23 @@ def test_a_damaged_file_is_told_in_one_line_and_nothing_is_lost(shipped, break_i
         pinnobs_gym.load("kkl_supervised", "ReverseDuffing")
     assert "\n" not in str(error.value)
     assert {path: path.read_bytes() for path in shipped.rglob("*.*")} == left
+
+
+def test_every_flipped_bit_of_what_is_published_is_noticed(shipped):
+    whole = Manifest.read(shipped)
+    (entry,) = [e for e in whole.trained if e.estimator == "kkl_supervised"]
+    for path in (shipped / "published.json", shipped / entry.file):
+        refused, same = [], 0
+        for change in damaged(path, 60):
+            try:
+                found = Manifest.read(shipped)
+                assert found == whole, change
+                found.content(entry)
+                same += 1
+            except ValueError as error:
+                refused.append(error)
+        assert len(refused) > same
+        assert all(is_one_line_about(error, path) for error in refused)
 
 
 def test_a_new_estimator_is_ranked_among_the_published_ones_on_the_same_episodes(made, shipped):
