@@ -68,8 +68,9 @@ def locked(path: Path) -> Iterator[FileIO]:
         yield file
 
 
-def write_whole(file: FileIO, data: bytes) -> None:
-    """Append to a locked file, all or nothing, and wait until the disk has it.
+def write_whole(file: FileIO, data: bytes, *, durable: bool = True) -> None:
+    """Append to a file that nobody else writes to now, all or nothing. If ``durable``, wait until
+    the disk has it.
 
     Raises:
         OSError: if not all data can be written. The file is unchanged, unless nothing can be
@@ -77,10 +78,14 @@ def write_whole(file: FileIO, data: bytes) -> None:
     """
     size = file.seek(0, os.SEEK_END)
     try:
-        written = file.write(data)
-        if written < len(data):
-            raise OSError(f"only {written} of {len(data)} bytes fitted")
-        os.fsync(file.fileno())
+        left = memoryview(data)
+        while left:  # of what does not fit, a first write takes a part, and the next says why
+            written = file.write(left)
+            if not written:
+                raise OSError(f"only {len(data) - len(left)} of {len(data)} bytes fitted")
+            left = left[written:]
+        if durable:
+            os.fsync(file.fileno())
     except BaseException:
         with suppress(OSError):  # the first error says more
             file.truncate(size)

@@ -69,13 +69,11 @@ class Log:
             self.scalar(tag, value, 0)
 
     def close(self) -> None:
-        """Flush and close the event file; later writes open a new one."""
+        """Close the event file; later writes open a new one."""
         opened, self._opened = self._opened, None
         if opened is not None:
-            try:
+            with suppress(OSError):  # each event was written when it was added
                 opened.close()
-            except OSError as error:
-                self._give_up(error)
 
     def __enter__(self) -> Self:
         return self
@@ -97,16 +95,13 @@ class Log:
                 self._opened = EventFile(self._folder)
             self._opened.add(value, step)
         except OSError as error:
-            self._give_up(error)
+            self._give_up(cannot_write(self._folder, error))
 
-    def _give_up(self, error: OSError | CannotWrite) -> None:
+    def _give_up(self, reason: CannotWrite) -> None:
         """Write nothing from now on, and say why."""
-        reason = error if isinstance(error, CannotWrite) else cannot_write(self._folder, error)
         say_first("TensorBoard", f"{reason}; what follows is done without this TensorBoard log")
-        opened, self._opened, self._folder = self._opened, None, None
-        if opened is not None:
-            with suppress(OSError):
-                opened.close()
+        self.close()
+        self._folder = None
 
 
 def _summary() -> Any:

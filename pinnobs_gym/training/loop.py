@@ -84,7 +84,8 @@ def _save(trainer: Trainer[Any, Any], checkpoint: Path) -> None:
     try:
         save_checkpoint(trainer, checkpoint)
     except CannotWrite as error:
-        say_first("checkpoint", f"{error}; the training goes on, and an earlier checkpoint is kept")
+        kept = ", and the checkpoint before is kept" if checkpoint.exists() else ""
+        say_first("checkpoint", f"{error}; the training goes on{kept}")
 
 
 class Interrupt:

@@ -41,10 +41,12 @@ def test_what_does_not_fit_is_taken_back(tmp_path):
         """A disk that is full after 3 bytes."""
 
         def __init__(self, file):
-            self.file = file
+            self.file, self.free = file, 3
 
         def write(self, data):
-            return self.file.write(data[:3])
+            written = self.file.write(data[: self.free])
+            self.free -= written
+            return written
 
         def __getattr__(self, name):
             return getattr(self.file, name)

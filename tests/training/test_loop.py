@@ -82,7 +82,7 @@ def test_a_training_outlives_a_checkpoint_that_cannot_be_written(tmp_path, caplo
     assert (trained.ending, trained.iterations) == ("finished", 4)
     (line,) = caplog.messages
     assert line.startswith(f"cannot write {checkpoint}: ")
-    assert line.endswith("the training goes on, and an earlier checkpoint is kept")
+    assert line.endswith("the training goes on, and the checkpoint before is kept")
     assert checkpoint.read_bytes() == before
     assert os.listdir(tmp_path) == ["checkpoint.pt"]
 
