@@ -62,6 +62,26 @@ def test_every_flipped_bit_and_every_end_too_early_is_noticed(file):
     assert trained_file.read(file)["facts"] == CONTENT["facts"]
 
 
+def test_tensors_of_every_kind_and_plain_values_are_read(tmp_path):
+    kinds = (torch.float32, torch.bfloat16, torch.int64, torch.bool, torch.complex128, torch.uint16)
+    content = {str(kind): torch.ones(2, dtype=kind) for kind in kinds}
+    content["parameter"] = torch.nn.Parameter(torch.ones(2))
+    plain = {
+        "kind": torch.float64,
+        "set": {1, 2},
+        "bytes": b"1",
+        "shape": torch.Size([2]),
+        0: 2**70,
+    }
+    trained_file.write(tmp_path / "file", content | plain)
+    found = trained_file.read(tmp_path / "file")
+    assert found.keys() == {*content, *plain}
+    for name, value in content.items():
+        assert found[name].dtype == value.dtype
+        assert torch.equal(found[name], value)
+    assert {name: found[name] for name in plain} == plain
+
+
 def test_every_bit_of_the_weights_counts(file):
     whole, weights = file.read_bytes(), CONTENT["weights"].numpy().tobytes()
     start = whole.index(weights)

@@ -116,8 +116,12 @@ def read(path: str | Path) -> dict[str, Any]:
     return content
 
 
-_MADE = ("collections OrderedDict", "torch._utils _rebuild_tensor_v2")
-"""What torch's files of weights make, beside storages of tensors, dicts, lists and numbers."""
+_MADE = (
+    *(f"torch._utils _rebuild_{kind}" for kind in ("tensor_v2", "tensor_v3", "parameter")),
+    *("torch Size", "torch.storage UntypedStorage"),
+    *("collections OrderedDict", "__builtin__ set", "_codecs encode"),
+)
+"""What torch's files of weights make of their numbers and texts, beside dicts and lists."""
 _SHARED = 16
 """Largest number of tensors that share their numbers, on average."""
 
@@ -133,14 +137,23 @@ def _loaded(parts: Mapping[str, bytes]) -> Any:
     try:
         (plan,) = (part for name, part in parts.items() if name.endswith("/data.pkl"))
         for opcode, name, _ in pickletools.genops(plan):
-            storage = str(name).startswith("torch ") and str(name).endswith("Storage")
-            if "GLOBAL" in opcode.name and name not in _MADE and not storage:
+            if "GLOBAL" in opcode.name and not _is_of_numbers(str(name)):
                 raise Damaged(f"it holds a {name!r:.80}; expected weights")
         return torch.load(plain_archive(parts), map_location="cpu", weights_only=True)
     except Damaged:
         raise
     except Exception as error:  # torch raises many kinds for a file it does not understand
         raise damaged(error) from None
+
+
+def _is_of_numbers(name: str) -> bool:
+    """Return whether a name in a file, ``module name``, is in `_MADE`, a storage or a data type."""
+    import torch
+
+    module, _, kind = name.partition(" ")
+    if name in _MADE or module != "torch":
+        return name in _MADE
+    return kind.endswith("Storage") or isinstance(getattr(torch, kind, None), torch.dtype)
 
 
 def _check_sizes(content: Any, size: int) -> None:
