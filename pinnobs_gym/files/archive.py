@@ -19,6 +19,8 @@ import numpy as np
 
 PACKED = 2**26
 """Largest number of bytes of the parts of a compressed archive."""
+LONGEST = 2**26
+"""Largest number of bytes of a file in JSON."""
 DEEPEST = 100
 """Largest depth of nested lists and objects."""
 _FIRST = b"PK\x03\x04"
@@ -130,6 +132,20 @@ def _array(content: bytes) -> np.ndarray:
         raise Damaged(f"an array of shape {shape} and {dtype} with {left} bytes")
     flat = np.frombuffer(content, dtype, offset=file.tell()).copy()
     return flat.reshape(shape, order="F" if by_columns else "C")
+
+
+def json_of(path: Path) -> Any:
+    """Return the JSON value in a file.
+
+    Raises:
+        OSError: if the file cannot be read.
+        Damaged: if it holds none, is longer than `LONGEST`, or is nested too deeply.
+    """
+    with path.open("rb") as file:
+        data = file.read(LONGEST + 1)
+    if len(data) > LONGEST:
+        raise Damaged(f"it has more than {LONGEST} bytes")
+    return json_in(data)
 
 
 def json_in(data: bytes | str) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 
 from pinnobs_gym.envs.game import Game, GameName
 from pinnobs_gym.files import replacing_folder
-from pinnobs_gym.files.archive import Damaged, json_in
+from pinnobs_gym.files.archive import Damaged, json_of
 from pinnobs_gym.files.seal import sealed, unsealed
 from pinnobs_gym.scoring.episode_table import writing
 from pinnobs_gym.scoring.evaluation import BATCH, seeds_of
@@ -140,7 +140,7 @@ def _read_facts(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"there is no {path}; expected a folder that pinnobs episodes wrote")
     try:
-        facts = json_in(path.read_bytes())
+        facts = json_of(path)
         if not isinstance(facts, dict) or facts.get("format") != FORMAT:
             raise ValueError(f"{path} is no file of pinnobs episodes of format {FORMAT}")
         return unsealed(facts)

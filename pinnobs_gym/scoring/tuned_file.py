@@ -17,7 +17,7 @@ from typing import Any
 
 from pinnobs_gym.estimation.hints import check_field, field_hints
 from pinnobs_gym.files import file_name, holding, replacing
-from pinnobs_gym.files.archive import Damaged, json_in
+from pinnobs_gym.files.archive import Damaged, json_of
 from pinnobs_gym.files.seal import SEAL, sealed, unsealed
 from pinnobs_gym.simulation.system import System
 
@@ -107,7 +107,7 @@ def store(system: type[System], entry: TunedEntry) -> Path:
 def _read(path: Path, _changed: int, _size: int) -> tuple[TunedEntry, ...]:
     """Read a file; time of change and size tell whether it is the one that was read before."""
     try:
-        content = json_in(path.read_bytes())
+        content = json_of(path)
         if not isinstance(content, list):
             raise ValueError("expected a list of entries")
         return tuple(map(_entry, content))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import shutil
 import time
 from dataclasses import asdict, dataclass, replace
@@ -19,6 +18,7 @@ from machine import processor
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.pinn_obs import PinnObsDirect, PinnObsReplay, TrainedNetwork
+from pinnobs_gym.files import replacing_folder
 from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.provenance import canonical, versions
 from pinnobs_gym.scoring.rows import Row
@@ -80,9 +80,8 @@ class PaperJob:
         }
         smaller = [budget for budget in earlier if budget < own]
         if smaller:
-            part = self._training / f"part-{os.getpid()}"
-            shutil.copytree(earlier[max(smaller)], part, dirs_exist_ok=True)
-            part.rename(self.folder)
+            with replacing_folder(self.folder) as part:
+                shutil.copytree(earlier[max(smaller)], part, dirs_exist_ok=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         return bool(smaller)
 

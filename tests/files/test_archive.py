@@ -10,7 +10,8 @@ import torch
 from damage import damaged, is_one_line_about
 
 from pinnobs_gym.estimation.learned import trained_file
-from pinnobs_gym.files.archive import Damaged, arrays_of, json_in, read_parts
+from pinnobs_gym.files import archive
+from pinnobs_gym.files.archive import Damaged, arrays_of, json_in, json_of, read_parts
 
 CONTENT = {
     "weights": torch.linspace(-1, 1, 12, dtype=torch.float64).reshape(3, 4),
@@ -26,9 +27,9 @@ def file(tmp_path):
 
 
 def repacked(path, parts, method=zipfile.ZIP_STORED):
-    with zipfile.ZipFile(path, "w", method) as archive:
+    with zipfile.ZipFile(path, "w", method) as packed:
         for name, content in parts.items():
-            archive.writestr(name, content)
+            packed.writestr(name, content)
 
 
 def refusal(path):
@@ -166,8 +167,8 @@ def test_a_tensor_of_more_numbers_than_the_file_has_is_refused(file):
 def npz(arrays):
     file = io.BytesIO()
     np.savez(file, **arrays)
-    with zipfile.ZipFile(file) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(file) as packed:
+        return {name: packed.read(name) for name in packed.namelist()}
 
 
 def test_arrays_are_those_that_numpy_writes():
@@ -212,6 +213,14 @@ def test_what_is_no_json_is_one_line(text):
         json_in(text)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) <= 200
+
+
+def test_a_json_file_has_a_largest_size(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("[1, 2, 3]")
+    assert json_of(tmp_path / "file") == [1, 2, 3]
+    monkeypatch.setattr(archive, "LONGEST", 8)
+    with pytest.raises(Damaged, match="more than 8 bytes"):
+        json_of(tmp_path / "file")
 
 
 def test_usual_json_is_read():

@@ -13,7 +13,7 @@ from typing import Any
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.estimation.hints import as_tuple, check_field, field_hints
 from pinnobs_gym.files import replacing
-from pinnobs_gym.files.archive import Damaged, json_in
+from pinnobs_gym.files.archive import Damaged, json_of
 from pinnobs_gym.files.seal import sealed, unsealed
 
 FOLDER = Path(__file__).parent
@@ -108,7 +108,7 @@ class Manifest:
         """
         path = folder / _NAME
         try:
-            content = json_in(path.read_bytes())
+            content = json_of(path)
         except FileNotFoundError:
             return None
         except OSError as error:
