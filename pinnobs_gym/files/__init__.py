@@ -2,6 +2,8 @@
 
 - `replacing` writes a new file under a temporary name and renames it when it is complete. Readers
   see either the old file or the new one. `replacing_folder` does the same with a folder.
+- What cannot be written raises `CannotWrite`. `noticing_full_disks` raises it in place of what
+  other libraries raise on a full disk.
 - `check_writable` checks before a long computation that its results can be written.
 - `locked` opens a file for appending by one process and thread at a time; `write_whole` then
   appends all of the data or nothing, and a full disk leaves the file unchanged. `append_lines` does
