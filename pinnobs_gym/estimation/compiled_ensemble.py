@@ -55,8 +55,8 @@ class CompiledEnsemble:
             G = np.ascontiguousarray(self._estimator.noise.G(t))
         structure = call.structure
         structure.more, structure.G, structure.G_rows = place(more), place(G), G.shape[2] > 1
-        left = self._code(call.at, contiguous(y), contiguous(u) if self._nu else None)
-        return None if left < 0 else sets.after(state, call, u, y, left=left > 0)
+        left = self._code(call.place, contiguous(y), contiguous(u) if self._nu else None)
+        return None if left < 0 else sets.after(state, call, y, u, left=left > 0)
 
     def run(self, record: Record) -> Estimates | None:
         """Return None: records are processed sample by sample, each of which has its own random

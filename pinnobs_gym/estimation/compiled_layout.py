@@ -79,6 +79,7 @@ def _left_behind(self: Any) -> tuple[Any, ...]:
     own place and process only."""
     return type(None), ()
 
+
 def contiguous(array: np.ndarray) -> bytes:
     """Return the numbers of an array (batch, n) with the batch last."""
     if getattr(array, "dtype", None) is not _DOUBLE:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from ctypes import addressof
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from pinnobs_gym.estimation.compiled_run import FIELDS, state_of
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.random_streams import Streams
-from pinnobs_gym.simulation.kernels.calls import Plan
+from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.record import check_use
 
@@ -74,21 +74,24 @@ class SetLayout:
 
     def arrays(self, buffer: Any) -> list[np.ndarray]:
         """Return the arrays of the memory in a buffer."""
-        return [np.ndarray(shape, _FLOAT, buffer, *rest) for shape, *rest in self.views]
+        return [
+            np.ndarray(shape, _FLOAT, buffer, place, strides)
+            for shape, place, strides in self.views
+        ]
 
 
-@dataclass(frozen=True, eq=False)
-class SetCall:
-    """A call for one sample, with the arrays that it points to."""
+class SetCall(NamedTuple):
+    """A call for one sample."""
 
     structure: SetStructure
     layout: SetLayout
     buffer: Any
     """The buffer of the state after the sample."""
     kept: tuple[Any, ...]
+    """What has to live until the call has been made."""
 
     @property
-    def at(self) -> int:
+    def place(self) -> int:
         """The address of the structure."""
         return addressof(self.structure)
 
@@ -142,7 +145,7 @@ class SetCode:
             stream: numbers of the random stream of the process noise.
         """
         batch = len(state.xhat)
-        if self._rows not in (1, batch):
+        if self._rows not in (1, batch) or state.P is None:
             return None
         plan, draws = self._plan, None
         if self._normal and state.t is not None:
@@ -166,15 +169,15 @@ class SetCode:
         return SetCall(call, layout, buffer, (plan, before, draws))
 
     def after(
-        self, state: State, call: SetCall, u: np.ndarray, y: np.ndarray, *, left: bool
-    ) -> State | None:
-        """Return the state after a sample; None if NumPy has to process all rows.
+        self, state: State, call: SetCall, y: np.ndarray, u: np.ndarray, *, left: bool
+    ) -> State:
+        """Return the state after a sample.
 
         Args:
             state: the state before.
             call: the call.
-            u: inputs, shape (batch, nu).
             y: outputs, shape (batch, ny).
+            u: inputs, shape (batch, nu).
             left: whether rows are left to NumPy.
         """
         buffer, t = call.buffer, call.structure.t
@@ -195,6 +198,8 @@ class SetCode:
         t, u, system = call.structure.t, np.asarray(after.u, dtype=float), self._estimator.system
         # The inputs may be others than the model uses.
         check_use(system, np.array([t], dtype=float), u[:, None])
+        # NumPy's steps of the model are then compiled, whatever else this process has asked for.
+        ask(system, "model")
         rows = np.flatnonzero(call.marks() & LEFT)
         estimator = of_rows(self._estimator, rows)
         own = state_of(estimator, state, rows)
@@ -209,6 +214,7 @@ class SetCode:
 
     def _packed(self, layout: SetLayout, state: State) -> Any:
         """Return a new buffer with the memory of a state."""
+        assert state.P is not None
         buffer = layout.layout.packed(state.t, state.u, state.xhat, state.P)
         for array, value in zip(layout.arrays(buffer), vars(state.memory).values(), strict=False):
             array[:] = value

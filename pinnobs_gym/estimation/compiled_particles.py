@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from pinnobs_gym.simulation.record import Record
 _TEMPERED, _FEW, _COLLAPSED = 2, 4, 8
 """Marks of rows whose particles are to be resampled, in tempering or after the sample, and of those
 with too many collapses; see ``members.c``."""
+_Given: TypeAlias = tuple[np.ndarray, np.ndarray, bytes]
+"""Outputs (batch, ny), inputs (batch, nu), and the outputs in the layout of compiled code."""
 
 
 class CompiledParticles:
@@ -58,7 +60,7 @@ class CompiledParticles:
         outputs, structure = contiguous(y), call.structure
         structure.rounds = self._rounds
         structure.most = self._estimator.most_collapses(sample)
-        found = self._begin(call.at, outputs, contiguous(u) if self._nu else None)
+        found = self._begin(call.place, outputs, contiguous(u) if self._nu else None)
         if found < 0:
             return None
         if found & _COLLAPSED:
@@ -67,51 +69,47 @@ class CompiledParticles:
             found = self._resampled(state, call, (y, u, outputs), found)
             if found < 0:
                 return None
-        return sets.after(state, call, u, y, left=bool(found & LEFT))
+        return sets.after(state, call, y, u, left=bool(found & LEFT))
 
     def run(self, record: Record) -> Estimates | None:
         """Return None: records are processed sample by sample, each of which has its own random
         numbers."""
         return None
 
-    def _resampled(
-        self, state: State, call: SetCall, given: tuple[np.ndarray, np.ndarray, bytes], found: int
-    ) -> int:
+    def _resampled(self, state: State, call: SetCall, given: _Given, found: int) -> int:
         """Resample the particles of rows in which it is to be done, and return what remains to be
-        done; -1 if NumPy has to process the sample. What is given are the outputs and inputs, and
-        the outputs in the layout of compiled code."""
-        y, u, outputs = given
+        done; -1 if NumPy has to process the sample."""
         step, sample = 0, state.memory.sample
-        while found & _TEMPERED:
+        while found > 0 and found & _TEMPERED:
             call.structure.rounds = self._rounds - step - 1
-            kept = self._numbers(call, (1, sample, step), self._shrinkage(state, call, y, u, True))
-            found = self._resample(call.at, outputs, _TEMPERED)
+            found = self._round(state, call, given, _TEMPERED, (1, sample, step))
             step += 1
         if found > 0 and found & _FEW:
-            stream = 1, sample, self._rounds
-            kept = self._numbers(call, stream, self._shrinkage(state, call, y, u, False))
-            found = self._resample(call.at, outputs, _FEW)
-        del kept
+            found = self._round(state, call, given, _FEW, (1, sample, self._rounds))
         return found
 
-    def _numbers(self, call: SetCall, stream: tuple[int, ...], shrinkage: np.ndarray) -> Any:
-        """Set the random numbers and the shrinkages (batch,) of a resampling, and return the arrays
-        that have to live until it is done."""
-        rng, structure = self._sets.streams.at(*stream), call.structure
+    def _round(
+        self, state: State, call: SetCall, given: _Given, kind: int, stream: tuple[int, ...]
+    ) -> int:
+        """Resample the rows of a mark with the numbers of a random stream, as `_resampled`."""
+        y, u, outputs = given
+        structure, shrinkage = call.structure, self._shrinkages(state, call, y, u, kind)
+        rng = self._sets.streams.at(*stream)
         structure.uniform = rng.random()
         normal = rng.standard_normal((self._count, self._nx))
         structure.more, structure.shrinkage = place(normal), place(shrinkage)
-        return normal, shrinkage
+        return self._resample(call.place, outputs, kind)
 
-    def _shrinkage(
-        self, state: State, call: SetCall, y: np.ndarray, u: np.ndarray, tempering: bool
+    def _shrinkages(
+        self, state: State, call: SetCall, y: np.ndarray, u: np.ndarray, kind: int
     ) -> np.ndarray:
-        """Return by how much centres of kernels are shrunk, (batch,); see
+        """Return by how much centres of kernels are shrunk in the rows of a mark, (batch,); see
         `pinnobs_gym.estimation.regularisation.shrinkages`."""
+        tempering = kind == _TEMPERED
         batch = len(state.xhat)
         if not (self._depends and state.t is not None):
             return np.full(batch, self._usual[tempering])
-        rows = np.flatnonzero(call.marks() == (_TEMPERED if tempering else _FEW))
+        rows = np.flatnonzero(call.marks() == kind)
         own, noise = of_rows(self._estimator, rows), self._estimator.noise
         sample = Sample.of(noise, state.t, call.structure.t, y, u).rows(rows)
         mean, P = (

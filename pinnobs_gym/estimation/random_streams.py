@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class Streams(threading.local):
         self._words = _words(seed)
         self._bits = np.random.PCG64(0)
         self._generator = np.random.Generator(self._bits)
-        self._state = dict(self._bits.state)
+        self._state: Any = self._bits.state
         self._seed = (ctypes.c_uint64 * 4)()
         self._place = ctypes.addressof(self._seed)
         self._stream_seed = code.stream_seed

@@ -175,7 +175,8 @@ w_i := \frac1N \\
         every = trial.max(axis=0) <= _ZERO
         if every.any():
             self._say("all particles overflow in the model; they stay where they are")
-        return x, np.where(every, memory.log_weights, _normalised(trial))
+        unchanged = every | ~lost.any(axis=0)
+        return x, np.where(unchanged, memory.log_weights, _normalised(trial))
 
     def _say(self, what: str) -> None:
         say_once(f"particle filter on {type(self.system).__name__}: {what}")
@@ -352,7 +353,8 @@ def _predicted_output(weights: np.ndarray, outputs: np.ndarray) -> tuple[np.ndar
         return moments(weights, outputs)
     defined: np.ndarray = np.all(abs(outputs) < _LARGEST, axis=-1)
     weights = np.where(defined, weights, 0.0)
-    sums = total(weights)
+    # Rows in which all are defined do not depend on the others.
+    sums = np.where(defined.all(axis=0), 1.0, total(weights))
     mean, S = moments(
         weights / np.where(sums > 0, sums, 1.0), np.where(defined[..., None], outputs, 0.0)
     )
