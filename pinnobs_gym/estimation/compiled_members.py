@@ -22,7 +22,6 @@ from pinnobs_gym.estimation.compiled_run import FIELDS, state_of
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.random_streams import Streams
-from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.record import check_use
 
@@ -198,8 +197,6 @@ class SetCode:
         t, u, system = call.structure.t, np.asarray(after.u, dtype=float), self._estimator.system
         # The inputs may be others than the model uses.
         check_use(system, np.array([t], dtype=float), u[:, None])
-        # NumPy's steps of the model are then compiled, whatever else this process has asked for.
-        ask(system, "model")
         rows = np.flatnonzero(call.marks() & LEFT)
         estimator = of_rows(self._estimator, rows)
         own = state_of(estimator, state, rows)

@@ -108,7 +108,9 @@ class RecursiveEstimator(Estimator):
         return filter_code(self, code, prior) if self.template in EXPORTED else None
 
     def ask_model(self) -> None:
-        if self.compiled is None:  # compiled filters contain the model's steps
+        # Compiled filters contain the model's steps. Rows that sets of points leave to NumPy take
+        # the same steps whatever else the process has asked for.
+        if not isinstance(self.compiled, CompiledFilter):
             super().ask_model()
 
     def plan_settings(self) -> dict[str, Any]:

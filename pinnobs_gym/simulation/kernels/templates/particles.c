@@ -12,25 +12,50 @@ struct room {
     double *w;                /* weights (members,), but for the factor 1 / sum */
     double *outputs;          /* (NY, members) */
     double *old;              /* (NX, members) */
+    double *ones;             /* (members,) */
     double largest, sum;      /* of the logarithms of w with the likelihood, and of w */
 };
+
+/* e^x for x <= 0, to rounding, which compilers make vector instructions of; 0 below e^-708. With
+   x = k log 2 + r for a whole number k, it is 2^k times the series of e^r, |r| <= log 2 / 2. */
+static inline double exponential(double x)
+{
+    const double shift = 6755399441055744.0; /* 1.5 * 2^52: the last bits of ``at`` are those of k */
+    const double bounded = x < -708 ? -708 : x;
+    const double at = bounded * 1.4426950408889634 + shift, k = at - shift;
+    /* log 2 in two parts, of which the product of k with the first is exact */
+    const double r = bounded - k * 6.93145751953125e-1 - k * 1.42860682030941723212e-6;
+    double sum = 1.0 / 6227020800, scale;
+    uint64_t bits;
+    sum = sum * r + 1.0 / 479001600; sum = sum * r + 1.0 / 39916800;
+    sum = sum * r + 1.0 / 3628800; sum = sum * r + 1.0 / 362880;
+    sum = sum * r + 1.0 / 40320; sum = sum * r + 1.0 / 5040;
+    sum = sum * r + 1.0 / 720; sum = sum * r + 1.0 / 120;
+    sum = sum * r + 1.0 / 24; sum = sum * r + 1.0 / 6;
+    sum = sum * r + 1.0 / 2;
+    sum = (sum * r + 1) * r + 1;
+    memcpy(&bits, &at, sizeof bits);
+    bits = (bits + 1023) << 52;
+    memcpy(&scale, &bits, sizeof bits);
+    return x < -708 ? 0 : sum * scale;
+}
 
 /* Set the weights w to those of the particles times a power of the likelihood. Return the effective
    number of particles. */
 static double weigh(int64_t members, const double *log_weights, double power, struct room *room)
 {
-    double *restrict w = room->w, part[W] = {0}, squares[W] = {0}, sum = 0, square = 0;
-    room->largest = -INFINITY;
-    for (int64_t k = 0; k < members; k++) w[k] = log_weights[k] + power * room->likelihood[k];
-    for (int64_t k = 0; k < members; k++) room->largest = maximum(w[k], room->largest);
-    for (int64_t k = 0; k < members; k++) w[k] = exp(w[k] - room->largest);
-    for (int64_t k = 0; k < members; k++) {
-        part[k % W] += w[k];
-        squares[k % W] += w[k] * w[k];
-    }
-    EACH_LANE sum += part[l], square += squares[l];
-    room->sum = sum;
-    return sum * sum / square;
+    const double *restrict likelihood = room->likelihood;
+    double *restrict w = room->w, most[W], largest = -INFINITY;
+    int64_t first = 0;
+    EACH_LANE most[l] = -INFINITY;
+    for (int64_t k = 0; k < members; k++) w[k] = log_weights[k] + power * likelihood[k];
+    for (; first + W <= members; first += W) EACH_LANE most[l] = maximum(w[first + l], most[l]);
+    EACH_LANE largest = maximum(most[l], largest);
+    for (; first < members; first++) largest = maximum(w[first], largest);
+    for (int64_t k = 0; k < members; k++) w[k] = exponential(w[k] - largest);
+    room->largest = largest;
+    room->sum = weighted_sum(members, room->ones, w);
+    return room->sum * room->sum / weighted_sum(members, w, w);
 }
 
 /* Take the weights that ``weigh`` has set, so that they sum to one. */
@@ -163,7 +188,7 @@ static int64_t begin_row(const struct set *c, const struct places *to, int64_t r
     if (!c->first) move_points(&over, c->draws ? room->drawn : NULL, members, x);
     for (int64_t k = 0; k < NX * members; k++) lost |= !(fabs(x[k]) < HUGE_STATE);
     if (lost) return LEFT;
-    for (int64_t k = 0; k < members; k++) room->w[k] = exp(log_weights[k]);
+    for (int64_t k = 0; k < members; k++) room->w[k] = exponential(log_weights[k]);
     if (!c->first) gather(NX, c->plan->state_period, members, room->w, x);
     if (predict_outputs(c, to, row, &over, x, room)) return LEFT;
     if (find_likelihood(c, row, x, room)) return LEFT;
@@ -193,7 +218,7 @@ static int resample_row(const struct set *c, const struct places *to, int64_t ro
     }
     memcpy(old, x, (size_t)(NX * members) * sizeof *x);
     for (int64_t k = 0, next = 0; k < members; k++) {
-        cumulated += exp(log_weights[k]);
+        cumulated += exponential(log_weights[k]);
         double end = minimum(ceil(cumulated * members - c->uniform), members);
         if (k == members - 1) end = members;
         for (; next < end; next++) /* another copy of particle k */
@@ -233,11 +258,13 @@ static int64_t continue_row(const struct set *c, const struct places *to, int64_
 static int set_up(const struct set *c, int64_t numbers, struct room *room)
 {
     const int64_t members = c->members;
-    room->drawn = malloc((size_t)((numbers + 2 + NY + NX) * members) * sizeof *room->drawn);
+    room->drawn = malloc((size_t)((numbers + 3 + NY + NX) * members) * sizeof *room->drawn);
     room->likelihood = room->drawn + numbers * members;
     room->w = room->likelihood + members;
     room->outputs = room->w + members;
     room->old = room->outputs + NY * members;
+    room->ones = room->old + NX * members;
+    for (int64_t k = 0; room->drawn && k < members; k++) room->ones[k] = 1;
     return room->drawn != NULL;
 }
 
