@@ -49,7 +49,7 @@ struct steps {
 };
 
 /* Go on to the next step. Return 0 if there is none. */
-static inline int AT_WIDTH(find_step)(const struct interval *over, struct steps *at)
+static inline int AT_WIDTH(locate_step)(const struct interval *over, struct steps *at)
 {
     const struct plan *plan = over->plan;
     while (!at->begun || at->k == at->count) {
@@ -77,7 +77,7 @@ static inline int AT_WIDTH(find_step)(const struct interval *over, struct steps 
 static inline int AT_WIDTH(next_step)(const struct interval *over, struct steps *at,
                                       struct rk_step *s)
 {
-    if (!AT_WIDTH(find_step)(over, at)) return 0;
+    if (!AT_WIDTH(locate_step)(over, at)) return 0;
     AT_WIDTH(set_step)(over, at->start, at->step, at->k - 1, at->last, s);
     return 1;
 }

@@ -210,7 +210,7 @@ int64_t noisy_steps(const struct plan *plan, double t0, double t1)
     int64_t count = 0;
     if (!movable_1(plan, t0, t1)) return -1;
     if (plan->discrete) return (int64_t)(t1 - t0);
-    while (AT_WIDTH(find_step)(&over, &at)) count++;
+    while (AT_WIDTH(locate_step)(&over, &at)) count++;
     return count;
 }
 
