@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -72,6 +74,36 @@ class Layout:
         for array, value in zip(self.arrays(buffer), (xhat, P), strict=False):
             array[:] = value
         return buffer
+
+
+@dataclass(frozen=True, eq=False)
+class SetLayout:
+    """A buffer of a state, in which the sets of points of all rows follow the other arrays."""
+
+    layout: Layout
+    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
+    """Shape, position in bytes and strides of the arrays of the estimator's memory."""
+
+    @staticmethod
+    def of(sizes: tuple[int, int, int], shapes: Sequence[tuple[int, ...]], batch: int) -> SetLayout:
+        """Return the layout for a model of sizes (nx, ny, nu), and what each row has beside: arrays
+        of these shapes, of which the last is not kept with a state."""
+        numbers = [math.prod(shape) for shape in shapes]
+        layout = Layout.of(*sizes, batch, sum(numbers))
+        views, place = [], layout.marks + 8 * batch
+        for shape, number in zip(shapes[:-1], numbers[:-1], strict=True):
+            array = np.empty((batch, *shape))
+            array = array.transpose(2, 0, 1) if array.ndim == 3 else array.T
+            views.append((array.shape, place, array.strides))
+            place += 8 * batch * number
+        return SetLayout(layout, tuple(views))
+
+    def arrays(self, buffer: Any) -> list[np.ndarray]:
+        """Return the arrays of the memory in a buffer."""
+        return [
+            np.ndarray(shape, _DOUBLE, buffer, place, strides)
+            for shape, place, strides in self.views
+        ]
 
 
 def _left_behind(self: Any) -> tuple[Any, ...]:

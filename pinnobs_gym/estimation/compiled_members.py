@@ -8,16 +8,14 @@ NumPy. Every row has the same result alone and in any batch.
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Sequence
 from ctypes import addressof
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import of_rows, plan_of, rows_of_numbers
-from pinnobs_gym.estimation.compiled_layout import Layout
+from pinnobs_gym.estimation.compiled_layout import SetLayout
 from pinnobs_gym.estimation.compiled_run import FIELDS, state_of
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.projection import kept_inside
@@ -25,13 +23,9 @@ from pinnobs_gym.estimation.random_streams import Streams
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.record import check_use
 
-if TYPE_CHECKING:
-    from pinnobs_gym.estimation.recursive import RecursiveEstimator
-
 LEFT = 1
 """The mark of rows that are left to NumPy; see ``members.c``."""
 _POINTER, _INT, _DOUBLE = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
-_FLOAT = np.dtype(float)
 _LAYOUTS = 16
 """Number of layouts that are kept, one for each number of rows."""
 
@@ -47,36 +41,6 @@ class SetStructure(ctypes.Structure):
         *(("G_rows", _INT), ("most", _DOUBLE), ("rounds", _INT)),
         *(("shrinkage", _POINTER), ("uniform", _DOUBLE), ("y", _POINTER), ("u", _POINTER)),
     ]
-
-
-@dataclass(frozen=True, eq=False)
-class SetLayout:
-    """A buffer of a state, in which the sets of points of all rows follow the other arrays."""
-
-    layout: Layout
-    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
-    """Shape, position in bytes and strides of the arrays of the estimator's memory."""
-
-    @staticmethod
-    def of(sizes: tuple[int, int, int], shapes: Sequence[tuple[int, ...]], batch: int) -> SetLayout:
-        """Return the layout for a model of sizes (nx, ny, nu), and what each row has beside: arrays
-        of these shapes, of which the last is not kept with a state."""
-        numbers = [math.prod(shape) for shape in shapes]
-        layout = Layout.of(*sizes, batch, sum(numbers))
-        views, place = [], layout.marks + 8 * batch
-        for shape, number in zip(shapes[:-1], numbers[:-1], strict=True):
-            array = np.empty((batch, *shape))
-            array = array.transpose(2, 0, 1) if array.ndim == 3 else array.T
-            views.append((array.shape, place, array.strides))
-            place += 8 * batch * number
-        return SetLayout(layout, tuple(views))
-
-    def arrays(self, buffer: Any) -> list[np.ndarray]:
-        """Return the arrays of the memory in a buffer."""
-        return [
-            np.ndarray(shape, _FLOAT, buffer, place, strides)
-            for shape, place, strides in self.views
-        ]
 
 
 class SetCall(NamedTuple):
@@ -104,8 +68,8 @@ class SetCode:
     """What compiled code of sets of points needs at each sample.
 
     Args:
-        estimator: the estimator, with a ``seed``. Its memory has arrays in the order of ``shapes``,
-            then the number of samples.
+        estimator: the estimator, which has a ``seed``. Its memory has arrays in the order of
+            ``shapes``, then the number of samples.
         made: its library.
         members: number of points of a row.
         shapes: shapes of the arrays of a row, as of `SetLayout`.
@@ -114,7 +78,7 @@ class SetCode:
 
     def __init__(
         self,
-        estimator: RecursiveEstimator,
+        estimator: Any,
         made: PlantLibrary,
         members: int,
         shapes: Sequence[tuple[int, ...]],
@@ -132,7 +96,7 @@ class SetCode:
         self._steps = made.code.noisy_steps
         self._steps.argtypes, self._steps.restype = [_POINTER, _DOUBLE, _DOUBLE], _INT
         self._layouts: dict[int, SetLayout] = {}
-        self.streams = Streams(vars(estimator)["seed"], made.code)
+        self.streams = Streams(estimator.seed, made.code)
         """The random numbers of the estimator."""
 
     def call(self, state: State, t: float, stream: tuple[int, ...]) -> SetCall | None:

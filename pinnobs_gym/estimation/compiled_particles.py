@@ -7,13 +7,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pinnobs_gym.estimation.compiled_code import of_rows
 from pinnobs_gym.estimation.compiled_layout import contiguous
 from pinnobs_gym.estimation.compiled_members import LEFT, SetCall, SetCode, place
 from pinnobs_gym.estimation.estimator import Estimates, State
 from pinnobs_gym.estimation.regularisation import Sample, shrinkages
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.truth import rows_of
 
 _TEMPERED, _FEW, _COLLAPSED = 2, 4, 8
 """Marks of rows whose particles are to be resampled, in tempering or after the sample, and of those
@@ -110,12 +110,12 @@ class CompiledParticles:
         if not (self._depends and state.t is not None):
             return np.full(batch, self._usual[tempering])
         rows = np.flatnonzero(call.marks() == kind)
-        own, noise = of_rows(self._estimator, rows), self._estimator.noise
+        system, noise = rows_of(self._estimator.system, rows), self._estimator.noise
         sample = Sample.of(noise, state.t, call.structure.t, y, u).rows(rows)
         mean, P = (
             np.ascontiguousarray(array[rows])
             for array in call.layout.layout.arrays(call.buffer)[:2]
         )
         shrinkage = np.ones(batch)
-        shrinkage[rows] = shrinkages(own.system, sample, mean, P, tempering=tempering)
+        shrinkage[rows] = shrinkages(system, sample, mean, P, tempering=tempering)
         return shrinkage

@@ -60,8 +60,10 @@ class Streams(threading.local):
         self._stream_seed.restype = None
 
     def at(self, *stream: int) -> np.random.Generator:
-        """Return the generator at the start of a stream, whose numbers are below 2³². The next call
-        in the same thread moves it."""
+        """Return the generator at the start of a stream. The next call in the same thread moves
+        it."""
+        if max(stream) >> 32:
+            stream = tuple(word for number in stream for word in _words(number))
         size = len(self._words) + len(stream)
         words = (ctypes.c_uint32 * size)(*self._words, *stream)
         self._stream_seed(words, size, self._place)

@@ -32,8 +32,10 @@ class _Parts:
     """Text before all of these."""
 
 
-_SETS = ("ensemble", "particles")
+_SETS = {"ensemble": ("ensemble.c",), "particles": ("weights.c", "particles.c")}
 """Algorithms of sets of points, of which those of one episode are side by side."""
+_OF_SETS = ("given_inputs.c", "streams.c", "members.c", "members_moments.c", "members_motion.c")
+"""What these share."""
 
 
 def _parts(template: str) -> _Parts:
@@ -45,7 +47,7 @@ def _parts(template: str) -> _Parts:
         lanes = "filter_rows.c", "smoother.c"
         return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
     if template in _SETS:
-        return _Parts(("given_inputs.c", "streams.c", "members.c", f"{template}.c"), ())
+        return _Parts((*_OF_SETS, *_SETS[template]), ())
     if template == "window":
         return _Parts(("given_inputs.c", "window_entry.c"), (), template, read("window.h"))
     return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)

@@ -43,7 +43,7 @@ static int find_gain(const struct set *c, const struct room *room, const struct 
     find_means(NY, members, room->ones, (double)members, room->outputs, a->yhat);
     find_covariances(NX, members, room->ones, whole, x, a->mean, a->P);
     find_covariances(NY, members, room->ones, whole, room->outputs, a->yhat, own);
-    if (may_turn(c, over, row, 1, a->mean, a->P, (const lanes_1 *)a->R)) return 1;
+    if (may_turn(c, over, row, 1, a->mean, a->P)) return 1;
     /* S = Y Y^T + R and K = X Y^T S^-1, where outputs that are missing are zero throughout */
     for (int i = 0; i < NY * NY; i++) a->S[i][0] = own[i] + a->R[i][0];
     for (int i = 0; i < NX; i++)
