@@ -8,32 +8,46 @@ are rows that are carried by roots. Every row has the same result alone and in a
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from ctypes import addressof
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import library_of, of_rows, plan_of, rows_of_numbers
-from pinnobs_gym.estimation.compiled_layout import Layout
+from pinnobs_gym.estimation.compiled_layout import Layout, contiguous
 from pinnobs_gym.estimation.compiled_run import FIELDS, CompiledRun, call_with, state_of, with_rows
-from pinnobs_gym.estimation.estimator import State
+from pinnobs_gym.estimation.estimator import Estimates, State
 from pinnobs_gym.estimation.square_root import carried
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
-from pinnobs_gym.simulation.record import check_use
+from pinnobs_gym.simulation.record import Record, check_use
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.recursive import RecursiveEstimator
 
-_DOUBLE = np.dtype(float)
 _LAYOUTS = 16
 """Number of layouts that are kept, one for each number of rows."""
 
 
-def compiled_filter(estimator: RecursiveEstimator) -> CompiledFilter | str:
+class Compiled(Protocol):
+    """The compiled code of an estimator."""
+
+    def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State | None:
+        """Return the state after a sample; None if NumPy has to process it. The arguments are those
+        of `Estimator.update`."""
+        ...
+
+    @property
+    def run(self) -> Callable[[Record], Estimates | None]:
+        """Returns the estimates of a record; None if it is processed sample by sample."""
+        ...
+
+
+def compiled_filter(estimator: RecursiveEstimator) -> Compiled | str:
     """Return the compiled code of an estimator, or the reason in one line why there is none."""
     reason = estimator.not_compiled() if estimator.template else ""
     made = reason or library_of(estimator)
-    return made if isinstance(made, str) else CompiledFilter(estimator, made)
+    return made if isinstance(made, str) else estimator.compiled_with(made)
 
 
 class CompiledFilter:
@@ -86,8 +100,8 @@ class CompiledFilter:
             batch,
             state.t is None,
             t,
-            _contiguous(y),
-            _contiguous(u) if self._sizes[2] else None,
+            contiguous(y),
+            contiguous(u) if self._sizes[2] else None,
             addressof(buffer),
             addressof(before),
             addressof(more) if more else None,
@@ -141,10 +155,3 @@ class CompiledFilter:
             if len(self._layouts) < _LAYOUTS:
                 self._layouts[batch] = layout
         return layout
-
-
-def _contiguous(array: np.ndarray) -> bytes:
-    """Return the numbers of an array (batch, n) with the batch last."""
-    if getattr(array, "dtype", None) is not _DOUBLE:
-        array = np.asarray(array, dtype=float)
-    return array.T.tobytes()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,8 +17,9 @@ _DOUBLE = np.dtype(float)
 @dataclass(frozen=True, eq=False)
 class Layout:
     """A buffer that has all arrays of a state one after the other: the time, outputs, inputs,
-    estimates, covariances, innovations and their covariances of a batch, and the numbers by which
-    compiled code marks rows; see ``update`` in ``templates/filter.c``."""
+    estimates, covariances, innovations and their covariances of a batch, the numbers by which
+    compiled code marks rows, and what some algorithms have beside; see ``update`` in
+    ``templates/filter.c``, and ``templates/members.c``."""
 
     buffer: Any
     """The type of the buffer."""
@@ -32,8 +35,9 @@ class Layout:
     """Position of the numbers that mark rows in bytes."""
 
     @staticmethod
-    def of(nx: int, ny: int, nu: int, batch: int) -> Layout:
-        """Return the layout for a model of these sizes and a batch."""
+    def of(nx: int, ny: int, nu: int, batch: int, more: int = 0) -> Layout:
+        """Return the layout for a model of these sizes and a batch, with further numbers for each
+        row."""
         shapes = [(nx,), (nx, nx), (ny,), (ny, ny)]
         sizes = [1, ny * batch, nu * batch, *(batch * int(np.prod(shape)) for shape in shapes)]
         ends = [8 * int(end) for end in np.cumsum(sizes)]
@@ -41,7 +45,7 @@ class Layout:
         for shape, place in zip(shapes, ends[2:], strict=False):
             array = np.moveaxis(np.empty((*shape, batch)), -1, 0)
             views.append((array.shape, place, array.strides))
-        kind = ctypes.c_double * (ends[-1] // 8 + batch)
+        kind = ctypes.c_double * (ends[-1] // 8 + (1 + more) * batch)
         buffer = type("Packed", (kind,), {"__reduce__": _left_behind})
         places = tuple(pairwise(end // 8 for end in ends[2:]))
         return Layout(buffer, ends[1], nu, tuple(views), places, ends[-1])
@@ -72,7 +76,44 @@ class Layout:
         return buffer
 
 
+@dataclass(frozen=True, eq=False)
+class SetLayout:
+    """A buffer of a state, in which the sets of points of all rows follow the other arrays."""
+
+    layout: Layout
+    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
+    """Shape, position in bytes and strides of the arrays of the estimator's memory."""
+
+    @staticmethod
+    def of(sizes: tuple[int, int, int], shapes: Sequence[tuple[int, ...]], batch: int) -> SetLayout:
+        """Return the layout for a model of sizes (nx, ny, nu), and what each row has beside: arrays
+        of these shapes, of which the last is not kept with a state."""
+        numbers = [math.prod(shape) for shape in shapes]
+        layout = Layout.of(*sizes, batch, sum(numbers))
+        views, place = [], layout.marks + 8 * batch
+        for shape, number in zip(shapes[:-1], numbers[:-1], strict=True):
+            array = np.empty((batch, *shape))
+            array = array.transpose(2, 0, 1) if array.ndim == 3 else array.T
+            views.append((array.shape, place, array.strides))
+            place += 8 * batch * number
+        return SetLayout(layout, tuple(views))
+
+    def arrays(self, buffer: Any) -> list[np.ndarray]:
+        """Return the arrays of the memory in a buffer."""
+        return [
+            np.ndarray(shape, _DOUBLE, buffer, place, strides)
+            for shape, place, strides in self.views
+        ]
+
+
 def _left_behind(self: Any) -> tuple[Any, ...]:
     """Return what is copied or pickled in place of a buffer: None, because its address holds in its
     own place and process only."""
     return type(None), ()
+
+
+def contiguous(array: np.ndarray) -> bytes:
+    """Return the numbers of an array (batch, n) with the batch last."""
+    if getattr(array, "dtype", None) is not _DOUBLE:
+        array = np.asarray(array, dtype=float)
+    return array.T.tobytes()

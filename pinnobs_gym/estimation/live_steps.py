@@ -104,7 +104,7 @@ def steps_of(estimator: Estimator, begun: State) -> Steps:
     if isinstance(estimator, RecursiveEstimator) and estimator.noise.samples is None:
         compiled = estimator.compiled
         # What an estimator remembers beside x and P is carried by `update`.
-        if compiled is not None and not estimator.carried_memory(begun)[1]:
+        if isinstance(compiled, CompiledFilter) and not estimator.carried_memory(begun)[1]:
             return InBuffers(compiled, plain)
     return plain
 

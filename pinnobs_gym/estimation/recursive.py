@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 
-from pinnobs_gym.estimation.compiled import CompiledFilter, compiled_filter
+from pinnobs_gym.estimation.compiled import Compiled, CompiledFilter, compiled_filter
 from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
 from pinnobs_gym.simulation.record import Prior, Record
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.export.algorithm import Algorithm
     from pinnobs_gym.simulation.kernels.plant_code import PlantCode
+    from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,14 @@ class RecursiveEstimator(Estimator):
         return self._state_from("correct", self.correct(state, t, y, u))
 
     @cached_property
-    def compiled(self) -> CompiledFilter | None:
+    def compiled(self) -> Compiled | None:
         """The compiled code of the estimator; None if it is computed in NumPy."""
         found = compiled_filter(self)
         return None if isinstance(found, str) else found
+
+    def compiled_with(self, made: PlantLibrary) -> Compiled:
+        """Return the compiled code of the estimator in a library of its template."""
+        return CompiledFilter(self, made)
 
     def not_compiled(self) -> str:
         """Return in one line why the template does not compute the same with the estimator's
@@ -98,12 +103,14 @@ class RecursiveEstimator(Estimator):
         return ""
 
     def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
-        from pinnobs_gym.estimation.export.filters import filter_code
+        from pinnobs_gym.estimation.export.filters import EXPORTED, filter_code
 
-        return filter_code(self, code, prior) if self.template else None
+        return filter_code(self, code, prior) if self.template in EXPORTED else None
 
     def ask_model(self) -> None:
-        if self.compiled is None:  # compiled filters contain the model's steps
+        # Compiled filters contain the model's steps. Rows that sets of points leave to NumPy take
+        # the same steps whatever else the process has asked for.
+        if not isinstance(self.compiled, CompiledFilter):
             super().ask_model()
 
     def plan_settings(self) -> dict[str, Any]:

@@ -57,6 +57,11 @@ def shrinkage_of(discount: float) -> float:
     return (3 * discount - 1) / (2 * discount)
 
 
+def usual_shrinkage(*, tempering: bool) -> float:
+    """Return the a of `shrinkages` without process noise."""
+    return shrinkage_of(_TEMPERED if tempering else _DISCOUNT)
+
+
 def shrinkages(
     system: System, sample: Sample, mean: np.ndarray, P: np.ndarray, *, tempering: bool
 ) -> np.ndarray:
@@ -76,7 +81,7 @@ def shrinkages(
         P: their covariances, shape (batch, nx, nx).
         tempering: whether a tempering step precedes.
     """
-    q, a, wide = _renewed(system, sample, mean, P), shrinkage_of(_DISCOUNT), shrinkage_of(_TEMPERED)
+    q, (a, wide) = _renewed(system, sample, mean, P), map(shrinkage_of, (_DISCOUNT, _TEMPERED))
     usual = 1 - a**2
     if tempering:
         share, a = np.maximum((1 - wide**2) * (1 - q / usual), usual), wide

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from pinnobs_gym.estimation.circular import gathered
+from pinnobs_gym.estimation.compiled_ensemble import CompiledEnsemble
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked
 from pinnobs_gym.estimation.kalman import gain_of_deviations
@@ -18,6 +20,7 @@ from pinnobs_gym.estimation.projection import nearest_points
 from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.wrapping import say_what_turns
+from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.matrices import divide, einsum, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
@@ -70,6 +73,7 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """Seed of the random numbers."""
 
     name = "enkf"
+    template: ClassVar[str] = "ensemble"
     exempt_from = {
         "model_alone": "its mean is that of points that the model has moved apart",
         "blank_rows": "its random numbers are drawn row by row",
@@ -111,9 +115,16 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
         L = root(prior.cov.transpose(1, 2, 0))
         members = prior.mean + spread(L, self._normal(0)(self.system.nx))
         members = self._inside(gathered(members, self.system.state_period))
-        # With the batch innermost in memory, noise that rows share is added several times faster.
-        members = np.ascontiguousarray(members.swapaxes(1, 2)).swapaxes(1, 2)
-        return State(prior.mean, P=prior.cov, memory=EnsembleMemory(members))
+        return State(prior.mean, P=prior.cov, memory=EnsembleMemory(_batch_innermost(members)))
+
+    def not_compiled(self) -> str:
+        return "" if self.localisation is None else "its covariances are localised"
+
+    def compiled_with(self, made: PlantLibrary) -> CompiledEnsemble:
+        return CompiledEnsemble(self, made)
+
+    def memory_rows(self, memory: EnsembleMemory, rows: np.ndarray) -> EnsembleMemory:
+        return replace(memory, members=_batch_innermost(memory.members[:, rows]))
 
     def predict(self, state: State, t: float, u: np.ndarray) -> State:
         assert state.t is not None
@@ -218,3 +229,9 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
             return draws / np.sqrt(np.add.reduce(rest) / (members - 1))
 
         return normal
+
+
+def _batch_innermost(members: np.ndarray) -> np.ndarray:
+    """Return members (num_members, batch, nx) with the batch innermost in memory, where noise that
+    rows share is added several times faster."""
+    return np.ascontiguousarray(members.swapaxes(1, 2)).swapaxes(1, 2)

@@ -5,17 +5,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from pinnobs_gym.estimation.circular import gathered
+from pinnobs_gym.estimation.compiled_particles import CompiledParticles
 from pinnobs_gym.estimation.estimator import Range, State
 from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.random_streams import generator
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
-from pinnobs_gym.estimation.regularisation import Sample, shrinkage_of, shrinkages
+from pinnobs_gym.estimation.regularisation import (
+    Sample,
+    shrinkage_of,
+    shrinkages,
+    usual_shrinkage,
+)
 from pinnobs_gym.estimation.wrapping import say_of_outputs
+from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.matrices import cholesky, factor, moments, spread, total, weighted_mean
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.notices import say_once
@@ -95,6 +103,7 @@ class ParticleFilter(RecursiveEstimator):
     """Seed of the random numbers."""
 
     name = "particle"
+    template: ClassVar[str] = "particles"
     exempt_from = {
         "model_alone": "its mean is that of points that the model has moved apart",
         "blank_rows": "its random numbers are drawn row by row",
@@ -166,7 +175,8 @@ w_i := \frac1N \\
         every = trial.max(axis=0) <= _ZERO
         if every.any():
             self._say("all particles overflow in the model; they stay where they are")
-        return x, np.where(every, memory.log_weights, _normalised(trial))
+        unchanged = every | ~lost.any(axis=0)
+        return x, np.where(unchanged, memory.log_weights, _normalised(trial))
 
     def _say(self, what: str) -> None:
         say_once(f"particle filter on {type(self.system).__name__}: {what}")
@@ -200,15 +210,37 @@ w_i := \frac1N \\
         innovation = np.where(missing | np.isnan(yhat), 0.0, innovation)
         return State(xhat, t, u, (P + P.swapaxes(1, 2)) / 2, innovation, S, memory)
 
+    def memory_rows(self, memory: ParticleMemory, rows: np.ndarray) -> ParticleMemory:
+        particles, log_weights = memory.particles.take(rows, 1), memory.log_weights.take(rows, 1)
+        return ParticleMemory(particles, log_weights, memory.collapses[rows], memory.sample)
+
+    def compiled_with(self, made: PlantLibrary) -> CompiledParticles:
+        return CompiledParticles(self, made, _ROUNDS, self.particles / _FEW, _COLLAPSED)
+
+    def shrinkage(self, tempering: bool) -> float:
+        """Return by how much centres of kernels are shrunk without process noise, in tempering or
+        after a sample; see `pinnobs_gym.estimation.regularisation`."""
+        if self.discount is None:
+            return usual_shrinkage(tempering=tempering)
+        return shrinkage_of(self.discount)
+
+    def most_collapses(self, sample: int) -> float:
+        """Return the number of collapses beyond which the log says so at a sample."""
+        return max(10, 0.1 * sample)
+
+    def say_that_it_collapses(self) -> None:
+        """Say in the log, once, that collapses are too many."""
+        self._say(
+            f"outputs leave fewer than {_COLLAPSED} effective particles in more than a tenth "
+            "of the samples; its covariances may be far too small, take more particles"
+        )
+
     def _counted(self, memory: ParticleMemory, effective: np.ndarray) -> np.ndarray:
         """Return the number of collapses, given the effective number of particles that a sample
         would have left, (batch,) each."""
         collapses = memory.collapses + (effective < _COLLAPSED)
-        if (collapses > np.maximum(10, 0.1 * memory.sample)).any():
-            self._say(
-                f"outputs leave fewer than {_COLLAPSED} effective particles in more than a tenth "
-                "of the samples; its covariances may be far too small, take more particles"
-            )
+        if (collapses > self.most_collapses(memory.sample)).any():
+            self.say_that_it_collapses()
         return collapses
 
     def _tempered(
@@ -290,7 +322,7 @@ w_i := \frac1N \\
         if self.discount is None:
             a = shrinkages(self.system, sample, mean, P, tempering=tempering)
         else:
-            a = np.full(len(rows), shrinkage_of(self.discount))
+            a = np.full(len(rows), self.shrinkage(tempering))
         wide = np.flatnonzero(a < 1)
         if not len(wide):
             return x, log_weights
@@ -321,7 +353,8 @@ def _predicted_output(weights: np.ndarray, outputs: np.ndarray) -> tuple[np.ndar
         return moments(weights, outputs)
     defined: np.ndarray = np.all(abs(outputs) < _LARGEST, axis=-1)
     weights = np.where(defined, weights, 0.0)
-    sums = total(weights)
+    # Rows in which all are defined do not depend on the others.
+    sums = np.where(defined.all(axis=0), 1.0, total(weights))
     mean, S = moments(
         weights / np.where(sums > 0, sums, 1.0), np.where(defined[..., None], outputs, 0.0)
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,6 +20,8 @@ from kernel_figures.timing import in_process, medians, pair, repeated
 from benchmarks import Figure, at_least, at_most, cpu_seconds
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.estimators.enkf import EnKF
+from pinnobs_gym.estimators.particle import ParticleFilter
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.systems import SYSTEMS
@@ -33,7 +35,9 @@ ASKED_OF_MOTOR = {1: 5.0, 256: 5.0}
 """The same of dynamax."""
 ASKED_OF_UPDATE = {"ekf": 8.0, "mhe, window 20": 60.0}
 """Time of a single update in µs."""
-TEMPLATES = ("ekf", "sigma_points", "truth", "model")
+OF_SETS = ((1, 200), (16, 100), (256, 20))
+"""The same for ensembles and particles, which take longer."""
+TEMPLATES = ("ekf", "sigma_points", "ensemble", "particles", "truth", "model")
 PEERS = ("dynamax", "cuthbert", "filterpy")
 AGREEMENT = {"filterpy": 1e-9, "cuthbert": 1e-9, "dynamax": 1e-4}
 """Largest difference of estimates over the states' scale."""
@@ -50,7 +54,9 @@ def figures(repeats: int) -> Iterator[Figure]:
     yield from compilation()
     for name in SYSTEMS.classes():
         for cls in (EKF, UKF):
-            yield from against_numpy(name, cls, repeats)
+            yield from against_numpy(name, cls, repeats, SHAPES)
+        for cls in (EnKF, ParticleFilter):
+            yield from against_numpy(name, cls, repeats, OF_SETS)
         yield from alone(name, repeats)
         if "filterpy" not in missing:
             yield from against_filterpy(name, repeats)
@@ -73,13 +79,19 @@ def compilation() -> Iterator[Figure]:
     yield Figure("libraries of all algorithms and systems", size, "bytes", "", None)
 
 
-def against_numpy(name: str, cls: type[RecursiveEstimator], repeats: int) -> Iterator[Figure]:
+def against_numpy(
+    name: str,
+    cls: type[RecursiveEstimator],
+    repeats: int,
+    shapes: Sequence[tuple[int, int]],
+) -> Iterator[Figure]:
     """Compare records in compiled code with NumPy."""
     slow, fast = pair(name, cls)
-    for batch, samples in SHAPES:
+    asked = ASKED if shapes is SHAPES else {}
+    for batch, samples in shapes:
         record = repeated(name, batch, samples)
         times = medians([lambda r=record: slow.run(r), lambda r=record: fast.run(r)], repeats)
-        yield from compared("NumPy", f"{fast.label}, {name}", record, times, ASKED.get(batch))
+        yield from compared("NumPy", f"{fast.label}, {name}", record, times, asked.get(batch))
 
 
 def compared(

@@ -47,4 +47,5 @@ def own(name: str) -> str:
 def model_parts(code: PlantCode) -> list[str]:
     """Return the texts of the model's motion and of samples."""
     steps = code.steps or read("loops.h")
-    return [read("steps.h"), steps, own("leaves.c"), read("motion.h"), read("filter.h")]
+    motion = read("interval.h"), read("motion.h")
+    return [read("steps.h"), steps, own("leaves.c"), *motion, read("filter.h")]

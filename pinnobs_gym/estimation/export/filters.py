@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pinnobs_gym.estimation.recursive import RecursiveEstimator
 
 _SIGMA_POINTS = "sigma_points"
+EXPORTED = "ekf", _SIGMA_POINTS
+"""The templates that exported files have, too."""
 
 
 def filter_code(estimator: RecursiveEstimator, code: PlantCode, prior: Prior) -> Algorithm:

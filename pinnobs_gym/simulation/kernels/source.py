@@ -32,6 +32,12 @@ class _Parts:
     """Text before all of these."""
 
 
+_SETS = {"ensemble": ("ensemble.c",), "particles": ("weights.c", "particles.c")}
+"""Algorithms of sets of points, of which those of one episode are side by side."""
+_OF_SETS = ("given_inputs.c", "streams.c", "members.c", "members_moments.c", "members_motion.c")
+"""What these share."""
+
+
 def _parts(template: str) -> _Parts:
     """Return the files of an algorithm."""
     if template in ("truth", "model"):
@@ -40,6 +46,8 @@ def _parts(template: str) -> _Parts:
     if template == "smoother":
         lanes = "filter_rows.c", "smoother.c"
         return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
+    if template in _SETS:
+        return _Parts((*_OF_SETS, *_SETS[template]), ())
     if template == "window":
         return _Parts(("given_inputs.c", "window_entry.c"), (), template, read("window.h"))
     return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)
@@ -63,6 +71,8 @@ def library_source(plant: PlantCode, template: str) -> str:
             read("rows.h"),
             plant.lanes,
         ]
+        if template in _SETS:
+            parts += set_parts(plant, width)
         if own.algorithm:
             parts += filter_parts(plant, own.algorithm, (read("inputs.h"), read("marks.h")))
         parts += map(read, own.lanes)
@@ -72,6 +82,15 @@ def library_source(plant: PlantCode, template: str) -> str:
     )
     parts += [f"#define WIDE {wide}\n{called}", *map(read, own.entries), read("check.c")]
     return "\n".join(parts)
+
+
+def set_parts(plant: PlantCode, width: int) -> list[str]:
+    """Return the parts of algorithms of sets of points, for points side by side, or for one lane:
+    matrices of an episode."""
+    if width == 1:
+        return [read("filter.h"), read("marks.h")]
+    steps = plant.steps or read("loops.h")
+    return [read("steps.h"), steps, read("inputs.h"), read("interval.h")]
 
 
 def filter_parts(plant: PlantCode, algorithm: str, between: Sequence[str]) -> list[str]:
@@ -84,8 +103,8 @@ def filter_parts(plant: PlantCode, algorithm: str, between: Sequence[str]) -> li
     """
     steps = plant.steps or read("loops.h")
     inputs, marks = between
-    files = inputs, read("motion.h"), read("filter.h"), marks, read(f"{algorithm}.c")
-    return [read("steps.h"), steps, *files]
+    motion = inputs, read("interval.h"), read("motion.h")
+    return [read("steps.h"), steps, *motion, read("filter.h"), marks, read(f"{algorithm}.c")]
 
 
 @cache
