@@ -55,7 +55,8 @@ def filter_functions(ekf: EKF, dt: float, **options: Any) -> tuple[Any, Any]:
     f, h, given = (function(system, name) for name in ("f", "h", "input"))
     moved = flow(system, dt, f, given)
     x, P = casadi.SX.sym("x", system.nx), casadi.SX.sym("P", system.nx, system.nx)
-    before, t, y = (casadi.SX.sym(*of) for of in (("before",), ("t",), ("y", system.ny)))
+    sizes = {"before": 1, "t": 1, "y": system.ny}
+    before, t, y = (casadi.SX.sym(name, size) for name, size in sizes.items())
 
     def corrected(x: Any, P: Any) -> list[Any]:
         at = casadi.SX.sym("x", system.nx)
@@ -103,9 +104,9 @@ def compiled_ekf(ekf: EKF, record: Record) -> Callable[[], np.ndarray]:
     def bound(function: Any, arguments: list[np.ndarray], results: tuple[np.ndarray, ...]) -> Any:
         buffer, call = function.buffer()
         for i, array in enumerate(arguments):
-            buffer.set_arg(i, memoryview(array))
+            buffer.set_arg(i, array.data)
         for i, array in enumerate(results):
-            buffer.set_res(i, memoryview(array))
+            buffer.set_res(i, array.data)
         return call, buffer  # the buffer has to live as long as the call
 
     # Each call reads what the one before wrote; P is symmetric, so that its order does not count.
