@@ -31,17 +31,17 @@ def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if min(*a.shape[1:], b.shape[2]) < LARGE:
         return np.matmul(a, b)
     result = np.empty((max(len(a), len(b)), a.shape[1], b.shape[2]))
-    for i, made in enumerate(result):
-        made[:] = _product(a[i % len(a)], b[i % len(b)])
+    for i in range(len(result)):
+        result[i] = _product(a[i % len(a)], b[i % len(b)])
     return result
 
 
 def sandwiches(M: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Return MPMᵀ (batch, n, n) for M (batch, n, m) and P (batch or 1, m, m)."""
     result = np.empty((*M.shape[:2], M.shape[1]))
-    for i, made in enumerate(result):
+    for i in range(len(result)):
         own = _without_zeros(M[i]) if _is_sparse(M[i]) else M[i]
-        made[:] = (own @ np.ascontiguousarray((own @ P[i % len(P)]).T)).T
+        result[i] = (own @ np.ascontiguousarray((own @ P[i % len(P)]).T)).T
     return result
 
 
@@ -55,7 +55,7 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _is_sparse(a: np.ndarray) -> bool:
-    return np.count_nonzero(a) <= _FILLED * a.size
+    return bool(np.count_nonzero(a) <= _FILLED * a.size)
 
 
 def _without_zeros(a: np.ndarray) -> csr_array:

@@ -36,8 +36,8 @@ def test_one_matrix_is_multiplied_by_a_batch():
 
 
 def banded(rng: np.random.Generator, n: int, batch: int) -> np.ndarray:
-    """Return matrices (n, n, batch) of three entries in a row that are not zero; the last matrix has
-    no zeros."""
+    """Return matrices (n, n, batch) of three entries that are not zero in a row, and a last one
+    without zeros."""
     i = np.arange(n)[:, None]
     matrices = np.zeros((n, n, batch))
     matrices[i, (i + np.array([0, 1, 5])) % n] = rng.standard_normal((n, 3, batch))
