@@ -18,8 +18,8 @@ COLUMNS = {
 """The figures of the columns."""
 INTRO = (
     "**Live filters.** One sample of the EKF of one episode, called from Python, in µs (median). "
-    "`Live` checks the sample and keeps those of the past; the others are bare steps of the same "
-    "filter. CasADi's compiled code reads and writes arrays in place, which no other does."
+    "`Live` checks the sample and keeps those of the past; the others are steps of the same filter "
+    "without that. CasADi's compiled code reads and writes arrays in place."
 )
 
 
