@@ -64,7 +64,7 @@ class CompiledRun:
             rows = rows[~np.isin(rows, () if state.root is None else carried(state.root))]
             if k + 1 < n and len(rows):
                 state = self._through(record, rows, k + 1, state, results, reached)
-        return Estimates(**{name: np.moveaxis(array, -1, 0) for name, array in results.items()})
+        return Estimates(**{name: _batch_first(array) for name, array in results.items()})
 
     def _through(
         self,
@@ -91,7 +91,8 @@ class CompiledRun:
         whole, n = len(rows) == record.batch, record.num_samples
         estimator = self._estimator if whole else of_rows(self._estimator, rows)
         own = record if whole else record.rows(rows)
-        before = state_of(estimator, self._before(record, first, state, results), rows)
+        before = self._before(record, first, state, results)
+        before = before if whole else state_of(estimator, before, rows)
         memory, arrays = estimator.carried_memory(before)
         plan = self._plan
         if self._by_sample or not whole:
@@ -124,7 +125,7 @@ class CompiledRun:
         """Return the state before sample k; the arguments are those of `_through`."""
         if k == 0:
             return state
-        xhat, P = (np.moveaxis(results[name][k - 1], -1, 0) for name in ("xhat", "P"))
+        xhat, P = (_batch_first(results[name][k - 1]) for name in ("xhat", "P"))
         return replace(state, t=float(record.t[k - 1]), u=record.u[:, k - 1], xhat=xhat, P=P)
 
     def _by_numpy(
@@ -170,9 +171,17 @@ def with_rows(estimator: RecursiveEstimator, state: State, rows: np.ndarray, par
 def _empty(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     """Return empty arrays of some shapes. They are views of a single one, because only large arrays
     are allocated in large memory pages, whose first access takes less time."""
-    sizes = [math.prod(shape) for shape in shapes.values()]
-    parts = np.split(np.empty(sum(sizes)), np.cumsum(sizes)[:-1])
-    return {name: part.reshape(shapes[name]) for name, part in zip(shapes, parts, strict=True)}
+    buffer, views, end = np.empty(sum(map(math.prod, shapes.values()))), {}, 0
+    for name, shape in shapes.items():
+        start, end = end, end + math.prod(shape)
+        views[name] = buffer[start:end].reshape(shape)
+    return views
+
+
+def _batch_first(array: np.ndarray) -> np.ndarray:
+    """Return an array (..., batch) as one of shape (batch, ...)."""
+    last = array.ndim - 1
+    return array.transpose(last, *range(last))
 
 
 def call_with(arrays: dict[str, np.ndarray]) -> CallStructure:

@@ -20,6 +20,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pinnobs_gym.simulation.arrays import array_namespace
+from pinnobs_gym.simulation.large_matrices import (
+    LAPACK,
+    LARGE,
+    divided,
+    factors,
+    products,
+    sandwiches,
+)
 
 if TYPE_CHECKING:
     from pinnobs_gym.simulation.system import Array
@@ -28,7 +36,7 @@ einsum = inspect.unwrap(np.einsum)
 """`numpy.einsum` for NumPy arrays alone: without its dispatch to other libraries, which takes a
 third of the time of a product of small matrices."""
 
-_BLAS = 8
+BLAS = 8
 """Number of rows or columns of a product from which it is formed by BLAS, which takes less time."""
 JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
 """Relative amounts added to the variances, in turn, until a covariance has a Cholesky factor."""
@@ -36,7 +44,12 @@ JITTER = (1e-15, 1e-12, 1e-9, 1e-6)
 
 def sandwich(M: Array, P: Array) -> Array:
     """Return MPMᵀ for M (n, m, batch) and P (m, m, batch or 1)."""
-    if len(M) * len(P) > 4 or not isinstance(M, np.ndarray):
+    if not isinstance(M, np.ndarray):
+        return product(product(M, P), M.swapaxes(0, 1))
+    if min(M.shape[:2]) >= LARGE and M.shape[2] >= P.shape[2]:
+        first, second = (np.ascontiguousarray(part.transpose(2, 0, 1)) for part in (M, P))
+        return sandwiches(first, second).transpose(1, 2, 0)
+    if len(M) * len(P) > 4:
         return product(product(M, P), M.swapaxes(0, 1))
     # A single sum over both indices is faster for the smallest matrices only.
     if M.shape[-1] > 1:
@@ -49,7 +62,7 @@ def sandwich(M: Array, P: Array) -> Array:
 
 def outer(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return ABᵀ, shape (n, k, batch), for A (n, m, batch) and B (k, m, batch)."""
-    if max(len(A), len(B)) >= _BLAS:
+    if max(len(A), len(B)) >= BLAS:
         return _by_blas(A, B.swapaxes(0, 1))
     if A.shape[-1] > 1:
         return einsum("imb,jmb->ijb", A, B)
@@ -70,14 +83,25 @@ def divide(A: Array, S: Array) -> Array:
         inverse = array_namespace(S).linalg.inv(S.swapaxes(0, 2))  # batch first; S is symmetric
         return product(A, inverse.swapaxes(0, 2))
     with np.errstate(invalid="ignore", divide="ignore"):
-        L = cholesky(S)
-        X = divide_factored(A, L)
+        if len(S) >= LAPACK:
+            X, last = _by_lapack(A, S)
+        else:
+            L = cholesky(S)
+            X, last = divide_factored(A, L), L[-1, -1]
     # A pivot that is not positive makes this one NaN: the sum tells whether there is any.
-    if not math.isfinite(L[-1, -1].sum()):
-        rows = np.flatnonzero(~np.isfinite(L[-1, -1]) & np.isfinite(S).all(axis=(0, 1)))
+    if not math.isfinite(last.sum()):
+        rows = np.flatnonzero(~np.isfinite(last) & np.isfinite(S).all(axis=(0, 1)))
         if len(rows):
             X[..., rows] = _by_eigenvalues(A[..., rows if A.shape[2] > 1 else [0]], S[..., rows])
     return X
+
+
+def _by_lapack(A: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return AS⁻¹ (n, m, batch) and the last pivots of the factors of S, (batch,), NaN where S has
+    none."""
+    L = factors(np.ascontiguousarray(S.transpose(2, 0, 1)))
+    X = divided(np.ascontiguousarray(A.transpose(2, 0, 1)), L)
+    return X.transpose(1, 2, 0), L[:, -1, -1]
 
 
 def _by_eigenvalues(A: np.ndarray, S: np.ndarray) -> np.ndarray:
@@ -161,7 +185,7 @@ def product(a: Array, b: Array) -> Array:
         return a * b
     if not isinstance(a, np.ndarray):
         return (a[:, :, None] * b[None]).sum(1)
-    if max(rows, b.shape[1]) >= _BLAS:
+    if max(rows, b.shape[1]) >= BLAS:
         return _by_blas(a, b)
     if batch > 1 or terms == 2:
         return einsum("ijb,jkb->ikb", a, b)
@@ -179,8 +203,8 @@ def _by_blas(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     last in that of small ones: `numpy.einsum`, which may use them, sums in order only then.
     """
     first, second = (np.ascontiguousarray(part.transpose(2, 0, 1)) for part in (a, b))
-    result = np.matmul(first, second).transpose(1, 2, 0)
-    return result if min(result.shape[:2]) >= _BLAS else np.ascontiguousarray(result)
+    result = products(first, second).transpose(1, 2, 0)
+    return result if min(result.shape[:2]) >= BLAS else np.ascontiguousarray(result)
 
 
 def mapped(M: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -227,6 +251,8 @@ def weighted_mean(weights: np.ndarray, x: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=16)
 def identity(size: int, batch: int) -> np.ndarray:
     """Return read-only identity matrices, shape (size, size, batch)."""
+    if size >= BLAS:  # the memory of one
+        return np.broadcast_to(np.eye(size)[..., None], (size, size, batch))
     matrix = np.repeat(np.eye(size)[..., None], batch, axis=-1)
     matrix.flags.writeable = False
     return matrix

@@ -15,7 +15,7 @@ from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.kernels.asked import is_asked
 from pinnobs_gym.simulation.maps import Map
-from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
+from pinnobs_gym.simulation.matrices import BLAS, identity, outer, product, sandwich
 from pinnobs_gym.simulation.motion import Interval, Motion, check_steps, inputs_at
 from pinnobs_gym.simulation.noise import Noise, Root
 from pinnobs_gym.simulation.own_flow import OwnFlow
@@ -328,7 +328,9 @@ def _linearised_steps(
             linearised,
             inputs[:, None] if u.ndim == 2 else inputs,
         )
-        A = np.ascontiguousarray(A.transpose(0, 2, 3, 1))  # (4, nx, nx, batch)
+        A = A.transpose(0, 2, 3, 1)  # (4, nx, nx, batch)
+        if nx < BLAS:  # the products of others have the batch first in memory
+            A = np.ascontiguousarray(A)
         # Integrate the variational equation Φ' = A(t)Φ by the same method at the same stages.
         flow = runge_kutta(partial(_variation, A), start, h)
         yield x.transpose(outside), flow, A, (t, h)

@@ -192,6 +192,8 @@ def check_use(system: System, t: np.ndarray, u: np.ndarray) -> None:
         raise ValueError(f"a sample has t={wrong:g}; {kind} is a map, expected whole numbers")
     if system.nu and not system.measured_input:
         known = np.asarray(system.input(t))
+        if (u == known).all():  # as usual, which takes a third of the time of what follows
+            return
         size = np.maximum(abs(known).max(axis=0), abs(u).max(axis=(0, 1)))
         other = abs(u - known) > _ROUNDING * np.maximum(size, _input_size(system))
         if other.any():

@@ -173,7 +173,9 @@ def against_jax(name: str, repeats: int) -> Iterator[Figure]:
 
 
 def large(repeats: int, *, peer: bool) -> Iterator[Figure]:
-    """Compare the EKF on Lorenz-96 with dynamax's."""
+    """Compare the EKF on Lorenz-96 with dynamax's, both in double precision and with as many
+    Runge-Kutta steps. Ours integrates the process noise over each of these; dynamax adds it once
+    per sample."""
     for nx, batch, samples in LORENZ:
         what = f"ekf, Lorenz-96 of {nx} states, batch {batch}"
         own = in_process("lorenz", "own", nx, batch, samples, repeats)

@@ -10,8 +10,11 @@ import sys
 from collections.abc import Iterator
 
 from log_figures import fit, judgement, live, reading, recorded, scored
+from log_figures.live_table import live_table
 
 from benchmarks import Figure
+
+readme_table = live_table
 
 
 def figures(repeats: int) -> Iterator[Figure]:

@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from kernel_figures import steps
+from kernel_figures.steps import matrices
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.plant_form import plant_form
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.traced_code import Trace
 
@@ -43,37 +44,16 @@ def function(system: System, name: str) -> Callable[..., Any]:
 
 
 def flow(ekf: EKF, dt: float) -> Callable[..., Any]:
-    """Return the state x after a time of at most dt in s, from the time t on, as a function of x, t
-    and that time, by as many Runge-Kutta steps as ours."""
-    system = ekf.system
-    f, given = function(system, "f"), function(system, "input")
-    steps = max(1, round(float(np.ceil(dt / longest_step(system) - 1e-6))))
-
-    def moved(x: Any, start: Any, ahead: Any) -> Any:
-        part = ahead / steps
-        for i in range(steps):
-            t = start + i * part
-            inputs = [given(t + c * part, x, None) for c in (0.0, 0.5, 1.0)]
-            k1 = f(t, x, inputs[0])
-            k2 = f(t + part / 2, x + part / 2 * k1, inputs[1])
-            k3 = f(t + part / 2, x + part / 2 * k2, inputs[1])
-            k4 = f(t + part, x + part * k3, inputs[2])
-            x = x + part / 6 * (k1 + 2 * (k2 + k3) + k4)
-        return x
-
-    return moved
+    """Return the state x after a time of at most dt in s as a function of x, the time t before and
+    that time; see `kernel_figures.steps.flow`."""
+    f, given = (function(ekf.system, name) for name in ("f", "input"))
+    return steps.flow(ekf.system, dt, f, given)
 
 
 def output(ekf: EKF) -> Callable[..., Any]:
     """Return h as a function of x and t."""
     h, given = (function(ekf.system, name) for name in ("h", "input"))
     return lambda x, t: h(t, x, given(t, x, None))
-
-
-def matrices(ekf: EKF, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariances Q over a step of dt (s), and R."""
-    L, R = ekf.noise.L(0.0)[..., 0], ekf.noise.R(0.0)[..., 0]
-    return dt * L @ L.T, R
 
 
 def dynamax_ekf(ekf: EKF, record: Record) -> Callable[[], np.ndarray]:

@@ -1,13 +1,13 @@
 """Print the time per sample in ms and the memory in MB of an EKF on Lorenz-96.
 
 The arguments are own or dynamax, nx, and the numbers of episodes, samples and repeats. Memory
-is the peak of the process beyond what it held before; it is read on Linux.
+is the peak of the process beyond what it held before, as Linux tells it. That of `resource` would
+not do: it begins with the memory of the process that started this one.
 """
 
 from __future__ import annotations
 
 import json
-import resource
 import sys
 from dataclasses import dataclass
 from importlib import import_module
@@ -82,6 +82,13 @@ def dynamax(ekf: EKF, record: Record) -> Any:
     return jax_peers.dynamax_ekf(ekf, record)
 
 
+def memory(what: str) -> float:
+    """Return the memory of this process in MB: VmRSS, which it holds, or VmHWM, its peak."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    (line,) = (each for each in lines if each.startswith(what))
+    return int(line.split()[1]) / 1024
+
+
 def main(whose: str, nx: str, batch: str, samples: str, repeats: str) -> None:
     """Measure and print."""
     n, rows, rng = int(nx), int(batch), np.random.default_rng(0)
@@ -92,12 +99,10 @@ def main(whose: str, nx: str, batch: str, samples: str, repeats: str) -> None:
     record = Record(t, y, np.zeros((rows, len(t), 0)), prior)
     if whose == "dynamax":
         import_module("kernel_figures.jax_peers")  # what it holds by itself does not count
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    before = pages * resource.getpagesize() / 1024
+    before = memory("VmRSS")
     call = dynamax(ekf, record) if whose == "dynamax" else lambda: ekf.run(record)
     seconds = float(medians([call], int(repeats))[0])
-    held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    print(json.dumps([seconds / len(t) * 1e3, held / 1024]))
+    print(json.dumps([seconds / len(t) * 1e3, memory("VmHWM") - before]))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from kernel_figures.jax_peers import flow, jax, jnp, matrices, output
+from kernel_figures.jax_peers import flow, jax, jnp, output
+from kernel_figures.steps import matrices
 
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.record import Record

@@ -6,10 +6,11 @@ samples are those at which the machine turned to something else.
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -40,18 +41,76 @@ LATE = 10
 
 def figures(repeats: int) -> Iterator[Figure]:
     """Measure live filters."""
-    missing = [name for name in ("filterpy", "jax") if not find_spec(name)]
-    if missing:
+    found = {name: make for name, make in PEERS.items() if available(name)}
+    if missing := [name for name in PEERS if name not in found]:
         print(f"not installed: {', '.join(missing)}; left out", file=sys.stderr)
     for name in NAMES:
-        yield from of_ekf(name, repeats, missing)
+        yield from of_ekf(name, repeats, [peer for make in found.values() for peer in make()])
     yield from of_all("ReverseDuffing", repeats)
     yield from late(repeats)
 
 
-def of_ekf(name: str, repeats: int, missing: list[str]) -> Iterator[Figure]:
+@dataclass(frozen=True)
+class Peer:
+    """The EKF of another library, sample by sample from Python."""
+
+    what: str
+    """Its description."""
+    of: str
+    """What its estimates are called."""
+    make: Callable[[EKF, Record], Callable[[], np.ndarray]]
+    """Returns a call whose result is the estimates (num_samples, nx) of a record."""
+    asked: float | None = 1.0
+    """Its time over that of a live filter."""
+
+
+def filterpy_peers() -> list[Peer]:
+    """Return filterpy's EKF."""
+    from kernel_figures.filterpy_peer import filterpy_ekf
+
+    def make(ekf: EKF, record: Record) -> Callable[[], np.ndarray]:
+        return lambda: filterpy_ekf(ekf, record)
+
+    return [Peer("filterpy's, compiled model", "filterpy's", make)]
+
+
+def jax_peers() -> list[Peer]:
+    """Return that of JAX."""
+    from log_figures.jax_step import jax_ekf
+
+    return [Peer("a jitted step of JAX", "that of JAX", jax_ekf)]
+
+
+def casadi_peers() -> list[Peer]:
+    """Return those of CasADi. Its compiled code by buffers is a bare call without any check, and
+    faster than `Live`."""
+    from log_figures.casadi_step import casadi_ekf, compiled_ekf
+
+    called = Peer("a function of CasADi called with arrays", "that of CasADi", casadi_ekf)
+    if not shutil.which("gcc"):
+        print("gcc is not found; CasADi's compiled code is left out", file=sys.stderr)
+        return [called]
+    what = "CasADi's compiled code by buffers"
+    return [called, Peer(what, "that of CasADi's compiled code", compiled_ekf, None)]
+
+
+PEERS: dict[str, Callable[[], list[Peer]]] = {
+    "filterpy": filterpy_peers,
+    "jax": jax_peers,
+    "casadi": casadi_peers,
+}
+"""The EKFs of other libraries, by the name of the module."""
+
+
+def available(module: str) -> bool:
+    """Return whether a module is installed."""
+    return find_spec(module) is not None
+
+
+def of_ekf(name: str, repeats: int, peers: list[Peer]) -> Iterator[Figure]:
     """Measure the EKF of a system, and the same of other libraries."""
     ekf, record = EKF(SYSTEMS.resolve(name)()), repeated(name, 1, SAMPLES)
+    exact = replace(ekf, assumed_noise=0.0)
     calls = {
         "live, what": played(ekf, record),
         "live, and all values read": played(ekf, record, read=True),
@@ -59,18 +118,11 @@ def of_ekf(name: str, repeats: int, missing: list[str]) -> Iterator[Figure]:
     }
     if ekf.system.nu:
         calls["live, inputs not given"] = played(ekf, record, given=False)
-    if "filterpy" not in missing:
-        from kernel_figures.filterpy_peer import filterpy_ekf
-
-        calls["filterpy's, compiled model"] = lambda: filterpy_ekf(ekf, record)
-    if "jax" not in missing:
-        from log_figures.jax_step import jax_ekf
-
-        calls["a jitted step of JAX"] = jax_ekf(ekf, record)
-        exact = replace(ekf, assumed_noise=0.0)
-        off = abs(jax_ekf(exact, record)() - exact.run(record).xhat[0]).max(axis=0)
+    for peer in peers:
+        calls[peer.what] = peer.make(ekf, record)
+        off = abs(peer.make(exact, record)() - exact.run(record).xhat[0]).max(axis=0)
         largest = float((off / np.asarray(ekf.system.scale)).max())
-        yield at_most(f"ekf - that of JAX over scale, {name}", largest, "", 1e-9)
+        yield at_most(f"ekf - {peer.of} over scale, {name}", largest, "", 1e-9)
     times = medians(list(calls.values()), repeats) / record.num_samples * 1e6
     own = dict(zip(calls, times.tolist(), strict=True))
     yield at_most(f"live ekf, {name}: one sample", own.pop("live, what"), "us", ASKED)
@@ -79,10 +131,9 @@ def of_ekf(name: str, repeats: int, missing: list[str]) -> Iterator[Figure]:
             yield at_most(f"ekf, {name}: one sample, {what}", value, "us", ASKED)
         else:
             yield Figure(f"ekf, {name}: one sample, {what}", value, "us", "", None)
-    for peer in ("filterpy's, compiled model", "a jitted step of JAX"):
-        if peer in own:
-            ratio = own[peer] / float(times[0])
-            yield at_least(f"ekf, {name}: {peer} / live", ratio, "x", 1.0)
+    for peer in peers:
+        ratio = own[peer.what] / float(times[0])
+        yield at_least(f"ekf, {name}: {peer.what} / live", ratio, "x", peer.asked)
     single = latencies(ekf, record)
     for share in (50.0, 99.9):
         value = float(np.percentile(single, share))

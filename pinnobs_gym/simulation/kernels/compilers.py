@@ -20,9 +20,11 @@ from pinnobs_gym.simulation.notices import say_once
 _NAMES = ("cc", "clang", "gcc")
 _STRICT = (
     *("-std=c99", "-O2", "-ftree-loop-vectorize", "-fno-math-errno", "-fno-trapping-math"),
-    *("-ffp-contract=off", "-shared"),
+    *("-ffp-contract=off", "-fno-tree-slp-vectorize", "-shared"),
 )
-"""Arithmetic is strict, so that NaN and reproducibility hold."""
+"""Arithmetic is strict, so that NaN and reproducibility hold. gcc 12 contracts operations of
+statements that it joins (``slp``) even where contraction is off, such as in the code for one lane,
+whose results would differ from those in several."""
 _CPUINFO = Path("/proc/cpuinfo")
 
 

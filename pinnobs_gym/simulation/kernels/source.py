@@ -12,9 +12,9 @@ from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 _WIDE = 8
 """Number of episodes side by side."""
-_WIDE_FILTER = 4
-"""The number in filters. A filter of eight takes a fifth less time where its results fit the cache,
-but one of a single episode, or a second library for that, takes half as long again."""
+_WIDE_ALONE = 4
+"""The number where the code for one lane is not compiled: a single episode takes little longer in
+four lanes, but half as long again in eight."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class _Parts:
     an algorithm that is no filter."""
     once: str = ""
     """Text before all of these."""
+    wide: int = _WIDE
+    """Number of lanes."""
 
 
 _SETS = {"ensemble": ("ensemble.c",), "particles": ("weights.c", "particles.c")}
@@ -45,11 +47,12 @@ def _parts(template: str) -> _Parts:
         return _Parts((f"{template}_entry.c",), (f"{template}.c",), once=once)
     if template == "smoother":
         lanes = "filter_rows.c", "smoother.c"
-        return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
+        return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED", _WIDE_ALONE)
     if template in _SETS:
         return _Parts((*_OF_SETS, *_SETS[template]), ())
     if template == "window":
-        return _Parts(("given_inputs.c", "window_entry.c"), (), template, read("window.h"))
+        entries = "given_inputs.c", "window_entry.c"
+        return _Parts(entries, (), template, read("window.h"), _WIDE_ALONE)
     return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)
 
 
@@ -62,9 +65,8 @@ def library_source(plant: PlantCode, template: str) -> str:
         template: name of a template with an algorithm for any number of lanes, such as ``ekf``.
     """
     own = _parts(template)
-    wide = _WIDE_FILTER if own.algorithm else _WIDE
     parts = [read("common.h"), plant.once, own.once]
-    for width in (1, wide):
+    for width in (1, own.wide):
         parts += [
             f"#undef W\n#undef AT_WIDTH\n#define W {width}\n#define AT_WIDTH(name) name##_{width}",
             read("lanes.h"),
@@ -77,10 +79,10 @@ def library_source(plant: PlantCode, template: str) -> str:
             parts += filter_parts(plant, own.algorithm, (read("inputs.h"), read("marks.h")))
         parts += map(read, own.lanes)
     called = "".join(
-        f"#define {name.upper()}_WIDE {name}_rows_{wide}\n"
+        f"#define {name.upper()}_WIDE {name}_rows_{own.wide}\n"
         for name in ("filter", "smooth", "solve", "step", "linearise", "window")
     )
-    parts += [f"#define WIDE {wide}\n{called}", *map(read, own.entries), read("check.c")]
+    parts += [f"#define WIDE {own.wide}\n{called}", *map(read, own.entries), read("check.c")]
     return "\n".join(parts)
 
 

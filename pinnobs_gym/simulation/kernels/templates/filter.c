@@ -33,7 +33,7 @@ static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t
     return count ? count : -1;
 }
 
-/* Filter the rows in groups of WIDE lanes. ``reached`` (batch,) is set to the number of the sample
+/* Filter the rows in groups of WIDE lanes, or a row that is left over alone. ``reached`` (batch,) is set to the number of the sample
    that NumPy has to do in each row, or the number of samples. Returns 0 if there is none to do.
 
    All rows are filtered through some samples, whose results stay in the cache while they are
@@ -57,7 +57,8 @@ int64_t run(const struct call *c, int64_t *reached)
                 count = 1;
                 continue;
             }
-            FILTER_WIDE(&part, row, (int)count, number);
+            if (count == 1) filter_rows_1(&part, row, 1, number);
+            else FILTER_WIDE(&part, row, (int)count, number);
             for (int l = 0; l < count; l++)
                 if (number[l] < part.samples) {
                     reached[row + l] = k + number[l];

@@ -18,9 +18,9 @@ static inline void AT_WIDTH(squared)(int n, int k, const lanes *restrict a, lane
 
 /* Points (num_points, NX) of the distribution with mean x and covariance P. Lanes where P has no
    root, or a point is outside of the bounds, are marked. */
-static inline void AT_WIDTH(draw)(const struct plan *plan, const lanes *restrict x,
-                                  const lanes *restrict P, lanes *restrict points,
-                                  int64_t *restrict bad)
+SEPARATE void AT_WIDTH(draw)(const struct plan *plan, const lanes *restrict x,
+                             const lanes *restrict P, lanes *restrict points,
+                             int64_t *restrict bad)
 {
     lanes L[NX * NX];
     AT_WIDTH(cholesky)(NX, P, L);
@@ -55,9 +55,9 @@ static inline void AT_WIDTH(mark_undefined)(const struct plan *plan, int n,
 
 /* Mean (n), and weighted deviations X (n, num_points), of values (num_points, n). Those that repeat
    are taken near those at the centre. */
-static inline void AT_WIDTH(deviations)(const struct plan *plan, int n, const double *period,
-                                        const lanes *restrict centre, lanes *restrict values,
-                                        lanes *restrict mean, lanes *restrict X)
+SEPARATE void AT_WIDTH(deviations)(const struct plan *plan, int n, const double *period,
+                                   const lanes *restrict centre, lanes *restrict values,
+                                   lanes *restrict mean, lanes *restrict X)
 {
     const int points = (int)plan->num_points;
     for (int i = 0; i < n; i++) {
@@ -109,10 +109,10 @@ static inline void AT_WIDTH(predict)(const struct interval *over, lanes *restric
 }
 
 /* Correct x and P by the outputs of a sample. Lanes that NumPy has to correct are marked. */
-static inline void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p,
-                                     struct sample *restrict s, lanes *restrict x,
-                                     lanes *restrict P, struct memory *restrict memory,
-                                     int64_t *restrict bad)
+SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p,
+                                struct sample *restrict s, lanes *restrict x,
+                                lanes *restrict P, struct memory *restrict memory,
+                                int64_t *restrict bad)
 {
     const int num_points = (int)plan->num_points;
     lanes *const y = s->y, *const e = s->e, *const R = s->R, *const S = s->S;
