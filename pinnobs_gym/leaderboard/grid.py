@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
-from pinnobs_gym.leaderboard.display import filled, padded, printable, width_of
+from pinnobs_gym.leaderboard.display import filled, one_line, padded, printable, width_of
 from pinnobs_gym.leaderboard.escapes import PACKAGES, csv_text, latex_text, markdown_text
 
 GAP = "  "
@@ -180,7 +180,7 @@ class Grid:
             " & ".join(map(latex_text, line)) + r" \\" for line in (self.header, *self.lines)
         )
         parts = [
-            *(f"% {printable(' '.join(text.split()))}" for text in (self.title, self.note) if text),
+            *(f"% {one_line(text)}" for text in (self.title, self.note) if text),
             rf"% \usepackage{{{','.join(PACKAGES)}}}",
             rf"\begin{{tabular}}{{{kinds}}}",
             r"\toprule",

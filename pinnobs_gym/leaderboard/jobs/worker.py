@@ -18,6 +18,7 @@ from uuid import uuid4
 from threadpoolctl import threadpool_limits
 
 from pinnobs_gym.files import is_held
+from pinnobs_gym.leaderboard.display import show_messages_printable
 from pinnobs_gym.scoring.rows import CannotWrite
 
 SEEN_AFTER = 5.0
@@ -149,6 +150,7 @@ def _prepare(origin: Origin) -> None:
     if origin.children and _is_orphan(origin):
         os._exit(1)  # the client no longer waits for this job
     _one_thread()
+    show_messages_printable()
     if origin.folder not in sys.path:
         sys.path.append(origin.folder)  # to import module:Class from the user's folder
     deadline = time.monotonic() + SEEN_AFTER
