@@ -73,6 +73,13 @@ def guarded(command: Callable[[], int]) -> int:
             raise
         print(f"pinnobs: error: {words_of(error)}", file=sys.stderr)
         return 1
+    except OSError as error:
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        place = "" if error.filename is None else f"{error.filename}: "
+        told = one_line(f"{place}{error.strerror}") if error.strerror else words_of(error)
+        print(f"pinnobs: error: {told}", file=sys.stderr)
+        return 2
     except Exception as error:  # a fault of a plug-in or of this package
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise

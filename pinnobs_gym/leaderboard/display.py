@@ -18,6 +18,8 @@ _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?
 _UNSEEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 """Unicode categories of characters that move, colour, hide or reorder text, and of halves of
 characters, which cannot be encoded."""
+_LONGEST = 1000
+"""Largest number of characters of a message."""
 _JOINED_JAMO = range(0x1160, 0x1200)
 """Hangul vowels and final consonants, which are drawn within the syllable before them."""
 
@@ -44,9 +46,12 @@ def one_line(text: str) -> str:
 
 
 def words_of(error: BaseException) -> str:
-    """Return the message of an error in one line, or its type if it has none or cannot say it."""
+    """Return the message of an error in one line, or its type if it has none or cannot say it. Of a
+    very long one, as of a value that somebody made long, the middle is left out."""
     try:
-        return one_line(str(error)) or type(error).__name__
+        words = one_line(str(error)) or type(error).__name__
+        half = _LONGEST // 2
+        return words if len(words) <= _LONGEST else f"{words[:half]} ... {words[-half:]}"
     except Exception:
         return f"{one_line(type(error).__name__)} without a message that can be read"
 

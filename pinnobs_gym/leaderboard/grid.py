@@ -198,10 +198,14 @@ class Grid:
         Title and note are left out, and cells that look like formulas are changed as `csv_text`
         says; every other cell is read back as it is.
         """
-        file = io.StringIO(newline="")
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([csv_text(cell) for cell in line] for line in (self.header, *self.lines))
-        return file.getvalue()
+        return "".join(map(_csv_line, (self.header, *self.lines)))
+
+
+def _csv_line(cells: Iterable[str]) -> str:
+    """Return a line of CSV. Only with this end does Python's writer quote every carriage return."""
+    file, end = io.StringIO(newline=""), "\r\n"
+    csv.writer(file, lineterminator=end).writerow(map(csv_text, cells))
+    return file.getvalue().removesuffix(end) + "\n"
 
 
 Layouts: TypeAlias = Sequence[Sequence[Grid]]

@@ -81,3 +81,19 @@ def test_warnings_and_the_log_are_plain(capsys, monkeypatch):
     assert is_plain(told)
     logging.lastResort.handle(logging.LogRecord("x", 30, "", 0, f"{HOSTILE}\n2", None, None))
     assert capsys.readouterr().err == f"{SEEN}\n2\n"
+
+
+def test_of_a_long_message_both_ends_are_told(capsys):
+    assert main(["x" * 5000]) == 2
+    told = capsys.readouterr().err
+    assert len(told) < 1100
+    assert told.startswith("pinnobs: error: unknown command 'xxx")
+    assert told.rstrip().endswith(", tune")
+
+
+def test_a_file_that_cannot_be_opened_is_named(capsys, tmp_path):
+    name = "a" * 300
+    assert main(["tables", str(tmp_path / name)]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"pinnobs: error: {tmp_path / name}: ")
+    assert told.count("\n") == 1
