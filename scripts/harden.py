@@ -1,6 +1,6 @@
 """Try to break the package, and print how it ends: one JSON line a group, and a summary.
 
-    python scripts/harden.py [rows logs ...] [--seconds 600] [--seed 0]
+    python scripts/harden.py [rows logs ...] [--seconds 1800] [--seed 0]
 
 A group is a module of the folder ``hardening``: bad inputs, which have to be refused in one line
 that names the file, the field or the argument, or accepted where that is right; faults, after which
@@ -97,7 +97,7 @@ def apart() -> Iterator[Material]:
 
 def main(
     groups: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
-    seconds: float = 600.0,
+    seconds: float = 1800.0,
     seed: int = 0,
     most: int = 1000,
 ) -> int:

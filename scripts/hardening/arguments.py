@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
 from random import Random
+from typing import Any
 
 from hardening.material import SYSTEM, Material
 from hardening.trial import Expected, Trial, command
@@ -60,14 +63,37 @@ COLUMNS += ("t=t*nan", "y1=y1**y1**9", "y1=\x1b", "y1=y1;y1", "y1=lambda:0", "y1
 
 def trials(material: Material, rng: Random) -> Iterator[Trial]:
     """Yield command lines, each right but for one option."""
-    out, new = material.file("out"), material.file("new")
+    for number in count():
+        yield _trial(material, rng, number)
+
+
+Options = list[tuple[tuple[Any, ...], tuple[str, ...], tuple[str, ...]]]
+"""Command lines that are right, options that are added, and values that these may not have."""
+
+
+def _trial(material: Material, rng: Random, number: int) -> Trial:
+    """Return a command line that writes to folders of its own."""
+    options = _options(material, material.file(f"out{number}"), material.file(f"new{number}"))
+    base, names, values = rng.choice(options)
+    option, value = rng.choice(names), rng.choice(values)
+    # An option that takes several values may have none.
+    expected: Expected = "either" if value in ("", "--", "1 2", "1 2 3") else "refused"
+    words = [*base, option, value] if option else [*filter(None, base), value]
+    field = option.strip("-")
+    known = [field, field.replace("-", "_"), value[:20], repr(value)[1:20], base[0] or "command"]
+    known += [part[:20] for part in value.split("=")]
+    return command(words, list(filter(None, known)), expected)
+
+
+def _options(material: Material, out: Path, new: Path) -> Options:
+    """Return what may be tried."""
     log = ("estimate", "--system", SYSTEM, "--log", material.log_file, "--estimator", "open_loop")
     log += ("--out", out / "estimates.csv")
     play = ("evaluate", "--system", SYSTEM, "--estimator", "open_loop", "--out", out)
     board = ("leaderboard", "--systems", SYSTEM, "--estimators", "open_loop", "--jobs", "1")
     board += ("--out", out)
     fit = ("fit", "--system", "Satellite", "--log", material.log_file, "--picture", out / "fit.png")
-    options = [
+    return [
         (play, ("--episodes",), COUNTS),
         (play, ("--seed",), SEEDS),
         (("evaluate", "--system", SYSTEM), ("--set",), SETTINGS),
@@ -99,18 +125,3 @@ def trials(material: Material, rng: Random) -> Iterator[Trial]:
         (("export",), ("",), NAMES),
         (("",), ("",), NAMES),
     ]
-    while True:
-        base, names, values = rng.choice(options)
-        option, value = rng.choice(names), rng.choice(values)
-        # An option that takes several values may have none.
-        expected: Expected = "either" if value in ("", "--", "1 2", "1 2 3") else "refused"
-        words = [*base, option, value] if option else [*filter(None, base), value]
-        field = option.strip("-")
-        known = [
-            field,
-            field.replace("-", "_"),
-            value[:20],
-            repr(value)[1:20],
-            base[0] or "command",
-        ]
-        yield command(words, list(filter(None, known)), expected)

@@ -6,8 +6,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from itertools import count
 from random import Random
 
@@ -19,7 +21,8 @@ from hardening.trial import Hung, Outcome, Trial
 MOST = 110
 ERRORS = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO, errno.EMFILE, errno.EDQUOT)
 _WRITING = os.O_WRONLY | os.O_RDWR
-Injected = Callable[[str], None]
+Injected = Callable[[str, str], None]
+"""Called with an event and a path."""
 _injected: list[Injected] = []
 """What is called at each change of a file system, in a list since an audit hook stays."""
 
@@ -36,33 +39,33 @@ def _hook(event: str, arguments: tuple[object, ...]) -> None:
     else:
         return
     if isinstance(path, str | bytes | os.PathLike):
-        _injected[0](os.fsdecode(path))
+        _injected[0](event, os.fsdecode(path))
+
+
+@cache
+def _add_hook() -> None:
+    """Add the hook, once, since it cannot be removed."""
+    sys.addaudithook(_hook)
 
 
 @contextmanager
 def injected(folder: str, at: int, act: Injected, lasting: bool) -> Iterator[list[int]]:
     """Act at the change number ``at`` of a folder's files, and at all later ones if it lasts.
     Yields a list of the numbers of changes so far."""
-    if "hardening" not in _hooked:
-        sys.addaudithook(_hook)
-        _hooked.append("hardening")
+    _add_hook()
     seen: list[int] = []
 
-    def called(path: str) -> None:
+    def called(event: str, path: str) -> None:
         if path.startswith(folder):
             seen.append(len(seen))
             if seen[-1] == at or (lasting and seen[-1] > at):
-                act(path)
+                act(event, path)
 
     _injected[:] = [called]
     try:
         yield seen
     finally:
         _injected.clear()
-
-
-_hooked: list[str] = []
-"""Filled once the hook is there, since it cannot be removed."""
 
 
 @contextmanager
@@ -83,7 +86,7 @@ def trials(material: Material, rng: Random) -> Iterator[Trial]:
     numbers = count()
     expected = undisturbed(material, next(numbers))
     run = Run(material, next(numbers))
-    with injected(str(run.out), -1, lambda path: None, False) as seen:
+    with injected(str(run.out), -1, lambda event, path: None, False) as seen:
         run.here()
     changes = len(seen)
     for name in (*plug_ins.RAISING, *plug_ins.DISTURBING):
@@ -103,12 +106,14 @@ def trials(material: Material, rng: Random) -> Iterator[Trial]:
             yield _disturbed(what, material, number, expected, at, act, lasting)
 
 
-def _stop(path: str) -> None:
-    raise KeyboardInterrupt
+def _stop(event: str, path: str) -> None:
+    """Interrupt as Ctrl-C does: in the main thread, and not in the place of a removal."""
+    if event != "os.remove" and threading.current_thread() is threading.main_thread():
+        raise KeyboardInterrupt
 
 
 def _failing(error: int) -> Injected:
-    def fail(path: str) -> None:
+    def fail(event: str, path: str) -> None:
         raise OSError(error, os.strerror(error), path)
 
     return fail
@@ -135,7 +140,10 @@ def _disturbed(
             return Outcome("hung", "it did not end")
         except BaseException as error:
             return Outcome("traceback", f"{type(error).__name__}: {error}")
-        again = tried.here()
+        try:
+            again = tried.here()
+        except Hung:
+            return Outcome("hung", "the run that was started again did not end")
         wrong = difference(tried.facts(), expected)
         left = leftovers(tried.out)
         tried.removed()
