@@ -12,6 +12,7 @@ from importlib import resources
 from io import TextIOWrapper
 
 from pinnobs_gym.cli import commands
+from pinnobs_gym.leaderboard.display import one_line, show_messages_printable, words_of
 
 COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 """Names of the commands."""
@@ -57,6 +58,7 @@ def guarded(command: Callable[[], int]) -> int:
     """Run a command as a process of its own: with one numerical thread, and with errors told in one
     line. Returns its exit status, see `main`."""
     _print_anything()
+    show_messages_printable()
     _one_thread()
     sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
     try:
@@ -64,17 +66,24 @@ def guarded(command: Callable[[], int]) -> int:
     except (ValueError, TypeError, FloatingPointError) as error:
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
-        print(f"pinnobs: error: {error}", file=sys.stderr)
+        print(f"pinnobs: error: {words_of(error)}", file=sys.stderr)
         return 2
     except ConnectionError as error:  # connection lost to other machines during the run
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
-        print(f"pinnobs: error: {error}", file=sys.stderr)
+        print(f"pinnobs: error: {words_of(error)}", file=sys.stderr)
         return 1
+    except OSError as error:
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        place = "" if error.filename is None else f"{error.filename}: "
+        told = one_line(f"{place}{error.strerror}") if error.strerror else words_of(error)
+        print(f"pinnobs: error: {told}", file=sys.stderr)
+        return 2
     except Exception as error:  # a fault of a plug-in or of this package
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
-        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        what = f"{one_line(type(error).__name__)}: {words_of(error)}"
         print(f"pinnobs: error: {what} (PINNOBS_TRACEBACK=1 shows where)", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -14,11 +15,28 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 
+from pinnobs_gym.leaderboard.display import printable_lines
 from pinnobs_gym.leaderboard.grid import PROSE, Layouts, fitting
 
+
+class PrintableConsole(Console):
+    """A console that writes no control character but its own: whatever is printed, a table, a text
+    or a bar, its letters go through `printable_lines`."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text.isprintable():
+                yield segment
+            else:
+                yield Segment(printable_lines(segment.text), segment.style)
+
+
 _PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
-console = Console(**_PLAIN) if Console().is_terminal else Console(width=PROSE, **_PLAIN)
+console = PrintableConsole(**_PLAIN, width=None if Console().is_terminal else PROSE)
 """The console for all output. Names are data: brackets and colons in them are printed as they
 are."""
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.envs.figures import ESTIMATE, MEASURED
+from pinnobs_gym.envs.figures import ESTIMATE, MEASURED, plain
 from pinnobs_gym.envs.panels import panels
 from pinnobs_gym.logs.fit import Fit
 from pinnobs_gym.logs.reading import Log
@@ -43,13 +43,14 @@ def fit_figure(logs: Sequence[Log], fit: Fit) -> Figure:
             above.plot(t, yhat[:, j], color=ESTIMATE, lw=1.0, label="model")
             below.plot(t, off[:, j], ".", ms=2, color=MEASURED)
             below.fill_between(t, -2 * std[:, j], 2 * std[:, j], color=ESTIMATE, alpha=0.15, lw=0)
-            above.set_ylabel(f"{name} ({unit})" if unit else name)
+            above.set_ylabel(plain(f"{name} ({unit})" if unit else name))
             below.set_ylabel("residual")
             below.set_ylim(*_around(off[:, j], std[:, j]))
             above.tick_params(labelbottom=False)
             for panel in (above, below):
                 panel.grid(alpha=0.3)
-        axes[0, i].set_title(f"{log.path.name}: {type(system).__name__}", fontsize=10)
+        title = plain(f"{log.path.name}: {type(system).__name__}")
+        axes[0, i].set_title(title, fontsize=10)
         axes[-1, i].set_xlabel(f"t ({system.time_unit})")
     axes[0, 0].legend(loc="upper right", fontsize=8, ncols=2)
     return figure

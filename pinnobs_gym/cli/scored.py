@@ -10,6 +10,7 @@ from pinnobs_gym.envs.game import AnyGame
 from pinnobs_gym.leaderboard import standings_table
 from pinnobs_gym.leaderboard.against import Opponents, compare
 from pinnobs_gym.leaderboard.contenders import contenders
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.floor import floors, is_floor
 from pinnobs_gym.leaderboard.runs import runs_of
 from pinnobs_gym.leaderboard.states_table import by_state
@@ -66,12 +67,13 @@ def report(
         known = [row for row in rows_module.read(rows) if rows_module.game_of(row) == game.name]
         found = floors([*evaluated.rows, *filter(is_floor, known)], shipped)
         for table in tables(contenders(runs_of(evaluated.rows, found)), floors=found):
-            print_table(standings_table.layouts(table), f"pinnobs tables {rows} -o FILE writes all")
+            hint = f"pinnobs tables {quoted(str(rows))} -o FILE writes all"
+            print_table(standings_table.layouts(table), hint)
         for note in found.notes:
             console.print(note, style="yellow", soft_wrap=True)
     else:
         comparison = compare(evaluated.rows, others)
-        hint = f"pinnobs tables {rows} {others.path} -o FILE writes all"
+        hint = f"pinnobs tables {quoted(str(rows))} {quoted(str(others.path))} -o FILE writes all"
         print_table(standings_table.layouts(comparison.table), hint)
         console.print(comparison.summary + "\n", highlight=False)
     print_table([[by_state(game.source.system, evaluated.rows)]])

@@ -58,7 +58,7 @@ def state_figure(
     periods = system.state_period or [None] * system.nx
     for i, (panel, name) in enumerate(zip(column[:, 0], system.state_names, strict=True)):
         unit = system.units.get(name)
-        panel.set_ylabel(f"{name} ({unit})" if unit else name)
+        panel.set_ylabel(plain(f"{name} ({unit})" if unit else name))
         if y is not None and i in measured:
             dots = _drawable(y[:, measured[i]])
             panel.plot(t, dots, ".", ms=2, color=MEASURED, label="measured")
@@ -86,10 +86,15 @@ def state_figure(
         if len(seen):
             panel.set_ylim(*_limits(seen, float(system.scale[i])))
         panel.grid(alpha=0.3)
-    column[0, 0].set_title(title, fontsize=10)
+    column[0, 0].set_title(plain(title), fontsize=10)
     column[0, 0].legend(loc="upper right", fontsize=8, ncols=3)
     column[-1, 0].set_xlabel(f"t ({system.time_unit})")
     return figure
+
+
+def plain(text: str) -> str:
+    """Return a text as Matplotlib draws it without mathematics: names may have dollar signs."""
+    return text.replace("$", r"\$")
 
 
 def drawn_outputs(system: System, x: np.ndarray, y: np.ndarray) -> np.ndarray:

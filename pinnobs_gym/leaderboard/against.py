@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pinnobs_gym.envs.game import AnyGame, GameName
 from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.published import reading
 from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.leaderboard.tables import Table
@@ -143,6 +144,6 @@ def _command(game: AnyGame) -> str:
     own = game.name.env_id.removeprefix("pinnobs/").rpartition("-v")[0]
     inside = cls.__module__.startswith("pinnobs_gym.systems.")
     system = own if inside else f"{cls.__module__}:{cls.__qualname__}"
-    options = "" if setup == "benchmark" else f" --setup {setup}"
-    options += "" if condition == "nominal" else f" --condition {condition}"
-    return f"pinnobs leaderboard --systems {system}{options}, and name its rows file"
+    options = "" if setup == "benchmark" else f" --setup {quoted(setup)}"
+    options += "" if condition == "nominal" else f" --condition {quoted(condition)}"
+    return f"pinnobs leaderboard --systems {quoted(system)}{options}, and name its rows file"

@@ -1,16 +1,25 @@
-"""Text as a terminal shows it: its width in columns, control characters, and lines of words."""
+"""Text as a terminal shows it: its width in columns, control characters, and lines of words.
+
+Names and messages are other people's text: of plug-ins, rows files, logs and their columns. What is
+shown of them goes through `printable`, by the console or here.
+"""
 
 from __future__ import annotations
 
+import logging
 import re
 import unicodedata
+import warnings
 from collections.abc import Iterable
+from typing import Any
 
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[@-Z\\-_])?")
 """An ANSI escape sequence (ECMA-48, 5.3 and 5.4), or an operating system command."""
 _UNSEEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 """Unicode categories of characters that move, colour, hide or reorder text, and of halves of
 characters, which cannot be encoded."""
+_LONGEST = 1000
+"""Largest number of characters of a message."""
 _JOINED_JAMO = range(0x1160, 0x1200)
 """Hangul vowels and final consonants, which are drawn within the syllable before them."""
 
@@ -24,6 +33,52 @@ def printable(text: str) -> str:
         "�" if unicodedata.category(character) in _UNSEEN else character
         for character in _ESCAPE.sub("�", text)
     )
+
+
+def printable_lines(text: str) -> str:
+    """Return `printable` text of several lines."""
+    return text if text.isprintable() else "\n".join(map(printable, text.split("\n")))
+
+
+def one_line(text: str) -> str:
+    """Return `printable` text in one line, without white space at its ends."""
+    return printable(" ".join(text.split()))
+
+
+def words_of(error: BaseException) -> str:
+    """Return the message of an error in one line, or its type if it has none or cannot say it. Of a
+    very long one, as of a value that somebody made long, the middle is left out."""
+    try:
+        words = one_line(str(error)) or type(error).__name__
+        half = _LONGEST // 2
+        return words if len(words) <= _LONGEST else f"{words[:half]} ... {words[-half:]}"
+    except Exception:
+        return f"{one_line(type(error).__name__)} without a message that can be read"
+
+
+def show_messages_printable() -> None:
+    """Let warnings and the log's lines, which Python writes to stderr, be `printable` in this
+    process. A handler that an application gives the log is its own affair."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_Printable())
+    if warnings.formatwarning is not _format_warning:
+        _FORMATS.append(warnings.formatwarning)
+        warnings.formatwarning = _format_warning
+
+
+class _Printable(logging.Formatter):
+    """The format of the log, printable."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable_lines(super().format(record))
+
+
+_FORMATS = [warnings.formatwarning]
+"""The formats of warnings that were replaced, of which the last is used."""
+
+
+def _format_warning(*arguments: Any, **more: Any) -> str:
+    return printable_lines(_FORMATS[-1](*arguments, **more))
 
 
 def width_of(text: str) -> int:

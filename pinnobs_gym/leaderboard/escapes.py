@@ -1,10 +1,11 @@
-"""Text in which no character is markup: of Markdown, LaTeX or a spreadsheet."""
+"""Text in which no character is markup: of Markdown, LaTeX, a spreadsheet or a shell."""
 
 from __future__ import annotations
 
 import re
+import shlex
 
-from pinnobs_gym.leaderboard.display import printable
+from pinnobs_gym.leaderboard.display import one_line, printable
 
 _COMMANDS = {
     "\\": r"\textbackslash{}",
@@ -52,13 +53,16 @@ def latex_text(text: str) -> str:
     Symbols of the tables become commands of mathematics. All other characters are left as they are,
     in UTF-8; pdflatex knows the Latin ones, lualatex and xelatex all those of their font.
     """
-    return re.sub("-(?=-)", "-{}", _one_line(text).translate(_TABLE))  # two would be one dash
+    return re.sub("-(?=-)", "-{}", one_line(text).translate(_TABLE))  # two would be one dash
 
 
 def markdown_text(text: str) -> str:
     """Return text with the characters escaped that Markdown, HTML or a table would take for
-    markup; brackets only where they could be a link."""
-    text = re.sub(r"[\\`*<>|]", r"\\\g<0>", _one_line(text))
+    markup: brackets only where they could be a link, underscores only at the ends of words, and
+    addresses so that they are no links."""
+    text = re.sub(r"[\\`*<>|&~$]", r"\\\g<0>", one_line(text))
+    text = re.sub(r"\b_|_\b", r"\\_", text)
+    text = re.sub(r":(?=//)|(?<=www)\.|@", r"\\\g<0>", text)
     return re.sub(r"\](?=[(\[:])", r"\\]", text)
 
 
@@ -78,6 +82,20 @@ def csv_text(cell: str) -> str:
     return cell
 
 
-def _one_line(text: str) -> str:
-    """Return printable text in one line."""
-    return printable(" ".join(text.split()))
+def quoted(word: str) -> str:
+    r"""Return a word of a command line, quoted for a POSIX shell where it has to be. Characters
+    that cannot be seen are written as bash and zsh read them, ``$'\x1b'``."""
+    if printable(word) == word:
+        return shlex.quote(word)
+    parts = []
+    for character in word:
+        if character in "\\'":
+            parts.append("\\" + character)
+        elif printable(character) == character:
+            parts.append(character)
+        else:  # as bytes, whatever the shell's encoding is
+            data = character.encode(
+                errors="surrogateescape" if "\udc80" <= character <= "\udcff" else "replace"
+            )
+            parts += [f"\\x{byte:02x}" for byte in data]
+    return f"$'{''.join(parts)}'"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
-from pinnobs_gym.leaderboard.display import filled, padded, printable, width_of
+from pinnobs_gym.leaderboard.display import filled, one_line, padded, printable, width_of
 from pinnobs_gym.leaderboard.escapes import PACKAGES, csv_text, latex_text, markdown_text
 
 GAP = "  "
@@ -180,7 +180,7 @@ class Grid:
             " & ".join(map(latex_text, line)) + r" \\" for line in (self.header, *self.lines)
         )
         parts = [
-            *(f"% {printable(' '.join(text.split()))}" for text in (self.title, self.note) if text),
+            *(f"% {one_line(text)}" for text in (self.title, self.note) if text),
             rf"% \usepackage{{{','.join(PACKAGES)}}}",
             rf"\begin{{tabular}}{{{kinds}}}",
             r"\toprule",
@@ -198,10 +198,14 @@ class Grid:
         Title and note are left out, and cells that look like formulas are changed as `csv_text`
         says; every other cell is read back as it is.
         """
-        file = io.StringIO(newline="")
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([csv_text(cell) for cell in line] for line in (self.header, *self.lines))
-        return file.getvalue()
+        return "".join(map(_csv_line, (self.header, *self.lines)))
+
+
+def _csv_line(cells: Iterable[str]) -> str:
+    """Return a line of CSV. Only with this end does Python's writer quote every carriage return."""
+    file, end = io.StringIO(newline=""), "\r\n"
+    csv.writer(file, lineterminator=end).writerow(map(csv_text, cells))
+    return file.getvalue().removesuffix(end) + "\n"
 
 
 Layouts: TypeAlias = Sequence[Sequence[Grid]]

@@ -38,3 +38,13 @@ def test_nothing_is_cut_off(size, rows):
     assert not cut_off(figure)
     column[0, 0].set_ylabel("a name that is longer than the panel is high, " * 4)
     assert cut_off(figure)
+
+
+def test_dollar_signs_in_names_are_no_formulas():
+    """Else such a title, of a log's file, could not be drawn."""
+    title = r"$\frac$.csv costs $2"
+    x = np.zeros((3, 2))
+    figure = state_figure(ReverseDuffing(), np.arange(3.0), x, title=title)
+    FigureCanvasAgg(figure).draw()
+    plain = figure.axes[0].title.get_text()
+    assert plain.replace(r"\$", "$") == title

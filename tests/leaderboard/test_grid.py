@@ -11,7 +11,7 @@ import pytest
 from rich.cells import cell_len
 
 from pinnobs_gym.leaderboard.display import filled, padded, printable, width_of
-from pinnobs_gym.leaderboard.escapes import PACKAGES, csv_text, latex_text, markdown_text
+from pinnobs_gym.leaderboard.escapes import PACKAGES, csv_text, latex_text, markdown_text, quoted
 from pinnobs_gym.leaderboard.grid import GAP, WANTED, Column, Grid, fitting, markdown_table
 
 COLUMNS = (
@@ -313,6 +313,32 @@ def test_latex_escapes(text, expected):
     assert latex_text(text) == expected
 
 
+def test_words_are_quoted_for_a_shell():
+    """bash reads back what was quoted, and nothing in it is run or cannot be seen."""
+    words = ["ekf", "a b", "it's", "$(touch x)", "`id`", "a;b", "~", "", "$'x'", "\\\\", "ä*"]
+    words += ["\x1b[31m'\\", "a\nb", "\u202ex", "\x85", "a\x7fb1"]
+    line = " ".join(map(quoted, words))
+    assert line.isprintable()
+    if bash := shutil.which("bash"):
+        command = [bash, "-c", f"printf '%s\\0' {line}"]
+        read = subprocess.run(command, check=True, capture_output=True).stdout
+        assert read.decode().split("\0")[:-1] == words
+    assert quoted("a\udcffb") == r"$'a\xffb'"  # a byte of a file's name that is no text
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("&lt;b&gt;", r"\&lt;b\&gt;"),
+        ("_a_ b_c", r"\_a\_ b_c"),
+        ("~~a~~ $x$", r"\~\~a\~\~ \$x\$"),
+        ("http://b www.b a@b", r"http\://b www\.b a\@b"),
+    ],
+)
+def test_markdown_escapes(text, expected):
+    assert markdown_text(text) == expected
+
+
 def test_latex_of_a_table():
     columns = (Column("name", numeric=False), Column("n %"))
     grid = Grid("A\ntitle", columns, (("a_b", "1"), ("[c", "∞")), blocks=(1,), note="50 %")
@@ -348,13 +374,14 @@ def test_latex_compiles(tmp_path):
 
 def test_csv_is_read_back_as_it_was():
     cells = [*NASTY, 'a "b", c', "-0.1", "+3", "-1e-3", "∞", "1.52 ▲", "a=b", " x ", "\x1b", "'"]
+    cells += ["a\rb", "a\r\nb", "a\nb"]
     columns = (Column("name, of it"), Column("-n"))
     text = Grid("T", columns, tuple((cell, "1") for cell in cells), note="N").csv()
     header, *lines = csv.reader(io.StringIO(text, newline=""))
     assert header == ["name, of it", "'-n"]
     assert lines == [[cell, "1"] for cell in cells]
     assert text.endswith("\n")
-    assert "\r" not in text
+    assert text.startswith('"name, of it",\'-n\n')  # lines end in a line feed alone
 
 
 @pytest.mark.parametrize("cell", ["=1+1", "+a", "-a", "@SUM(A1)", "\t=1", "\r=1", "-1+2", "-"])

@@ -15,6 +15,7 @@ from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.leaderboard import suites
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.chapters import chapters, markdown
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.job import Job
@@ -194,7 +195,8 @@ class Leaderboard:
             if where.exists():
                 console.print(f"{what + ':':14} {where}", soft_wrap=True)
         console.print(
-            f"to make a page: pinnobs report {self.out / 'rows.jsonl'} -o {self.out / 'site'}",
+            f"to make a page: pinnobs report {quoted(str(self.out / 'rows.jsonl'))} "
+            f"-o {quoted(str(self.out / 'site'))}",
             soft_wrap=True,
         )
 

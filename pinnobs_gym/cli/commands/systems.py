@@ -13,6 +13,7 @@ from pinnobs_gym.cli.console import console, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.envs.registration import env_id
+from pinnobs_gym.leaderboard.display import printable_lines
 from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.systems import SYSTEMS
 
@@ -30,9 +31,9 @@ class Systems:
             name = env_id(self.name)
             text = page(SYSTEMS.resolve(self.name), name)
             if console.is_terminal:
-                console.print(Markdown(text))
+                console.print(Markdown(printable_lines(text), hyperlinks=False))
             else:
-                print(text)
+                console.out(text, highlight=False)
             return 0
         print_table([[listing()]], "pinnobs systems NAME says more")
         return 0

@@ -41,6 +41,8 @@ def connected(address: str) -> Iterator[DaskPool]:
         ) from None
     if not re.fullmatch(r"\w+://.+:\d+", address):
         raise ValueError(f"scheduler={address!r}; expected an address such as tcp://host:8786")
+    if address.startswith("tls://"):
+        _check_tls(address)
     for name in logging.root.manager.loggerDict:
         if name.partition(".")[0] == "distributed":  # they log every retry
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -65,6 +67,27 @@ def connected(address: str) -> Iterator[DaskPool]:
     finally:
         with suppress(Exception):  # a lost scheduler is reported elsewhere
             client.close(timeout=2)
+
+
+def _check_tls(address: str) -> None:
+    """Check that Dask's configuration has what a client of an encrypted scheduler needs.
+
+    Raises:
+        ValueError: in one line that names the settings or the file.
+    """
+    from distributed.security import Security
+
+    wanted = (
+        "ca-file, client.key and client.cert below distributed.comm.tls in Dask's configuration"
+    )
+    try:
+        context = Security().get_connection_args("client").get("ssl_context")
+    except OSError as error:  # a file that is missing, or is no certificate
+        raise ValueError(
+            f"scheduler={address!r}: cannot read the files of {wanted}: {error}"
+        ) from None
+    if context is None:
+        raise ValueError(f"scheduler={address!r} needs {wanted}")
 
 
 class DaskPool(Pool):

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol, Self
 from threadpoolctl import threadpool_limits
 
 from pinnobs_gym.files import CannotWrite, is_held, replacing
+from pinnobs_gym.leaderboard.display import show_messages_printable
 
 SEEN_AFTER = 5.0
 """Longest time in s until other machines of a shared folder see a new file."""
@@ -145,6 +146,7 @@ def _prepare(origin: Origin) -> None:
     if origin.children and _is_orphan(origin):
         os._exit(1)  # the client no longer waits for this job
     _one_thread()
+    show_messages_printable()
     if origin.folder not in sys.path:
         sys.path.append(origin.folder)  # to import module:Class from the user's folder
     deadline = time.monotonic() + SEEN_AFTER

@@ -10,12 +10,15 @@ from typing import Any
 import altair as alt
 import numpy as np
 
+from pinnobs_gym.leaderboard.display import one_line
 from pinnobs_gym.leaderboard.site.palette import Style
 
 Spec = dict[str, Any]
 """A chart in Vega-Lite."""
 SHOWN = "indexof(shown, datum.estimator) >= 0"
 """Expression for whether the reader has selected the estimator."""
+NAME = alt.Tooltip("name:N", title="estimator")
+"""The estimator in a tooltip."""
 PLAIN = ".3~r"
 """Number format of ticks, without exponents."""
 AXIS = 54
@@ -26,17 +29,20 @@ HUGE = 1e9
 
 class Styled:
     """Encodings that draw each estimator in its style, and the name of the peer that factors are
-    to."""
+    to. In the data, and thus in a chart's code, an estimator is its place among ``styles``: names
+    are text that anybody may have written, and are looked up where they are drawn."""
 
     def __init__(self, styles: Mapping[str, Style], peer: str) -> None:
-        self.peer = peer
-        names = list(styles)
+        self.peer = one_line(peer)
+        self.places = {name: i for i, name in enumerate(styles)}
+        """Place of each estimator."""
+        domain = list(self.places.values())
         dashes = [list(style.dash) for style in styles.values()]
         shapes = [style.shape for style in styles.values()]
         field = "estimator:N"
-        self.colour = alt.Color(field, scale=alt.Scale(domain=names), legend=None)
-        self.dash = alt.StrokeDash(field, scale=alt.Scale(domain=names, range=dashes), legend=None)
-        self.shape = alt.Shape(field, scale=alt.Scale(domain=names, range=shapes), legend=None)
+        self.colour = alt.Color(field, scale=alt.Scale(domain=domain), legend=None)
+        self.dash = alt.StrokeDash(field, scale=alt.Scale(domain=domain, range=dashes), legend=None)
+        self.shape = alt.Shape(field, scale=alt.Scale(domain=domain, range=shapes), legend=None)
 
 
 def named(data: str) -> alt.Chart:

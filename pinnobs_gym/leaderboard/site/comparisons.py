@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import altair as alt
 
 from pinnobs_gym.leaderboard.site.charts import (
+    NAME,
     Spec,
     Styled,
     exact,
@@ -22,9 +23,21 @@ STEP = 21
 TALL_STEP = 27
 """The same of lines with two symbols, one below the other."""
 PLAIN_NAMES = alt.Axis(
-    domain=False, ticks=False, grid=False, labelLimit=150, labelPadding=8, minExtent=0
+    domain=False,
+    ticks=False,
+    grid=False,
+    labelExpr="names[datum.value]",
+    labelLimit=150,
+    labelPadding=8,
+    minExtent=0,
 )
-"""The estimator axis of charts with one line per estimator."""
+"""The estimator axis of charts with one line per estimator; the page sets ``names``."""
+
+
+def lines_of(styled: Styled, order: Sequence[str]) -> alt.Y:
+    """Return the axis with a line for each estimator, in this order."""
+    places = [styled.places[name] for name in order]
+    return alt.Y("estimator:N", sort=places, title=None, axis=PLAIN_NAMES)
 
 
 def level(scale: alt.Scale, vertical: bool) -> alt.Chart:
@@ -40,9 +53,9 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
     high."""
     scale = log_scale(low, high)
     tips = [
-        "estimator:N",
+        NAME,
         "track:N",
-        exact("ratio", f"/ {styled.peer}"),
+        exact("ratio", "ratio to the peer"),
         exact("low"),
         exact("high"),
     ]
@@ -52,7 +65,7 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
         named("standings")
         .transform_calculate(upper=finite("high"))
         .encode(
-            y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
+            y=lines_of(styled, order),
             color=styled.colour,
             tooltip=tips,
         )
@@ -62,6 +75,7 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
         base.mark_rule(strokeWidth=2).encode(x=alt.X("low:Q", scale=scale), x2="upper:Q"),
         base.mark_point(filled=True, size=70, opacity=1).encode(x=x, shape=styled.shape),
         height=STEP * len(order),
+        names=[],
     )
 
 
@@ -74,8 +88,8 @@ def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spe
         named("ratios")
         .transform_calculate(upper90=finite("q90"), upper75=finite("q75"))
         .encode(
-            y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
-            tooltip=["estimator:N", *map(exact, ("q10", "q25", "rms", "q75", "q90"))],
+            y=lines_of(styled, order),
+            tooltip=[NAME, *map(exact, ("q10", "q25", "rms", "q75", "q90"))],
         )
     )
     coloured = base.encode(color=styled.colour)
@@ -91,6 +105,7 @@ def ratios(styled: Styled, order: Sequence[str], low: float, high: float) -> Spe
         .mark_tick(style="middle")
         .encode(x=alt.X("rms:Q", scale=scale, axis=axis, title=title)),
         height=STEP * len(order),
+        names=[],
     )
 
 
@@ -103,9 +118,9 @@ def over_floor(styled: Styled, order: Sequence[str], low: float, high: float) ->
         named("over_floor")
         .transform_calculate(shown=finite("ratio"), lower=finite("low"), upper=finite("high"))
         .encode(
-            y=alt.Y("estimator:N", sort=list(order), title=None, axis=PLAIN_NAMES),
+            y=lines_of(styled, order),
             color=styled.colour,
-            tooltip=["estimator:N", "window:N", *map(exact, ("ratio", "low", "high"))],
+            tooltip=[NAME, "window:N", *map(exact, ("ratio", "low", "high"))],
         )
     )
     layers = [level(scale, vertical=True)]
@@ -119,7 +134,7 @@ def over_floor(styled: Styled, order: Sequence[str], low: float, high: float) ->
                 x=x, shape=styled.shape
             ),
         ]
-    return finished(*layers, height=TALL_STEP * len(order))
+    return finished(*layers, height=TALL_STEP * len(order), names=[])
 
 
 def cost(
@@ -134,7 +149,7 @@ def cost(
     scale = log_scale(*up)
     x = alt.X(f"{field}:Q", scale=log_scale(*across), title=title, axis=log_axis(*across))
     y = alt.Y("ratio:Q", scale=scale, title=f"steady NRMSE / {styled.peer}'s", axis=log_axis(*up))
-    tips = ["estimator:N", "track:N", exact(field, title), exact("ratio", f"/ {styled.peer}")]
+    tips = [NAME, "track:N", exact(field, title), exact("ratio", "ratio to the peer")]
     base = (
         named("standings")
         .transform_filter(f"isValid(datum.{field})")
@@ -151,6 +166,6 @@ def cost(
         ),
         base.transform_filter(f"datum.named_{field}")
         .mark_text(style="name", align="left", dx=8, dy=-7)
-        .encode(text="estimator:N"),
+        .encode(text="name:N"),
         height=340,
     )

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.leaderboard.display import one_line
 from pinnobs_gym.leaderboard.site import comparisons, over_time
 from pinnobs_gym.leaderboard.site.charts import Spec, Styled, nice_range
 from pinnobs_gym.leaderboard.site.columns import Columns
@@ -37,8 +39,10 @@ class Charts:
 
     charts: dict[str, dict[str, Any]]
     """The charts, each with its ``spec``, the key of its ``data``, and its ``height``."""
-    data: dict[str, dict[str, Any]]
-    """Tables by name, in the format of the page's script."""
+    data: dict[str, dict[str, Columns]]
+    """Tables by name. Their columns ``estimator`` are places in `names`."""
+    names: list[str]
+    """Names of the estimators in their order, then those of floors."""
 
 
 def charts_of(page: Page, styles: Mapping[str, Style]) -> Charts:
@@ -48,16 +52,38 @@ def charts_of(page: Page, styles: Mapping[str, Style]) -> Charts:
     parts = [_across(styled, page.costs)] if page.costs["estimator"] else []
     parts += [_game(styled, game) for section in page.sections for game in section.games]
     charts = {name: chart for part in parts for name, chart in part.charts.items()}
-    return Charts(charts, {key: tables for part in parts for key, tables in part.data.items()})
+    data = {part.key: part.tables for part in parts}
+    found = [table.get("estimator", []) for tables in data.values() for table in tables.values()]
+    names = dict.fromkeys(chain(styles, *found))
+    places = {name: i for i, name in enumerate(names)}
+    packed = {
+        key: {name: _packed(table, places) for name, table in tables.items()}
+        for key, tables in data.items()
+    }
+    return Charts(charts, packed, [one_line(name) for name in names])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Charts of the same data."""
+
+    charts: dict[str, dict[str, Any]]
+    """Charts as in `Charts`."""
+    key: str
+    """Key of their data."""
+    tables: dict[str, Columns]
+    """The tables by name, with the names of estimators."""
 
 
 def embedded(charts: Charts, styles: Mapping[str, Style], chosen: Sequence[str]) -> str:
     """Return charts, data, styles and initially selected estimators as JSON for a script
     element."""
+    places = {name: i for i, name in enumerate(styles)}
     everything = {
         "light": [style.light for style in styles.values()],
         "dark": [style.dark for style in styles.values()],
-        "shown": list(chosen),
+        "names": charts.names,
+        "shown": [places[name] for name in chosen],
         "charts": charts.charts,
         "data": charts.data,
     }
@@ -65,7 +91,7 @@ def embedded(charts: Charts, styles: Mapping[str, Style], chosen: Sequence[str])
     return text.replace("<", "\\u003c")  # which could end the script element
 
 
-def _across(styled: Styled, costs: Columns) -> Charts:
+def _across(styled: Styled, costs: Columns) -> _Part:
     """Return the charts across systems, for at least one estimator."""
     names, ratio = costs["estimator"], costs["ratio"]
     trained = [seconds is not None for seconds in costs["seconds"]]
@@ -83,7 +109,7 @@ def _across(styled: Styled, costs: Columns) -> Charts:
     return _charts("across", specs, {"standings": costs | named})
 
 
-def _game(styled: Styled, game: GameResults) -> Charts:
+def _game(styled: Styled, game: GameResults) -> _Part:
     """Return the charts of one game."""
     tables = {name: getattr(game, name) for name in TABLES}
     end = max([*game.errors["t"], *game.settling["t"], *game.floor_settling["t"], 1e-9])
@@ -116,14 +142,13 @@ def _game(styled: Styled, game: GameResults) -> Charts:
     return _charts(f"game{game.number}", specs, tables)
 
 
-def _charts(key: str, specs: Mapping[str, Spec], tables: Mapping[str, Columns]) -> Charts:
+def _charts(key: str, specs: Mapping[str, Spec], tables: Mapping[str, Columns]) -> _Part:
     """Return charts of the same data with their heights, so that the layout does not move when they
     are drawn."""
     charts = {
         name: {"spec": spec, "data": key, "height": spec["height"]} for name, spec in specs.items()
     }
-    packed = {name: _packed(table) for name, table in tables.items()}
-    return Charts(charts, {key: {**packed, "one": {"at": [1]}}})
+    return _Part(charts, key, {**tables, "one": {"at": [1]}})
 
 
 def _range_of(costs: Columns, wanted: Sequence[bool]) -> tuple[float, float]:
@@ -146,14 +171,12 @@ def _labelled(x: Sequence[Any], y: Sequence[Any], wanted: Iterable[bool]) -> lis
     return [i in chosen for i in range(len(x))]
 
 
-def _packed(table: Columns) -> dict[str, Any]:
-    """Return the columns with estimators encoded as indices into a list."""
-    packed: dict[str, Any] = dict(table)
+def _packed(table: Columns, places: Mapping[str, int]) -> Columns:
+    """Return the columns with estimators as their places, and with other texts in one line."""
+    packed = {
+        name: [one_line(value) if isinstance(value, str) else value for value in column]
+        for name, column in table.items()
+    }
     if "estimator" in table:
-        levels = list(dict.fromkeys(table["estimator"]))
-        place = {name: i for i, name in enumerate(levels)}
-        packed["estimator"] = {
-            "levels": levels,
-            "codes": [place[name] for name in table["estimator"]],
-        }
+        packed["estimator"] = [places[name] for name in table["estimator"]]
     return packed

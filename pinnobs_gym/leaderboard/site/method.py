@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.leaderboard.board import Board
 from pinnobs_gym.leaderboard.contenders import Contender, contenders
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.floor import contending
 from pinnobs_gym.leaderboard.runs import ScoredRun, rows_of, runs_of
 from pinnobs_gym.leaderboard.standings import training_of
@@ -150,23 +150,23 @@ def commands(runs: Iterable[ScoredRun]) -> list[str]:
 
 def _command_of_logs(run: ScoredRun) -> str:
     """Return the command line that scores an estimator on sensor logs."""
-    words = ["pinnobs evaluate --system", run.game.system.rpartition("-v")[0]]
+    words = ["pinnobs evaluate --system", quoted(run.game.system.rpartition("-v")[0])]
     for option in LOG_FILES:
         files = dict.fromkeys((row["episode"], row[option]) for row in run.rows)
-        words += [f"--{option}", *(shlex.quote(name) for _, name in files)]
-    return " ".join([*words, "--estimator", shlex.quote(run.estimator.partition(" (")[0])])
+        words += [f"--{option}", *(quoted(name) for _, name in files)]
+    return " ".join([*words, "--estimator", quoted(run.estimator.partition(" (")[0])])
 
 
 def _command(runs: Sequence[ScoredRun], conditions: Sequence[str] = ()) -> str:
     rows = rows_of(runs)
     words = ["pinnobs leaderboard"]
     systems = {run.game.system.rpartition("-v")[0] for run in runs}
-    words += ["--systems", *sorted(systems)]
+    words += ["--systems", *map(quoted, sorted(systems))]
     names = {run.estimator.partition(" (")[0] for run in runs}
-    words += ["--estimators", *map(shlex.quote, sorted(names))]
+    words += ["--estimators", *map(quoted, sorted(names))]
     setup = runs[0].game.setup
-    words += ["--setup", setup] if setup != "benchmark" else []
-    words += ["--condition", *conditions] if conditions else []
+    words += ["--setup", quoted(setup)] if setup != "benchmark" else []
+    words += ["--condition", *map(quoted, conditions)] if conditions else []
     alone = {seed_of(row) for row in rows if row["training"].get("per_record")}
     seeds = {seed_of(row) for row in rows}
     words += ["--episodes", str(max(seeds) - min(seeds) + 1)]

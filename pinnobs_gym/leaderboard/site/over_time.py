@@ -6,7 +6,9 @@ from typing import Any
 
 import altair as alt
 
+from pinnobs_gym.leaderboard.display import one_line
 from pinnobs_gym.leaderboard.site.charts import (
+    NAME,
     SHOWN,
     Spec,
     Styled,
@@ -25,7 +27,7 @@ HEIGHT = 300
 
 def _floor(base: alt.Chart, **line: Any) -> list[alt.Chart]:
     """Return the lines of the floors: grey, and dashed where the whole record is known."""
-    whole = "indexof(datum.estimator, 'whole record') >= 0"
+    whole = "indexof(datum.name, 'whole record') >= 0"
     return [
         base.transform_filter(f"!({whole})").mark_line(style="floor", **line),
         base.transform_filter(whole).mark_line(style="floor", strokeDash=[7, 4], **line),
@@ -58,7 +60,7 @@ def errors(styled: Styled, end: float, low: float, high: float) -> Spec:
         .transform_calculate(shown_median="datum.median > 0 ? datum.median : null")
         .encode(x=time_of(end), y=y, detail="estimator:N")
     )
-    tips = ["estimator:N", exact("t", "t (s)"), exact("median"), exact("q10", "10 %")]
+    tips = [NAME, exact("t", "t (s)"), exact("median"), exact("q10", "10 %")]
     return finished(
         base.transform_filter(f"!({SHOWN})")
         .mark_line(style="others", clip=True)
@@ -85,7 +87,7 @@ def settling(styled: Styled, end: float) -> Spec:
     base = named("settling").encode(x=time_of(end), y=y)
     chosen = base.transform_filter(SHOWN).encode(color=styled.colour)
     floor = named("floor_settling").encode(x=time_of(end), y=y, detail="estimator:N")
-    tips = ["estimator:N", exact("t", "t (s)"), alt.Tooltip("share:Q", format=".0%")]
+    tips = [NAME, exact("t", "t (s)"), alt.Tooltip("share:Q", format=".0%")]
     return finished(
         base.transform_filter(f"!({SHOWN})")
         .mark_line(style="others", interpolate="step-after")
@@ -126,7 +128,7 @@ def state(
     )
 
     def y(field: str) -> alt.Y:
-        return alt.Y(f"{field}:Q", scale=scale, title=title, axis=alt.Axis(tickCount=4))
+        return alt.Y(f"{field}:Q", scale=scale, title=one_line(title), axis=alt.Axis(tickCount=4))
 
     layers = [
         mine.mark_area(opacity=0.18, clip=True).encode(y=y("low"), y2="high:Q"),
@@ -139,4 +141,4 @@ def state(
         layers.insert(1, truth.mark_line(style="truth", clip=True).encode(y=y(f"x{index}")))
     if measured:
         layers.insert(0, truth.mark_point(style="measured", clip=True).encode(y=y(f"y{index}")))
-    return finished(*layers, height=120, selected="", until=end)
+    return finished(*layers, height=120, selected=-1, until=end)

@@ -1,16 +1,17 @@
 "use strict";
 (() => {
-  const page = JSON.parse(document.getElementById("data").textContent);
+  const page = JSON.parse(document.querySelector('script[type="application/json"]').textContent);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const views = new Map(); // of charts that are drawn, by name
   const shown = new Set(page.shown);
   const choices = new Map(); // of the example episode, by game: estimator, and until when
 
-  // Data come by columns, names of estimators as a list and places in it; Vega takes rows.
-  const rowsOf = (table) => {
+  // Data come by columns, estimators as places in a list of names; Vega takes rows.
+  const rowsOf = (given) => {
+    const table = given.estimator
+      ? { ...given, name: given.estimator.map((place) => page.names[place]) } : given;
     const fields = Object.keys(table);
-    const columns = fields.map((f) =>
-      table[f].levels ? table[f].codes.map((code) => table[f].levels[code]) : table[f]);
+    const columns = Object.values(table);
     return columns.length ? columns[0].map((_, i) =>
       Object.fromEntries(fields.map((f, j) => [f, columns[j][i]]))) : [];
   };
@@ -51,7 +52,7 @@
     };
   };
 
-  const paramsOf = (name) => ({ shown: [...shown], ...choices.get(page.charts[name].data) });
+  const paramsOf = (name) => ({ names: page.names, shown: [...shown], ...choices.get(page.charts[name].data) });
 
   async function draw(place) {
     const name = place.dataset.chart;
@@ -61,7 +62,7 @@
     const whole = { ...spec, params, config: theme(), datasets: datasetsOf(data) };
     views.get(name)?.finalize();
     const made = await vegaEmbed(place, whole, {
-      actions: false, renderer: "svg", tooltip: { theme: dark.matches ? "dark" : "light" },
+      actions: false, ast: true, renderer: "svg", tooltip: { theme: dark.matches ? "dark" : "light" },
     });
     views.set(name, made);
     place.dataset.drawn = dark.matches ? "dark" : "light";
@@ -92,7 +93,7 @@
   addEventListener("beforeprint", () => places.forEach((p) => p.dataset.drawn || draw(p)));
 
   for (const chip of document.querySelectorAll(".chip")) {
-    const name = chip.dataset.estimator;
+    const name = Number(chip.dataset.estimator);
     chip.setAttribute("aria-pressed", shown.has(name));
     chip.addEventListener("click", () => {
       if (!shown.delete(name)) shown.add(name);
@@ -105,7 +106,8 @@
     const name = choice.dataset.param;
     const take = () => {
       const end = page.data[key].truth.t.at(-1);
-      choices.set(key, { ...choices.get(key), [name]: name === "until" ? end * choice.value : choice.value });
+      const value = Number(choice.value);
+      choices.set(key, { ...choices.get(key), [name]: name === "until" ? end * value : value });
     };
     take();
     choice.addEventListener("change", () => {
@@ -113,7 +115,7 @@
       set(name, choices.get(key)[name], key);
     });
   }
-  document.getElementById("heat")?.addEventListener("change", (event) => {
+  document.querySelector("select.systems")?.addEventListener("change", (event) => {
     for (const box of document.querySelectorAll("[data-heat]")) {
       box.hidden = box.dataset.heat !== event.target.value;
     }

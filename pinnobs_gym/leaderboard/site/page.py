@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from typing import Any
 
 import altair as alt
 import jinja2
@@ -15,6 +18,7 @@ from markupsafe import Markup, escape
 
 from pinnobs_gym.leaderboard import ranks_table, standings_table
 from pinnobs_gym.leaderboard.chapters import ON_RECORD
+from pinnobs_gym.leaderboard.display import printable
 from pinnobs_gym.leaderboard.numerals import number
 from pinnobs_gym.leaderboard.places import Place
 from pinnobs_gym.leaderboard.site.across import Factors
@@ -28,8 +32,13 @@ def draw(page: Page) -> str:
     """Render the page as HTML; computes nothing from rows."""
     drawn = styles(list(page.tracks), page.main.places.peer)
     charts = charts_of(page, drawn)
+    scripts = _bundle(), _text("page.js")
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_visible,
     )
     environment.filters |= {"marked": _marked, "anchor": _anchor}
     return environment.from_string(_text("page.html")).render(
@@ -42,8 +51,8 @@ def draw(page: Page) -> str:
         styles=drawn,
         charts=charts.charts,
         css=Markup(_text("page.css")),
-        vega=Markup(_bundle()),
-        script=Markup(_text("page.js")),
+        policy=Markup(_policy(scripts)),
+        scripts=[Markup(script) for script in scripts],
         data=Markup(embedded(charts, drawn, page.chosen)),
     )
 
@@ -109,9 +118,27 @@ def _cell(place: Place | None) -> HeatCell:
     return HeatCell(number(factor, 2), "better" if factor < 1 else "worse", round(depth, 2))
 
 
+def _policy(scripts: Iterable[str]) -> str:
+    """Return the content security policy of a page with these scripts: nothing else runs, code
+    made of text included, and nothing is fetched or sent."""
+    digests = [hashlib.sha256(script.encode()).digest() for script in scripts]
+    sources = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    return (
+        f"default-src 'none'; style-src 'unsafe-inline'; script-src {sources}; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _visible(value: Any) -> Any:
+    """Return a text that is no markup with nothing invisible in it, in one line."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return printable(re.sub(r"\s", " ", value))
+
+
 def _marked(text: str) -> Markup:
     """Convert parts in backticks to code elements."""
-    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
+    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(_visible(text)))))
 
 
 def _anchor(title: str) -> str:

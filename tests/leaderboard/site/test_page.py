@@ -9,12 +9,13 @@ import altair as alt
 import pytest
 from made_rows import rows_of
 from playwright.sync_api import sync_playwright
-from waiting import PATIENCE
+from waiting import PATIENCE, until
 
 from pinnobs_gym import evaluate
 from pinnobs_gym.cli import main
 from pinnobs_gym.leaderboard.site.charts import Styled
 from pinnobs_gym.leaderboard.site.comparisons import cost, factors, over_floor, ratios
+from pinnobs_gym.leaderboard.site.drawings import charts_of
 from pinnobs_gym.leaderboard.site.model import page_model
 from pinnobs_gym.leaderboard.site.over_time import errors, settling, state
 from pinnobs_gym.leaderboard.site.page import draw
@@ -63,7 +64,12 @@ def test_the_page_is_one_file_that_fetches_nothing(site):
     assert [path.name for path in site.parent.iterdir()] == ["index.html"]
     assert len(text) < 5e6
     assert "src=" not in text.split("<script")[0]
-    assert "default-src 'none'" in text
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    for part in ("default-src 'none'", "base-uri 'none'", "form-action 'none'"):
+        assert part in policy.split("; ")
+    scripts = policy.split("script-src ")[1].split(";")[0].split()
+    assert len(scripts) == 2
+    assert all(source.startswith("'sha256-") for source in scripts)  # nothing inline, no eval
     assert "<link" not in text
 
 
@@ -147,7 +153,7 @@ def test_a_floor_is_shown_but_is_no_contender():
     floor = rows_of("exact_bayes", [0.05] * 60, **facts)
     text, alone = drawn(*floor), drawn()
     for chip in ("exact_bayes", "exact Bayes"):
-        assert f'data-estimator="{chip}"' not in text
+        assert f"{chip}</button>" not in text
     assert [each.partition("<")[0] for each in text.split("<b>")[1:4]] == [
         each.partition("<")[0]
         for each in alone.split("<b>")[1:4]  # systems, estimators, episodes
@@ -258,7 +264,7 @@ def opened(browser, site):
     """Opens the page without network; its console has to stay silent, and nothing is asked for."""
     contexts, said, asked = [], [], []
 
-    def opened(**options):
+    def opened(path=site, **options):
         context = browser.new_context(offline=True, **options)
         contexts.append(context)
         context.set_default_timeout(1000 * PATIENCE)
@@ -266,7 +272,7 @@ def opened(browser, site):
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
-        page.goto(site.as_uri())
+        page.goto(path.as_uri())
         return page
 
     yield opened
@@ -287,8 +293,10 @@ def draw_all(page):
             }
         }"""
     )
-    page.wait_for_function(
-        "[...document.querySelectorAll('[data-chart]')].every(chart => chart.dataset.drawn)"
+    until(
+        lambda: page.evaluate(
+            "[...document.querySelectorAll('[data-chart]')].every(chart => chart.dataset.drawn)"
+        )
     )
 
 
@@ -362,6 +370,58 @@ def test_columns_sort_both_ways(opened):
     assert sorted(before) == sorted(column(page, table, 3))
 
 
+HOSTILE = ["<!--<script>", "</script><script>alert(1)</script>", "<img src=http://x.example/y>"]
+HOSTILE += ["a\\nb\\", "\\u0041\\x41", "'+alert(1)+'", '"]}', "${alert(1)}", "{{ 7 * 7 }}", "'"]
+HOSTILE += ["__proto__", "constructor", "toString", "data", "null", "1", "datum.x", "a.b[0]"]
+HOSTILE += ["a\u2028b", "a\x1b[31mb", "a\u202eb", "a\x00b", "a\nb", "a\ud800b", "x" * 999]
+
+
+@pytest.fixture(scope="module")
+def hostile():
+    """The page of estimators of these names, of which the first names all else, too."""
+    name = "'\"`</script><!--<script>\\u0041\x1b[31m\u2028${1}{{ 1 }}__proto__"
+    facts = COMMON | {"versions": {name: name}, "knows": [name]}
+    facts |= {"options": {name: name}, "training": {"config": {}, "seconds": 1.0}}
+    made = []
+    for condition in ("nominal", name):
+        for each in (name, *HOSTILE):
+            more = {"condition": condition, "nrmse_over_reference": 2.0, **facts}
+            more["settings"] = {name: name} if each is name else {}
+            made += rows_of(each, [0.1] * 60, env_id=name, setup=name, **more)
+    failed = {"env_id": name, "setup": name, "condition": name, "estimator": name, "error": name}
+    return page_model(Stored(made, [{**failed, "episode": "seed:0", "episodes": 1}]), [])
+
+
+def test_no_name_is_in_the_code_of_a_chart(hostile):
+    """Only in titles of axes, which are drawn as they are."""
+    charts = charts_of(hostile, styles(list(hostile.tracks), hostile.main.places.peer))
+
+    def code(value):
+        if isinstance(value, dict):
+            return {k: code(v) for k, v in value.items() if k != "title" or isinstance(v, dict)}
+        return [code(each) for each in value] if isinstance(value, list) else value
+
+    specs = json.dumps([code(chart["spec"]) for chart in charts.charts.values()])
+    assert len(charts.charts) >= 3
+    for name in HOSTILE:
+        if len(name) > 4 and name not in ("datum.x", "constructor"):
+            assert json.dumps(name)[1:-1] not in specs
+    assert all(name.isprintable() for name in charts.names)
+
+
+def test_hostile_names_run_nothing_and_stop_no_chart(hostile, opened, tmp_path):
+    path = tmp_path / "index.html"
+    path.write_text(draw(hostile), encoding="utf-8")
+    page = opened(path, viewport={"width": 1280, "height": 900})
+    draw_all(page)
+    labels = page.locator("[data-chart=factors] .role-axis-label text").all_text_contents()
+    assert "__proto__" in labels
+    assert "a�b" in labels
+    chips = page.locator(".chip").all_text_contents()
+    assert len(chips) == len(HOSTILE) + 1
+    assert all(chip.strip().isprintable() for chip in chips)
+
+
 def test_nothing_is_wider_than_a_phone(opened):
     page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
     draw_all(page)
@@ -385,8 +445,10 @@ def test_the_dark_changes_page_and_charts(opened):
     draw_all(page)
     light = page.evaluate(look)
     page.emulate_media(color_scheme="dark")
-    page.wait_for_function(
-        "[...document.querySelectorAll('[data-chart]')].every(c => c.dataset.drawn === 'dark')"
+    until(
+        lambda: page.evaluate(
+            "[...document.querySelectorAll('[data-chart]')].every(c => c.dataset.drawn === 'dark')"
+        )
     )
     dark = page.evaluate(look)
     assert light[0] == "rgb(255, 255, 255)"
@@ -399,14 +461,14 @@ def test_choices_change_what_is_drawn(opened):
     draw_all(page)
     bands = page.locator("[data-chart=errors2] .mark-area path")
     before = bands.count()
-    chip = page.locator(".chip[data-estimator=rts_smoother]")
+    chip = page.locator(".chip", has_text="rts_smoother")
     assert chip.get_attribute("aria-pressed") == "false"
     chip.click()
     assert chip.get_attribute("aria-pressed") == "true"
-    page.wait_for_function(
-        f"document.querySelectorAll('[data-chart=errors2] .mark-area path').length === {before + 1}"
-    )
+    until(lambda: bands.count() == before + 1)
     estimate = "document.querySelector('[data-chart=state2-1] .mark-area').innerHTML"
     first = page.evaluate(estimate)
-    page.locator("#ReverseDuffing-v0 select[data-param=selected]").select_option("rts_smoother")
-    page.wait_for_function(f"{estimate} !== {json.dumps(first)}")
+    page.locator("#ReverseDuffing-v0 select[data-param=selected]").select_option(
+        label="rts_smoother"
+    )
+    until(lambda: page.evaluate(f"{estimate} !== {json.dumps(first)}"))
