@@ -79,7 +79,7 @@ class CompiledFilter:
         plan = self.plan
         if self._by_sample:
             plan = plan.with_R(self._estimator.noise.R(t)[None])
-        memory, arrays = self._estimator.carried_memory(state)
+        memory, arrays = self._estimator.carried_memory(state.memory)
         more = call_with(arrays) if arrays else None
         left = self.code(
             addressof(plan.structure),

@@ -92,7 +92,7 @@ class CompiledRun:
         estimator = self._estimator if whole else of_rows(self._estimator, rows)
         own = record if whole else record.rows(rows)
         before = state_of(estimator, self._before(record, first, state, results), rows)
-        memory, arrays = estimator.carried_memory(before)
+        memory, arrays = estimator.carried_memory(before.memory)
         plan = self._plan
         if self._by_sample or not whole:
             R = noise_at(estimator.noise, own.t[first:])

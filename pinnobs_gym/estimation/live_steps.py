@@ -12,6 +12,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.compiled import CompiledFilter
 from pinnobs_gym.estimation.compiled_layout import Layout
+from pinnobs_gym.estimation.compiled_run import call_with
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.live_sample import Sample
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
@@ -93,19 +94,13 @@ def moments_of(
     )
 
 
-def steps_of(estimator: Estimator, begun: State) -> Steps:
-    """Return the fastest way of an estimator through samples of one plant.
-
-    Args:
-        estimator: the estimator.
-        begun: its state before the first sample.
-    """
+def steps_of(estimator: Estimator) -> Steps:
+    """Return the fastest way of an estimator through samples of one plant."""
     plain = ByUpdate(estimator)
     if isinstance(estimator, RecursiveEstimator) and estimator.noise.samples is None:
         compiled = estimator.compiled
-        # What an estimator remembers beside x and P is carried by `update`.
-        if compiled is not None and not estimator.carried_memory(begun)[1]:
-            return InBuffers(compiled, plain)
+        if compiled is not None:
+            return InBuffers(compiled, estimator, plain)
     return plain
 
 
@@ -150,11 +145,14 @@ class InBuffers:
 
     Args:
         compiled: the code.
+        estimator: its estimator.
         plain: the steps that it leaves to NumPy.
     """
 
-    def __init__(self, compiled: CompiledFilter, plain: ByUpdate) -> None:
-        system = plain.estimator.system
+    def __init__(
+        self, compiled: CompiledFilter, estimator: RecursiveEstimator, plain: ByUpdate
+    ) -> None:
+        system, self._carried_memory = estimator.system, estimator.carried_memory
         self._plain, self._code = plain, compiled.code
         self._layout = compiled.layout(1)
         self._buffer = self._layout.buffer
@@ -171,6 +169,8 @@ class InBuffers:
         else:
             earlier = self._layout.packed(before.t, before.u, before.xhat, before.P)
         buffer = self._buffer()
+        memory, arrays = self._carried_memory(before.memory)
+        more = call_with(arrays) if arrays else None
         left = self._code(
             self._plan,
             1,
@@ -180,8 +180,8 @@ class InBuffers:
             self._u(*u) if u else None,
             ctypes.addressof(buffer),
             ctypes.addressof(earlier),
-            None,
+            ctypes.addressof(more) if more else None,
         )
         if left:
             return self._plain(before, sample)
-        return Packed(self._layout, buffer, t, before.memory)
+        return Packed(self._layout, buffer, t, memory)

@@ -110,10 +110,10 @@ class RecursiveEstimator(Estimator):
         """Return the settings that the compiled code takes, by the fields of ``struct plan``."""
         return {}
 
-    def carried_memory(self, state: State) -> tuple[Any, dict[str, np.ndarray]]:
-        """Return the memory of the next state, and those of its arrays, by the fields of ``struct
-        call``, that the compiled code reads and changes."""
-        return state.memory, {}
+    def carried_memory(self, memory: Any) -> tuple[Any, dict[str, np.ndarray]]:
+        """Return the memory of the next state, given that of the last one, and those of its arrays,
+        by the fields of ``struct call``, that the compiled code reads and changes."""
+        return memory, {}
 
     def memory_rows(self, memory: Any, rows: np.ndarray) -> Any:
         """Return the memory of some rows of the batch."""

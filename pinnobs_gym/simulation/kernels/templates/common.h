@@ -68,6 +68,9 @@ struct plan {
     const double *gate;       /* bounds of the NIS, (NY + 1,), or NULL */
     int64_t patience;
     double huber;             /* 0 for none */
+    const double *growth;     /* variances (NX,) that P grows by at an innovation of size 1, or NULL */
+    double caution;           /* factor with which H P H^T is added to R */
+    int64_t carried;          /* number of entries of ``carried`` of filter.h that are in use */
     /* sigma-point filters; at most 2 NX + 1 points */
     const double *points;     /* (num_points, NX) for the standard normal distribution */
     const double *weights;    /* (num_points,) in means */

@@ -9,11 +9,15 @@ struct sample {
     lanes t, y[NY], u[LU], R[NY * NY], e[NY], S[NY * NY];
 };
 
-/* What is known of W rows beside x and P: the number of samples in a row beyond the gate, and
+/* What is known of W rows beside x and P: what the algorithm remembers from sample to sample, and
    whether x and P are NaN throughout. */
+#ifndef CARRIED
+#define CARRIED 1
+#endif
 #define memory AT_WIDTH(memory)
 struct memory {
-    int64_t beyond[W], lost[W];
+    lanes carried[CARRIED];
+    int64_t lost[W];
 #ifdef RESTARTS
     lanes P_restart[NX * NX]; /* covariances with which the gate restarts a filter */
 #endif

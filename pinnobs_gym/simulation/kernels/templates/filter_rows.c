@@ -18,8 +18,7 @@ struct call {
     const double *u_before;   /* (NU, batch) */
     const double *x_before;   /* (NX, batch) */
     const double *P_before;   /* (NX, NX, batch) */
-    /* EKF with a gate */
-    int64_t *beyond;          /* (batch,) samples in a row beyond the gate */
+    double *carried;          /* (plan->carried, batch) what an algorithm remembers, or NULL */
     /* results of the forward pass of a smoother, or NULL; innovation and S are then NULL */
     double *x_predicted;      /* (samples, NX, batch) */
     double *P_predicted;      /* (samples, NX, NX, batch) */
@@ -106,7 +105,7 @@ SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count
     int64_t bad[W];
     EACH_LANE bad[l] = 0;
     for (int l = 0; l < count; l++) reached[l] = c->samples;
-    EACH_LANE own.beyond[l] = plan->gate ? c->beyond[row + MIN(l, count - 1)] : 0;
+    AT_WIDTH(load)(plan->carried, c->carried, batch, row, count, own.carried);
     AT_WIDTH(load)(NP, plan->p, plan->p_rows ? batch : 0, row, count, p);
     AT_WIDTH(load)(NX, c->x_before, batch, row, count, x);
     AT_WIDTH(load)(NX * NX, c->P_before, batch, row, count, P);
@@ -138,8 +137,8 @@ SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count
         if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
         AT_WIDTH(store)(NX, x, c->x + k * NX * batch, batch, row, count);
         AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * batch, batch, row, count);
-        if (plan->gate)
+        for (int i = 0; i < plan->carried; i++)
             for (int l = 0; l < count; l++)
-                if (!bad[l]) c->beyond[row + l] = own.beyond[l];
+                if (!bad[l]) c->carried[i * batch + row + l] = own.carried[i][l];
     }
 }
