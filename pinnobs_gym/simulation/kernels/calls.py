@@ -47,9 +47,12 @@ class CallStructure(ctypes.Structure):
     ]
 
 
-def address(array: np.ndarray) -> int:
-    """Return the address of an array's first entry."""
-    return array.ctypes.data
+def address(array: Any) -> int:
+    """Return the address of an array's first entry, faster than NumPy if it is contiguous."""
+    try:
+        return ctypes.addressof(ctypes.c_double.from_buffer(array))
+    except (TypeError, ValueError, BufferError):
+        return array.ctypes.data
 
 
 def plant_numbers(system: System, numbers: Sequence[str]) -> np.ndarray:

@@ -40,8 +40,9 @@ def _parts(template: str) -> _Parts:
     if template == "smoother":
         lanes = "filter_rows.c", "smoother.c"
         return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
-    if template == "window":
-        return _Parts(("given_inputs.c", "window_entry.c"), (), template, read("window.h"))
+    if template in ("window", "moving_window"):
+        entries, lanes = ("given_inputs.c", "window_entry.c"), (f"{template}.c",)
+        return _Parts(entries, lanes, "window_samples", read("window.h"))
     return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)
 
 
