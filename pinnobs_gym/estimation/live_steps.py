@@ -49,15 +49,16 @@ class Packed:
 
     def moments(self) -> Moments:
         """Return the moments; parts of the buffer become lists faster than arrays."""
-        (x, P), (_, e), (_, S), (_, end) = self._layout.places
-        buffer = self.buffer
-        return Moments(buffer[x:P], buffer[P : e : P - x + 1], buffer[e:S], buffer[S:end])
+        buffer, places = self.buffer, self._layout.places
+        parts = {name: buffer[place] for name, place in places.items()}
+        x, P = parts["xhat"], parts.get("P")
+        variances = None if P is None else P[:: len(x) + 1]
+        return Moments(x, variances, parts.get("innovation"), parts.get("S"))
 
     def state(self) -> State:
         """Return the same as a `State`, whose arrays are views of the buffer."""
-        x, P, innovation, S = self._layout.arrays(self.buffer)
-        u = self._layout.inputs(self.buffer)
-        after = State(x, self.t, u, P, innovation, S, self.memory)
+        arrays, u = self._layout.arrays(self.buffer), self._layout.inputs(self.buffer)
+        after = State(t=self.t, u=u, memory=self.memory, **arrays)
         object.__setattr__(after, "packed", self.buffer)
         return after
 
@@ -164,7 +165,7 @@ class InBuffers:
         t, y, u = sample
         if isinstance(before, Packed):
             earlier = before.buffer
-        elif before.root is not None or before.P is None:
+        elif before.root is not None or (before.P is None and "P" in self._layout.places):
             return self._plain(before, sample)
         else:
             earlier = self._layout.packed(before.t, before.u, before.xhat, before.P)

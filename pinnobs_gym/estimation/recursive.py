@@ -30,6 +30,8 @@ class RecursiveEstimator(Estimator):
     template: ClassVar[str] = ""
     """The template of `pinnobs_gym.simulation.kernels` that computes the same; empty if there is
     none. It is not used for a subclass that overrides a method of the class that names it."""
+    computes: ClassVar[tuple[str, ...]] = ("xhat", "P", "innovation", "S")
+    """The fields of `Estimates` that the estimator has, if there is a template."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -100,7 +102,7 @@ class RecursiveEstimator(Estimator):
     def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
         from pinnobs_gym.estimation.export.filters import filter_code
 
-        return filter_code(self, code, prior) if self.template else None
+        return filter_code(self, code, prior) if self.template and "P" in self.computes else None
 
     def ask_model(self) -> None:
         if self.compiled is None:  # compiled filters contain the model's steps

@@ -30,7 +30,9 @@ class PlanStructure(ctypes.Structure):
         *(("state_period", _POINTER), ("output_period", _POINTER)),
         *(("low", _POINTER), ("high", _POINTER)),
         *(("gate", _POINTER), ("patience", _INT), ("huber", _DOUBLE)),
-        *(("growth", _POINTER), ("caution", _DOUBLE), ("carried", _INT)),
+        *(("growth", _POINTER), ("caution", _DOUBLE)),
+        *(("theta", _DOUBLE), ("per_scale", _POINTER)),
+        *(("switching", _DOUBLE), ("layer", _DOUBLE), ("carried", _INT)),
         *((name, _POINTER) for name in ("points", "weights", "roots")),
         ("num_points", _INT),
     ]
@@ -43,7 +45,7 @@ class CallStructure(ctypes.Structure):
         *(("plan", _POINTER), ("batch", _INT), ("samples", _INT)),
         *((name, _POINTER) for name in ("t", "y", "u", "x", "P", "innovation", "S")),
         *((name, _POINTER) for name in ("t_before", "u_before", "x_before", "P_before")),
-        *((name, _POINTER) for name in ("carried", "x_predicted", "P_predicted", "F", "Q")),
+        *((name, _POINTER) for name in ("carried", "gain", "x_predicted", "P_predicted", "F", "Q")),
     ]
 
 

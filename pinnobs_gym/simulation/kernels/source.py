@@ -43,7 +43,14 @@ def _parts(template: str) -> _Parts:
     if template in ("window", "moving_window"):
         entries, lanes = ("given_inputs.c", "window_entry.c"), (f"{template}.c",)
         return _Parts(entries, lanes, "window_samples", read("window.h"))
-    return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)
+    entries, rows = ("given_inputs.c", "filter.c"), "filter_rows.c"
+    if template == "observer":
+        once = f"#define OBSERVER\n#define CARRIED NY\n{read('solve.c')}"
+        return _Parts(entries, (rows,), template, once)
+    if template == "high_gain":
+        once = "#define FORGETTING\n#define CARRIED (4 + NX * NX)"
+        return _Parts(entries, ("forgetting.c", rows), "ekf", once)
+    return _Parts(entries, (rows,), template)
 
 
 def library_source(plant: PlantCode, template: str) -> str:

@@ -14,9 +14,17 @@ struct sample {
 #ifndef CARRIED
 #define CARRIED 1
 #endif
+#ifdef OBSERVER /* it has no covariances: the numbers of entries that are loaded and stored */
+#define PP 0
+#define SS 0
+#else
+#define PP (NX * NX)
+#define SS (NY * NY)
+#endif
 #define memory AT_WIDTH(memory)
 struct memory {
     lanes carried[CARRIED];
+    const double *gain;
     int64_t lost[W];
 #ifdef RESTARTS
     lanes P_restart[NX * NX]; /* covariances with which the gate restarts a filter */
