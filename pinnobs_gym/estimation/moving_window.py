@@ -49,9 +49,10 @@ class MovingWindow:
 
     def rows(self, rows: np.ndarray) -> MovingWindow:
         """Return the windows of some rows of the batch."""
-        own = (self.mean[rows], self.root[rows], self.x[:, rows])
-        own = (np.ascontiguousarray(part) for part in own)  # so that sums are formed in one order
-        return MovingWindow(*own, self.exact, self.samples.rows(rows))
+        own = self.mean[rows], self.root[rows], self.x[:, rows]
+        # Contiguous, so that sums are formed in one order in any batch.
+        mean, root, x = map(np.ascontiguousarray, own)
+        return MovingWindow(mean, root, x, self.exact, self.samples.rows(rows))
 
     def shortened(self, system: System, noise: Noise) -> MovingWindow:
         """Return the window without its first sample, with which x̄ and P̄ are updated as in an
@@ -76,8 +77,8 @@ class MovingWindow:
     def improved(self, system: System, noise: Noise) -> tuple[MovingWindow, Smoothed]:
         """Return the window after a Gauss-Newton step of all its states, within their bounds, and
         the states without bounds with their covariances."""
-        samples = (self.samples.at(k) for k in range(len(self.samples)))
-        window = linear_window(system, noise, *zip(*samples, strict=True), self.x, self.exact)
+        t, y, u = zip(*(self.samples.at(k) for k in range(len(self.samples))), strict=True)
+        window = linear_window(system, noise, t, y, u, self.x, self.exact)
         states = smoothed(window, system.state_residual(self.mean, window.r[0]), self.root)
         box, x = system.state_box, states.x
         if box is not None and box.outside(x).any():

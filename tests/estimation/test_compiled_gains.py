@@ -1,29 +1,42 @@
-"""Compiled observers with a constant gain, and the model alone, against the same in NumPy."""
+"""Compiled estimators other than the Kalman filters of `test_compiled` against the same in NumPy:
+observers with a constant gain or forgetting, the strong-tracking filter, and the model alone."""
 
 from dataclasses import dataclass, replace
 
 import many_plants
 import numpy as np
 import pytest
-from agreement import assert_near, assert_same
+from agreement import FIELDS, assert_near, assert_same
 from fake_compilers import needs_compiler
 from linear import Linear, linear_record, record_of
 
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.compiled import compiled_filter
 from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimators.high_gain import HighGain
 from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.open_loop import OpenLoop
 from pinnobs_gym.estimators.sliding_mode import SlidingMode
+from pinnobs_gym.estimators.strong_tracking_ekf import StrongTrackingEKF
 from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.systems import SYSTEMS
 
 pytestmark = needs_compiler
-KINDS = pytest.mark.parametrize("kind", [Luenberger, SlidingMode, OpenLoop])
 OBSERVED = [  # the gain of the design is not stable on the augmented cart; it multiplies rounding
     *(many_plants.cart, many_plants.cart_with_joined_input, many_plants.bounded_reactor),
     *(many_plants.escape, many_plants.well),
 ]
+FORGETTING = [  # one that escapes is brought back from 1e21 to what rounding leaves
+    *(many_plants.cart, many_plants.cart_of_each_row, many_plants.cart_with_noise_by_sample),
+    *(many_plants.cart_with_wide_priors, many_plants.henon, many_plants.bounded_reactor),
+]
+PLANTS = {
+    Luenberger: OBSERVED,
+    SlidingMode: [*OBSERVED, many_plants.cart_with_noise_by_sample],
+    HighGain: FORGETTING,
+    StrongTrackingEKF: many_plants.PLANTS,
+    OpenLoop: [many_plants.henon_with_measured_input, many_plants.cart_of_each_row],
+}
 
 
 def in_numpy(estimator):
@@ -41,14 +54,22 @@ def stepped(estimator, record, goes_on=None, after=None):
             own = goes_on if after is not None and k >= after else estimator
             state = own.update(state, t, record.y[:, k], record.u[:, k])
             states.append(state)
-    innovation = None
-    if states[0].innovation is not None:
-        innovation = np.stack([s.innovation for s in states], axis=1)
-    assert all(s.P is None and s.S is None for s in states)
-    return Estimates(np.stack([s.xhat for s in states], axis=1), innovation=innovation)
+    return stacked(states)
 
 
-@KINDS
+def stacked(states):
+    fields = {name: [getattr(state, name) for state in states] for name in FIELDS}
+    return Estimates(
+        **{name: None if v[0] is None else np.stack(v, axis=1) for name, v in fields.items()}
+    )
+
+
+def rows_of(estimates, rows):
+    values = {name: getattr(estimates, name) for name in FIELDS}
+    return Estimates(**{name: None if v is None else v[rows] for name, v in values.items()})
+
+
+@pytest.mark.parametrize("kind", PLANTS)
 @pytest.mark.parametrize("name", SYSTEMS.classes())
 def test_it_agrees_with_numpy_on_each_system(kind, name):
     source = EpisodeSource(name)
@@ -57,19 +78,14 @@ def test_it_agrees_with_numpy_on_each_system(kind, name):
     assert_near(estimator.run(record), in_numpy(estimator).run(record))
 
 
-@pytest.mark.parametrize(
-    ("kind", "plant"),
-    [
-        *((kind, plant) for kind in (Luenberger, SlidingMode) for plant in OBSERVED),
-        *((OpenLoop, plant) for plant in (many_plants.henon_with_measured_input,)),
-        (OpenLoop, many_plants.cart_of_each_row),
-    ],
-)
+@pytest.mark.parametrize(("kind", "plant"), [(k, p) for k in PLANTS for p in PLANTS[k]])
 def test_it_agrees_with_numpy_and_itself(kind, plant):
-    """Irregular times, missing outputs, inputs, angles, bounds, maps, rows that diverge; updates
-    give what a run gives, and a row is the same alone and in any batch."""
+    """Irregular times, missing outputs, inputs, angles, bounds, maps, wide priors, rows that
+    diverge; updates give what a run gives, either goes on from a state of the other, and a row is
+    the same alone and in any batch."""
     system, record = plant(9)
-    estimator = kind(system)
+    level = None if record.noise_std is None else SampledLevel(record.t, record.noise_std)
+    estimator = kind(system, level)
     whole, other = estimator.run(record), in_numpy(estimator)
     assert_near(whole, other.run(record))
     assert_same(stepped(estimator, record), whole)
@@ -77,17 +93,23 @@ def test_it_agrees_with_numpy_and_itself(kind, plant):
         assert_near(stepped(first, record, second, 8), whole)
     rows = np.array([1, 4, 8])
     own = {name: value[rows] for name, value in system.parameters.items() if np.ndim(value)}
-    part = kind(replace(system, **own)).run(record.rows(rows))
-    innovation = None if whole.innovation is None else whole.innovation[rows]
-    assert_same(part, Estimates(whole.xhat[rows], innovation=innovation))
+    part = kind(replace(system, **own), None if level is None else level.rows(rows))
+    assert_same(part.run(record.rows(rows)), rows_of(whole, rows))
 
 
-def test_a_layer_of_noise_by_sample():
-    system, record = many_plants.cart_with_noise_by_sample(5)
-    estimator = SlidingMode(system, SampledLevel(record.t, record.noise_std))
-    assert estimator.compiled is not None
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        StrongTrackingEKF(Linear(), gamma=1e-3, output_factor=0.7),
+        HighGain(Linear(), theta=40.0, process_noise=0.1),
+        SlidingMode(Linear(), layer=0.5, switching=9.0),
+    ],
+    ids=lambda estimator: estimator.label,
+)
+def test_it_agrees_with_numpy_under_other_settings(estimator):
+    record = linear_record(3)
     assert_near(estimator.run(record), in_numpy(estimator).run(record))
-    assert_same(stepped(estimator, record), estimator.run(record))
+    assert abs(estimator.run(record).xhat - type(estimator)(Linear()).run(record).xhat).max() > 1e-3
 
 
 def test_the_correction_of_two_outputs_is_that_of_the_equations():
