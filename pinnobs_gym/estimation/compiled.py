@@ -78,8 +78,10 @@ class CompiledFilter:
             before = layout.packed(state.t, state.u, state.xhat, state.P)
         # All arrays of the next state are parts of one buffer, whose address is found once.
         buffer = layout.buffer()
-        plan = self.plan
-        if self._by_sample:
+        plan, given = self.plan, self._estimator.given_noise(state.memory)
+        if given is not None:
+            plan = plan.with_R(given[None])
+        elif self._by_sample:
             plan = plan.with_R(self._estimator.noise.R(t)[None])
         memory, carried_arrays = self._estimator.carried_memory(state.memory)
         more = call_with(carried_arrays) if carried_arrays else None

@@ -117,6 +117,11 @@ class RecursiveEstimator(Estimator):
         by the fields of ``struct call``, that the compiled code reads and changes."""
         return memory, {}
 
+    def given_noise(self, memory: Any) -> np.ndarray | None:
+        """Return the covariance of the output noise of all samples, (ny, ny, batch or 1), that a
+        memory has in place of the known one; None if it has none."""
+        return None
+
     def memory_rows(self, memory: Any, rows: np.ndarray) -> Any:
         """Return the memory of some rows of the batch."""
         return memory

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from agreement import FIELDS, assert_near, assert_same
 from fake_compilers import needs_compiler
+from learned_gains import gain_of
 from linear import Linear, linear_record, record_of
 
 from pinnobs_gym.envs.episodes import EpisodeSource
@@ -22,6 +23,13 @@ from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.systems import SYSTEMS
 
 pytestmark = needs_compiler
+
+
+def learned(system, level=None):
+    """A learned gain of small random weights; larger ones let estimates diverge."""
+    return gain_of(system, 0.1, noise_std=level)
+
+
 OBSERVED = [  # the gain of the design is not stable on the augmented cart; it multiplies rounding
     *(many_plants.cart, many_plants.cart_with_joined_input, many_plants.bounded_reactor),
     *(many_plants.escape, many_plants.well),
@@ -35,6 +43,7 @@ PLANTS = {
     SlidingMode: [*OBSERVED, many_plants.cart_with_noise_by_sample],
     HighGain: FORGETTING,
     StrongTrackingEKF: many_plants.PLANTS,
+    learned: [many_plants.cart, many_plants.henon, many_plants.well],
     OpenLoop: [many_plants.henon_with_measured_input, many_plants.cart_of_each_row],
 }
 
@@ -147,3 +156,21 @@ def test_a_subclass_uses_its_own_methods():
     found = estimator.run(record)
     assert abs(found.xhat - SlidingMode(Linear()).run(record).xhat).max() > 1e-4
     assert_same(found, in_numpy(estimator).run(record))
+
+
+def test_a_learned_gain_with_a_noise_of_its_own_is_that_of_numpy():
+    """Its training tries it at several levels at once."""
+    record, estimator = linear_record(3), learned(Linear())
+    R = np.eye(Linear().ny)[..., None] * np.array([0.01, 0.1, 1.0]) ** 2
+    state = other = estimator.begin(record.prior, R)
+    for k, t in enumerate(record.t.tolist()):
+        state = estimator.update(state, t, record.y[:, k], record.u[:, k])
+        other = estimator.update_by_numpy(other, t, record.y[:, k], record.u[:, k])
+        assert state.packed is not None
+        np.testing.assert_allclose(state.xhat, other.xhat, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(state.S, other.S, rtol=1e-9)
+
+
+def test_a_recurrent_gain_and_a_wide_one_stay_in_numpy():
+    assert compiled_filter(gain_of(Linear(), variant="gru")) == "its network is recurrent"
+    assert compiled_filter(gain_of(Linear(), width=300)) == "its network is 300 wide, more than 256"

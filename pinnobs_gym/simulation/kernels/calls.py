@@ -31,6 +31,7 @@ class PlanStructure(ctypes.Structure):
         *(("low", _POINTER), ("high", _POINTER)),
         *(("gate", _POINTER), ("patience", _INT), ("huber", _DOUBLE)),
         *(("growth", _POINTER), ("caution", _DOUBLE)),
+        *(("network", _POINTER), ("width", _INT), ("scale", _POINTER)),
         *(("theta", _DOUBLE), ("per_scale", _POINTER)),
         *(("switching", _DOUBLE), ("layer", _DOUBLE), ("carried", _INT)),
         *((name, _POINTER) for name in ("points", "weights", "roots")),

@@ -16,6 +16,9 @@ _WIDE_FILTER = 4
 """The number in filters. A filter of eight takes a fifth less time where its results fit the cache,
 but one of a single episode, or a second library for that, takes half as long again."""
 
+WIDEST = 256
+"""Largest number of neurons in a layer of a network in compiled code."""
+
 
 @dataclass(frozen=True)
 class _Parts:
@@ -46,6 +49,9 @@ def _parts(template: str) -> _Parts:
     entries, rows = ("given_inputs.c", "filter.c"), "filter_rows.c"
     if template == "observer":
         once = f"#define OBSERVER\n#define CARRIED NY\n{read('solve.c')}"
+        return _Parts(entries, (rows,), template, once)
+    if template == "learned_gain":
+        once = f"#define CARRIED NY\n#define WIDEST {WIDEST}"
         return _Parts(entries, (rows,), template, once)
     if template == "high_gain":
         once = "#define FORGETTING\n#define CARRIED (4 + NX * NX)"

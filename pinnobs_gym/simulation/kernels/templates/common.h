@@ -70,6 +70,9 @@ struct plan {
     double huber;             /* 0 for none */
     const double *growth;     /* variances (NX,) that P grows by at an innovation of size 1, or NULL */
     double caution;           /* factor with which H P H^T is added to R */
+    const double *network;    /* weights and biases of a learned gain, layer by layer, or NULL */
+    int64_t width;            /* number of neurons of its layers */
+    const double *scale;      /* (NX,) of the states, or NULL */
     double theta;             /* rate of forgetting in 1/s */
     const double *per_scale;  /* (NX,) scale^-2 of the states, or NULL */
     double switching, layer;  /* of a sliding mode: ratio to the layer, and its width in deviations */

@@ -47,16 +47,7 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
     lanes H[NY * NX], HP[NY * NX];
     double rest[W];
     if (plan->growth) AT_WIDTH(grow)(plan, y, memory->carried, P);
-    /* Innovation e = y - h and H; both are zero for missing outputs. */
-    AT_WIDTH(plant_h_linearised)(s->t, x, s->u, p, e, H);
-    for (int i = 0; i < NY; i++) {
-        EACH_LANE e[i][l] = y[i][l] - e[i][l];
-        if (plan->output_period && plan->output_period[i])
-            EACH_LANE e[i][l] = wrapped(e[i][l], plan->output_period[i]);
-        EACH_LANE e[i][l] = y[i][l] != y[i][l] ? 0 : e[i][l];
-        for (int j = 0; j < NX; j++)
-            EACH_LANE H[i * NX + j][l] = y[i][l] != y[i][l] ? 0 : H[i * NX + j][l];
-    }
+    AT_WIDTH(observe)(plan, p, x, s, H);
     AT_WIDTH(output_moments)(H, P, R, HP, S);
     AT_WIDTH(mark_wide)(plan, P, S, bad);
     if (plan->gate) { /* restart after too many samples in a row beyond it, of lanes in NumPy */

@@ -40,6 +40,22 @@ static inline void AT_WIDTH(leave_out_missing)(const lanes *restrict y, lanes *r
                 EACH_LANE if (y[i][l] != y[i][l] || y[j][l] != y[j][l]) R[i * NY + j][l] = 0;
 }
 
+/* Find innovations and output Jacobians of a sample at x, zero for missing outputs. */
+static inline void AT_WIDTH(observe)(const struct plan *plan, const lanes *restrict p,
+                                     const lanes *restrict x, struct sample *restrict s,
+                                     lanes *restrict H)
+{
+    AT_WIDTH(plant_h_linearised)(s->t, x, s->u, p, s->e, H);
+    for (int i = 0; i < NY; i++) {
+        EACH_LANE s->e[i][l] = s->y[i][l] - s->e[i][l];
+        if (plan->output_period && plan->output_period[i])
+            EACH_LANE s->e[i][l] = wrapped(s->e[i][l], plan->output_period[i]);
+        EACH_LANE s->e[i][l] = s->y[i][l] != s->y[i][l] ? 0 : s->e[i][l];
+        for (int j = 0; j < NX; j++)
+            EACH_LANE H[i * NX + j][l] = s->y[i][l] != s->y[i][l] ? 0 : H[i * NX + j][l];
+    }
+}
+
 /* Mark the lanes in which P (n, n) is finite and its factor L is not: it has none. */
 static inline void AT_WIDTH(mark_without_root)(int n, const lanes *restrict P,
                                                const lanes *restrict L, int64_t *restrict bad)

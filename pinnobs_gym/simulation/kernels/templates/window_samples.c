@@ -1,21 +1,5 @@
 /* The samples of moving windows, and what they say of a state. */
 
-/* Find innovations and output Jacobians of a sample at x, zero for missing outputs. */
-static inline void AT_WIDTH(observe)(const struct plan *plan, const lanes *restrict p,
-                                     const lanes *restrict x, struct sample *restrict s,
-                                     lanes *restrict H)
-{
-    AT_WIDTH(plant_h_linearised)(s->t, x, s->u, p, s->e, H);
-    for (int i = 0; i < NY; i++) {
-        EACH_LANE s->e[i][l] = s->y[i][l] - s->e[i][l];
-        if (plan->output_period && plan->output_period[i])
-            EACH_LANE s->e[i][l] = wrapped(s->e[i][l], plan->output_period[i]);
-        EACH_LANE s->e[i][l] = s->y[i][l] != s->y[i][l] ? 0 : s->e[i][l];
-        for (int j = 0; j < NX; j++)
-            EACH_LANE H[i * NX + j][l] = s->y[i][l] != s->y[i][l] ? 0 : H[i * NX + j][l];
-    }
-}
-
 /* a - b for states, of which those that repeat are within half a period */
 static inline void AT_WIDTH(state_residual)(const struct plan *plan, const lanes *restrict a,
                                             const lanes *restrict b, lanes *restrict difference)
