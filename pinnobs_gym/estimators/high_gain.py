@@ -19,7 +19,7 @@ from pinnobs_gym.estimation.kalman import observe, predict
 from pinnobs_gym.estimation.observer_gains import default_rate
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
-from pinnobs_gym.simulation.matrices import sandwich
+from pinnobs_gym.simulation.matrices import sandwich, total
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
 
@@ -176,4 +176,5 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
 
     def _size(self, P: np.ndarray) -> np.ndarray:
         """Return the sum of the variances in P (nx, nx, batch) over scale², shape (batch,)."""
-        return np.einsum("iib,i->b", P, np.asarray(self.system.scale, dtype=float) ** -2)
+        scale = vector(self.system.scale, self.system.nx, "scale")
+        return total(np.einsum("iib->ib", P) * scale[:, None] ** -2)

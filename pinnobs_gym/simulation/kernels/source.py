@@ -37,26 +37,32 @@ class _Parts:
 
 def _parts(template: str) -> _Parts:
     """Return the files of an algorithm."""
-    if template in ("truth", "model"):
-        once = coefficients() if template == "truth" else ""
-        return _Parts((f"{template}_entry.c",), (f"{template}.c",), once=once)
-    if template == "smoother":
-        lanes = "filter_rows.c", "smoother.c"
-        return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
-    if template in ("window", "moving_window"):
-        entries, lanes = ("given_inputs.c", "window_entry.c"), (f"{template}.c",)
-        return _Parts(entries, lanes, "window_samples", read("window.h"))
-    entries, rows = ("given_inputs.c", "filter.c"), "filter_rows.c"
-    if template == "observer":
-        once = f"#define OBSERVER\n#define CARRIED NY\n{read('solve.c')}"
-        return _Parts(entries, (rows,), template, once)
-    if template == "learned_gain":
-        once = f"#define CARRIED NY\n#define WIDEST {WIDEST}"
-        return _Parts(entries, (rows,), template, once)
-    if template == "high_gain":
-        once = "#define FORGETTING\n#define CARRIED (4 + NX * NX)"
-        return _Parts(entries, ("forgetting.c", rows), "ekf", once)
-    return _Parts(entries, (rows,), template)
+    filters, windows = ("given_inputs.c", "filter.c"), ("given_inputs.c", "window_entry.c")
+    rows = ("filter_rows.c",)
+    match template:
+        case "truth":
+            return _Parts(("truth_entry.c",), ("truth.c",), once=coefficients())
+        case "model":
+            return _Parts(("model_entry.c",), ("model.c",))
+        case "smoother":
+            lanes = *rows, "smoother.c"
+            return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED")
+        case "window":
+            return _Parts(windows, ("window.c",), "window_samples", read("window.h"))
+        case "moving_window":
+            lanes = "roots.c", "linear_window.c", "moving_window.c"
+            return _Parts(windows, lanes, "window_samples", read("window.h"))
+        case "observer":
+            once = f"#define OBSERVER\n#define CARRIED NY\n{read('solve.c')}"
+            return _Parts(filters, rows, template, once)
+        case "high_gain":
+            once = "#define FORGETTING\n#define CARRIED (4 + NX * NX)"
+            return _Parts(filters, ("forgetting.c", *rows), "ekf", once)
+        case "learned_gain":
+            once = f"#define CARRIED NY\n#define WIDEST {WIDEST}"
+            return _Parts(filters, rows, template, once)
+        case _:
+            return _Parts(filters, rows, template)
 
 
 def library_source(plant: PlantCode, template: str) -> str:

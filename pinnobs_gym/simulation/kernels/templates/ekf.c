@@ -49,7 +49,9 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
     if (plan->growth) AT_WIDTH(grow)(plan, y, memory->carried, P);
     AT_WIDTH(observe)(plan, p, x, s, H);
     AT_WIDTH(output_moments)(H, P, R, HP, S);
+#ifndef FORGETTING /* such an observer has nothing to say of angles */
     AT_WIDTH(mark_wide)(plan, P, S, bad);
+#endif
     if (plan->gate) { /* restart after too many samples in a row beyond it, of lanes in NumPy */
         lanes Se[NY];
         for (int i = 0; i < NY; i++) EACH_LANE Se[i][l] = e[i][l];
