@@ -16,7 +16,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import library_of, of_rows, plan_of, rows_of_numbers
 from pinnobs_gym.estimation.compiled_layout import Layout, contiguous
-from pinnobs_gym.estimation.compiled_run import FIELDS, CompiledRun, call_with, state_of, with_rows
+from pinnobs_gym.estimation.compiled_run import CompiledRun, call_with, state_of, with_rows
 from pinnobs_gym.estimation.estimator import Estimates, State
 from pinnobs_gym.estimation.square_root import carried
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
@@ -62,6 +62,7 @@ class CompiledFilter:
         system = estimator.system
         self._estimator = estimator
         self._sizes = system.nx, system.ny, system.nu
+        self._fields = estimator.computes
         self._by_sample = estimator.noise.samples is not None
         self._rows = rows_of_numbers(estimator, made)
         R = estimator.noise.R(0.0)[None]
@@ -83,18 +84,21 @@ class CompiledFilter:
         of `Estimator.update`."""
         batch = len(state.xhat)
         layout = self.layout(batch)
-        if state.P is None or self._rows not in (1, batch):
+        without = state.P is None and "P" in self._fields
+        if without or self._rows not in (1, batch):
             return None
         before = state.packed
         if type(before) is not layout.buffer:
             before = layout.packed(state.t, state.u, state.xhat, state.P)
         # All arrays of the next state are parts of one buffer, whose address is found once.
         buffer = layout.buffer()
-        plan = self.plan
-        if self._by_sample:
+        plan, given = self.plan, self._estimator.given_noise(state.memory)
+        if given is not None:
+            plan = plan.with_R(given[None])
+        elif self._by_sample:
             plan = plan.with_R(self._estimator.noise.R(t)[None])
-        memory, arrays = self._estimator.carried_memory(state)
-        more = call_with(arrays) if arrays else None
+        memory, carried_arrays = self._estimator.carried_memory(state.memory)
+        more = call_with(carried_arrays) if carried_arrays else None
         left = self.code(
             addressof(plan.structure),
             batch,
@@ -106,12 +110,10 @@ class CompiledFilter:
             addressof(before),
             addressof(more) if more else None,
         )
-        x, P, innovation, S = layout.arrays(buffer)
         # The attributes are set at once, in a quarter of the time that State(...) takes.
         after = object.__new__(State)
-        after.__dict__.update(
-            xhat=x, t=t, u=u, P=P, innovation=innovation, S=S, memory=memory, root=state.root
-        )
+        arrays = layout.arrays(buffer)
+        after.__dict__.update(arrays, t=t, u=u, memory=memory, root=state.root)
         if left:  # the inputs may be others than the model uses
             check_use(
                 self._estimator.system,
@@ -143,7 +145,7 @@ class CompiledFilter:
         part = estimator.update_by_numpy(
             own, after.t, np.asarray(y)[rows], np.asarray(after.u)[rows]
         )
-        for name in FIELDS:
+        for name in self._fields:
             getattr(after, name)[rows] = getattr(part, name)
         return with_rows(self._estimator, after, rows, part)
 
@@ -151,7 +153,7 @@ class CompiledFilter:
         """Return the layout of a buffer for a batch."""
         layout = self._layouts.get(batch)
         if layout is None:
-            layout = Layout.of(*self._sizes, batch)
+            layout = Layout.of(*self._sizes, batch, self._fields)
             if len(self._layouts) < _LAYOUTS:
                 self._layouts[batch] = layout
         return layout

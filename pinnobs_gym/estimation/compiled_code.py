@@ -18,9 +18,9 @@ from pinnobs_gym.simulation.truth import rows_of
 T = TypeVar("T", bound=BaseEstimator)
 
 
-def library_of(estimator: BaseEstimator) -> PlantLibrary | str:
+def library_of(estimator: BaseEstimator, other: str = "") -> PlantLibrary | str:
     """Return the library of an estimator whose class names a ``template``, or the reason in one
-    line why there is none."""
+    line why there is none; ``other`` is a template that its settings ask for instead."""
     cls = type(estimator)
     template = getattr(cls, "template", "")
     if not template:
@@ -30,7 +30,7 @@ def library_of(estimator: BaseEstimator) -> PlantLibrary | str:
     noise = estimator.noise
     if type(noise) is not AssumedNoise or type(noise.told) is not Noise:
         return "its noise has methods of its own"
-    return plant_library(estimator.system, template)
+    return plant_library(estimator.system, other or template)
 
 
 def changed_method(cls: type[BaseEstimator]) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 _DOUBLE = np.dtype(float)
+_NAMES = "xhat", "P", "innovation", "S"
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,43 +28,49 @@ class Layout:
     """Position of the inputs (nu, batch) in bytes."""
     nu: int
     """Number of inputs."""
-    views: tuple[tuple[tuple[int, ...], int, tuple[int, ...]], ...]
-    """Shape, position in bytes and strides of the estimates (batch, nx) and so on."""
-    places: tuple[tuple[int, int], ...]
-    """Begin and end of the same, in doubles."""
+    views: tuple[tuple[str, tuple[int, ...], int, tuple[int, ...]], ...]
+    """Names in `pinnobs_gym.estimation.estimator.State`, shapes, positions in bytes and strides of
+    the estimates (batch, nx) and so on."""
+    places: dict[str, slice]
+    """Places of the same in doubles."""
     marks: int
     """Position of the numbers that mark rows in bytes."""
 
     @staticmethod
-    def of(nx: int, ny: int, nu: int, batch: int, more: int = 0) -> Layout:
-        """Return the layout for a model of these sizes and a batch, with further numbers for each
-        row."""
-        shapes = [(nx,), (nx, nx), (ny,), (ny, ny)]
+    def of(
+        nx: int, ny: int, nu: int, batch: int, names: Sequence[str] = _NAMES, more: int = 0
+    ) -> Layout:
+        """Return the layout for a model of these sizes and a batch, of an estimator that computes
+        the fields of `State` with these names, with further numbers for each row."""
+        covariances = [(nx, nx), (ny, ny)] if "P" in names else [(0,), (0,)]
+        shapes = [(nx,), covariances[0], (ny,), covariances[1]]
         sizes = [1, ny * batch, nu * batch, *(batch * int(np.prod(shape)) for shape in shapes)]
         ends = [8 * int(end) for end in np.cumsum(sizes)]
         views = []
-        for shape, place in zip(shapes, ends[2:], strict=False):
+        for name, shape, place in zip(_NAMES, shapes, ends[2:], strict=False):
             array = np.moveaxis(np.empty((*shape, batch)), -1, 0)
-            views.append((array.shape, place, array.strides))
+            if name in names:
+                views.append((name, array.shape, place, array.strides))
         kind = ctypes.c_double * (ends[-1] // 8 + (1 + more) * batch)
         buffer = type("Packed", (kind,), {"__reduce__": _left_behind})
-        places = tuple(pairwise(end // 8 for end in ends[2:]))
+        parts = zip(_NAMES, pairwise(end // 8 for end in ends[2:]), strict=True)
+        places = {name: slice(*part) for name, part in parts if name in names}
         return Layout(buffer, ends[1], nu, tuple(views), places, ends[-1])
 
-    def arrays(self, buffer: Any) -> list[np.ndarray]:
+    def arrays(self, buffer: Any) -> dict[str, np.ndarray]:
         """Return the estimates (batch, nx), their covariances, the innovations and their
-        covariances in a buffer."""
-        return [
-            np.ndarray(shape, _DOUBLE, buffer, place, strides)
-            for shape, place, strides in self.views
-        ]
+        covariances in a buffer, by name, as far as there are any."""
+        return {
+            name: np.ndarray(shape, _DOUBLE, buffer, place, strides)
+            for name, shape, place, strides in self.views
+        }
 
     def inputs(self, buffer: Any) -> np.ndarray:
         """Return the inputs (batch, nu) in a buffer."""
-        batch = self.views[0][0][0]
+        batch = self.views[0][1][0]
         return np.ndarray((self.nu, batch), _DOUBLE, buffer, self.inputs_place).T
 
-    def packed(self, t: float | None, u: Any, xhat: np.ndarray, P: np.ndarray) -> Any:
+    def packed(self, t: float | None, u: Any, xhat: np.ndarray, P: np.ndarray | None) -> Any:
         """Return a new buffer with the values of a state, see
         `pinnobs_gym.estimation.estimator.State`."""
         buffer = self.buffer()
@@ -71,8 +78,10 @@ class Layout:
             buffer[0] = t
         if u is not None and self.nu:
             self.inputs(buffer)[:] = u
-        for array, value in zip(self.arrays(buffer), (xhat, P), strict=False):
-            array[:] = value
+        arrays = self.arrays(buffer)
+        arrays["xhat"][:] = xhat
+        if "P" in arrays:
+            arrays["P"][:] = P
         return buffer
 
 
@@ -89,7 +98,7 @@ class SetLayout:
         """Return the layout for a model of sizes (nx, ny, nu), and what each row has beside: arrays
         of these shapes, of which the last is not kept with a state."""
         numbers = [math.prod(shape) for shape in shapes]
-        layout = Layout.of(*sizes, batch, sum(numbers))
+        layout = Layout.of(*sizes, batch, more=sum(numbers))
         views, place = [], layout.marks + 8 * batch
         for shape, number in zip(shapes[:-1], numbers[:-1], strict=True):
             array = np.empty((batch, *shape))

@@ -16,7 +16,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import of_rows, plan_of, rows_of_numbers
 from pinnobs_gym.estimation.compiled_layout import SetLayout
-from pinnobs_gym.estimation.compiled_run import FIELDS, state_of
+from pinnobs_gym.estimation.compiled_run import state_of
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.projection import kept_inside
 from pinnobs_gym.estimation.random_streams import Streams
@@ -144,14 +144,12 @@ class SetCode:
             left: whether rows are left to NumPy.
         """
         buffer, t = call.buffer, call.structure.t
-        x, P, innovation, S = call.layout.layout.arrays(buffer)
+        moments = call.layout.layout.arrays(buffer)
         memory = state.memory
         memory = type(memory)(*call.layout.arrays(buffer), memory.sample + 1)
         # The attributes are set at once, in a quarter of the time that State(...) takes.
         after = object.__new__(State)
-        after.__dict__.update(
-            xhat=x, t=t, u=u, P=P, innovation=innovation, S=S, memory=memory, packed=buffer
-        )
+        after.__dict__.update(moments, t=t, u=u, memory=memory, packed=buffer)
         if left:
             self._complete(state, after, call, y)
         return after
@@ -167,7 +165,7 @@ class SetCode:
         part = estimator.update_by_numpy(own, t, np.asarray(y)[rows], u[rows])
         if system.state_box is not None:
             part = kept_inside(part, system.state_box)
-        for name in FIELDS:
+        for name in self._estimator.computes:
             getattr(after, name)[rows] = getattr(part, name)
         values = vars(part.memory).values()
         for array, value in zip(call.layout.arrays(call.buffer), values, strict=False):

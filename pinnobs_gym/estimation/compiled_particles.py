@@ -112,10 +112,8 @@ class CompiledParticles:
         rows = np.flatnonzero(call.marks() == kind)
         system, noise = rows_of(self._estimator.system, rows), self._estimator.noise
         sample = Sample.of(noise, state.t, call.structure.t, y, u).rows(rows)
-        mean, P = (
-            np.ascontiguousarray(array[rows])
-            for array in call.layout.layout.arrays(call.buffer)[:2]
-        )
+        moments = call.layout.layout.arrays(call.buffer)
+        mean, P = (np.ascontiguousarray(moments[name][rows]) for name in ("xhat", "P"))
         shrinkage = np.ones(batch)
         shrinkage[rows] = shrinkages(system, sample, mean, P, tempering=tempering)
         return shrinkage

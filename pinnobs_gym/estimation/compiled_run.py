@@ -21,9 +21,6 @@ from pinnobs_gym.simulation.record import Record
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.recursive import RecursiveEstimator
 
-FIELDS = ("xhat", "P", "innovation", "S")
-"""The fields of `Estimates` that compiled filters compute."""
-
 
 class CompiledRun:
     """The compiled code of one estimator for whole records.
@@ -53,7 +50,7 @@ class CompiledRun:
         if self._rows not in (1, batch) or rooted.all():
             return None
         shapes = {"xhat": (nx,), "P": (nx, nx), "innovation": (ny,), "S": (ny, ny)}
-        results = _empty({name: (n, *shapes[name], batch) for name in FIELDS})
+        results = _empty({name: (n, *shapes[name], batch) for name in self._estimator.computes})
         # For each row, the number of the sample that NumPy has to process, n if there is none
         reached = np.where(rooted, 0, n)
         state = self._through(record, np.flatnonzero(~rooted), 0, state, results, reached)
@@ -93,7 +90,7 @@ class CompiledRun:
         own = record if whole else record.rows(rows)
         before = self._before(record, first, state, results)
         before = before if whole else state_of(estimator, before, rows)
-        memory, arrays = estimator.carried_memory(before)
+        memory, arrays = estimator.carried_memory(before.memory)
         plan = self._plan
         if self._by_sample or not whole:
             R = noise_at(estimator.noise, own.t[first:])
@@ -104,17 +101,16 @@ class CompiledRun:
         if not whole:
             part = {name: np.empty((*a.shape[:-1], len(rows))) for name, a in part.items()}
         earlier = _arrays_of(before)
-        names = ["t", "y", "u", "x", "P", "innovation", "S", "x_before", "P_before"]
-        given = [t, y, u, *part.values(), *earlier[2:]]
-        if before.t is not None:
-            names, given = [*names, "t_before", "u_before"], [*given, *earlier[:2]]
-        call = call_with(arrays | dict(zip(names, given, strict=True)))
+        part["x"] = part.pop("xhat")
+        given = {"t": t, "y": y, "u": u, **part, **earlier}
+        call = call_with(arrays | given)
         call.plan, call.batch, call.samples = addressof(plan.structure), len(rows), n - first
         stopped = np.empty(len(rows), dtype=np.int64)
         self._run(addressof(call), address(stopped))
         reached[rows] = first + stopped
         if whole:
             return replace(state, memory=memory)
+        part["xhat"] = part.pop("x")
         for name, array in part.items():
             results[name][first:, ..., rows] = array
         return replace(state, memory=self._estimator.with_memory_rows(state.memory, rows, memory))
@@ -125,8 +121,8 @@ class CompiledRun:
         """Return the state before sample k; the arguments are those of `_through`."""
         if k == 0:
             return state
-        xhat, P = (_batch_first(results[name][k - 1]) for name in ("xhat", "P"))
-        return replace(state, t=float(record.t[k - 1]), u=record.u[:, k - 1], xhat=xhat, P=P)
+        moments = {n: _batch_first(results[n][k - 1]) for n in ("xhat", "P") if n in results}
+        return replace(state, t=float(record.t[k - 1]), u=record.u[:, k - 1], **moments)
 
     def _by_numpy(
         self, record: Record, rows: np.ndarray, k: int, state: State, results: dict[str, np.ndarray]
@@ -140,19 +136,18 @@ class CompiledRun:
             part = estimator.update_by_numpy(before, t, y, u)
         if (box := estimator.system.state_box) is not None:
             part = kept_inside(part, box)
-        for name in FIELDS:
+        for name in self._estimator.computes:
             results[name][k][..., rows] = np.moveaxis(getattr(part, name), 0, -1)
         return with_rows(self._estimator, state, rows, part)
 
 
 def state_of(estimator: RecursiveEstimator, state: State, rows: np.ndarray) -> State:
     """Return the state of some rows, for the estimator of these."""
-    assert state.P is not None
     return State(
         state.xhat[rows],
         state.t,
         None if state.u is None else np.asarray(state.u)[rows],
-        state.P[rows],
+        None if state.P is None else state.P[rows],
         memory=estimator.memory_rows(state.memory, rows),
         root=None if state.root is None else state.root[rows],
     )
@@ -189,11 +184,13 @@ def call_with(arrays: dict[str, np.ndarray]) -> CallStructure:
     return CallStructure(**{name: address(array) for name, array in arrays.items()})
 
 
-def _arrays_of(state: State) -> list[np.ndarray]:
-    """Return the time, inputs, estimate and covariance of a state in the layout of compiled
-    code."""
-    assert state.P is not None
-    t = np.array([np.nan if state.t is None else state.t])
-    u = np.empty((0, len(state.xhat))) if state.u is None else state.u.T
-    parts = (t, u, state.xhat.T, state.P.transpose(1, 2, 0))
-    return [np.ascontiguousarray(part, dtype=float) for part in parts]
+def _arrays_of(state: State) -> dict[str, np.ndarray]:
+    """Return the time, inputs, estimate and covariance of a state in the layout of compiled code,
+    by the fields of ``struct call``; the first two only after a sample."""
+    arrays = {"x_before": state.xhat.T}
+    if state.P is not None:
+        arrays["P_before"] = state.P.transpose(1, 2, 0)
+    if state.t is not None:
+        u = np.empty((0, len(state.xhat))) if state.u is None else state.u.T
+        arrays |= {"t_before": np.array([state.t]), "u_before": u}
+    return {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}

@@ -139,8 +139,7 @@ def predicted(
 
 def enlarged(state: State, growth: np.ndarray) -> State:
     """Return the state with a covariance (nx, nx, batch) added to P and to its roots."""
-    assert state.P is not None
-    P, L = state.P + growth.transpose(2, 0, 1), state.root
+    P, L = (covariances(state) + growth).transpose(2, 0, 1), state.root
     if L is not None:
         rows = square_root.carried(L)
         L, P = L.copy(), P.copy()

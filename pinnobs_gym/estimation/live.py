@@ -74,7 +74,7 @@ class Live:
         self._longest_gap = LONGEST_GAP * dt if longest_gap is None else longest_gap
         check_settings(late, ring, self._longest_gap)
         begun = estimator.reset(prior_of(self._system, xhat0, P0))
-        self._steps: Steps = steps_of(estimator, begun)
+        self._steps: Steps = steps_of(estimator)
         prepare(estimator, self._steps, begun, dt)
         self._ring = Ring(ring if late == "replay" else 0, begun)
 

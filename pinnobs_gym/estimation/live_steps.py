@@ -12,6 +12,7 @@ import numpy as np
 
 from pinnobs_gym.estimation.compiled import CompiledFilter
 from pinnobs_gym.estimation.compiled_layout import Layout
+from pinnobs_gym.estimation.compiled_run import call_with
 from pinnobs_gym.estimation.estimator import Estimator, State
 from pinnobs_gym.estimation.live_sample import Sample
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
@@ -48,15 +49,16 @@ class Packed:
 
     def moments(self) -> Moments:
         """Return the moments; parts of the buffer become lists faster than arrays."""
-        (x, P), (_, e), (_, S), (_, end) = self._layout.places
-        buffer = self.buffer
-        return Moments(buffer[x:P], buffer[P : e : P - x + 1], buffer[e:S], buffer[S:end])
+        buffer, places = self.buffer, self._layout.places
+        parts = {name: buffer[place] for name, place in places.items()}
+        x, P = parts["xhat"], parts.get("P")
+        variances = None if P is None else P[:: len(x) + 1]
+        return Moments(x, variances, parts.get("innovation"), parts.get("S"))
 
     def state(self) -> State:
         """Return the same as a `State`, whose arrays are views of the buffer."""
-        x, P, innovation, S = self._layout.arrays(self.buffer)
-        u = self._layout.inputs(self.buffer)
-        after = State(x, self.t, u, P, innovation, S, self.memory)
+        arrays, u = self._layout.arrays(self.buffer), self._layout.inputs(self.buffer)
+        after = State(t=self.t, u=u, memory=self.memory, **arrays)
         object.__setattr__(after, "packed", self.buffer)
         return after
 
@@ -93,19 +95,13 @@ def moments_of(
     )
 
 
-def steps_of(estimator: Estimator, begun: State) -> Steps:
-    """Return the fastest way of an estimator through samples of one plant.
-
-    Args:
-        estimator: the estimator.
-        begun: its state before the first sample.
-    """
+def steps_of(estimator: Estimator) -> Steps:
+    """Return the fastest way of an estimator through samples of one plant."""
     plain = ByUpdate(estimator)
     if isinstance(estimator, RecursiveEstimator) and estimator.noise.samples is None:
         compiled = estimator.compiled
-        # What an estimator remembers beside x and P is carried by `update`.
-        if isinstance(compiled, CompiledFilter) and not estimator.carried_memory(begun)[1]:
-            return InBuffers(compiled, plain)
+        if isinstance(compiled, CompiledFilter):
+            return InBuffers(compiled, estimator, plain)
     return plain
 
 
@@ -150,11 +146,14 @@ class InBuffers:
 
     Args:
         compiled: the code.
+        estimator: its estimator.
         plain: the steps that it leaves to NumPy.
     """
 
-    def __init__(self, compiled: CompiledFilter, plain: ByUpdate) -> None:
-        system = plain.estimator.system
+    def __init__(
+        self, compiled: CompiledFilter, estimator: RecursiveEstimator, plain: ByUpdate
+    ) -> None:
+        system, self._carried_memory = estimator.system, estimator.carried_memory
         self._plain, self._code = plain, compiled.code
         self._layout = compiled.layout(1)
         self._buffer = self._layout.buffer
@@ -166,11 +165,13 @@ class InBuffers:
         t, y, u = sample
         if isinstance(before, Packed):
             earlier = before.buffer
-        elif before.root is not None or before.P is None:
+        elif before.root is not None or (before.P is None and "P" in self._layout.places):
             return self._plain(before, sample)
         else:
             earlier = self._layout.packed(before.t, before.u, before.xhat, before.P)
         buffer = self._buffer()
+        memory, arrays = self._carried_memory(before.memory)
+        more = call_with(arrays) if arrays else None
         left = self._code(
             self._plan,
             1,
@@ -180,8 +181,8 @@ class InBuffers:
             self._u(*u) if u else None,
             ctypes.addressof(buffer),
             ctypes.addressof(earlier),
-            None,
+            ctypes.addressof(more) if more else None,
         )
         if left:
             return self._plain(before, sample)
-        return Packed(self._layout, buffer, t, before.memory)
+        return Packed(self._layout, buffer, t, memory)

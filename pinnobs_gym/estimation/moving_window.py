@@ -15,6 +15,7 @@ from pinnobs_gym.estimation.linear_window import (
 )
 from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.estimation.square_root import compressed, root_of, updated
+from pinnobs_gym.estimation.window_samples import WindowSamples
 from pinnobs_gym.simulation.bounds import StateBox
 from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.noise import Noise
@@ -33,20 +34,25 @@ class MovingWindow:
     """Estimates of the states at the window's samples, shape (num_samples, batch, nx)."""
     exact: bool
     """Whether the model is assumed to have no process noise in the window."""
-    t: tuple[float, ...] = ()
-    """Times of the samples in s."""
-    y: tuple[np.ndarray, ...] = ()
-    """Outputs at these samples, shape (batch, ny) each."""
-    u: tuple[np.ndarray, ...] = ()
-    """Inputs at these samples, shape (batch, nu) each."""
+    samples: WindowSamples
+    """The window's samples."""
 
     def extended(self, system: System, t: float, y: np.ndarray, u: np.ndarray) -> MovingWindow:
-        """Return the window with one more sample, whose state is predicted by the model."""
+        """Return the window with one more sample, whose state is predicted by the model: y
+        (batch, ny) and u (batch, nu) at time t (s)."""
         x = self.x
-        if self.t:
-            ahead = model_step(system, self.t[-1], t, x[-1], self.u[-1], u)
+        if len(self.samples):
+            before, _, inputs = self.samples.at(-1)
+            ahead = model_step(system, before, t, x[-1], inputs, u)
             x = np.concatenate([x, ahead[None]])
-        return replace(self, x=x, t=(*self.t, t), y=(*self.y, y), u=(*self.u, u))
+        return replace(self, x=x, samples=self.samples.extended(t, y, u))
+
+    def rows(self, rows: np.ndarray) -> MovingWindow:
+        """Return the windows of some rows of the batch."""
+        own = self.mean[rows], self.root[rows], self.x[:, rows]
+        # Contiguous, so that sums are formed in one order in any batch.
+        mean, root, x = map(np.ascontiguousarray, own)
+        return MovingWindow(mean, root, x, self.exact, self.samples.rows(rows))
 
     def shortened(self, system: System, noise: Noise) -> MovingWindow:
         """Return the window without its first sample, with which x̄ and P̄ are updated as in an
@@ -54,24 +60,25 @@ class MovingWindow:
         roots (Kühl, Diehl, Kraus, Schlöder & Bock 2011, "A real-time algorithm for moving horizon
         state and parameter estimation"). There is a second sample."""
         x, batch = self.x[0], len(self.mean)
-        e, H = whitened(system, noise, (self.t[0], self.y[0], self.u[0]), x)
+        (t0, y0, u0), (t1, _, u1) = self.samples.at(0), self.samples.at(1)
+        e, H = whitened(system, noise, (t0, y0, u0), x)
         # Update x̄ − x with the sample.
         deviation = system.state_residual(self.mean, x)
         unit = np.broadcast_to(np.eye(H.shape[1]), (batch, H.shape[1], H.shape[1]))
         step, L = updated(self.root, e - (H @ deviation[..., None])[..., 0], H, unit)
         # Predict it to the next sample.
-        end, F, Q = model_step_moments(system, noise, self.t[0], self.t[1], x, self.u[0], self.u[1])
+        end, F, Q = model_step_moments(system, noise, t0, t1, x, u0, u1)
         F = np.ascontiguousarray(F.transpose(2, 0, 1))
         G = np.broadcast_to(root_of(Q.transpose(2, 0, 1)), F.shape)
         mean = end + (F @ (deviation + step)[..., None])[..., 0]
         L = compressed(F @ L, G)
-        window = MovingWindow(mean, L, self.x[1:], self.exact)
-        return replace(window, t=self.t[1:], y=self.y[1:], u=self.u[1:])
+        return MovingWindow(mean, L, self.x[1:], self.exact, self.samples.without_first())
 
     def improved(self, system: System, noise: Noise) -> tuple[MovingWindow, Smoothed]:
         """Return the window after a Gauss-Newton step of all its states, within their bounds, and
         the states without bounds with their covariances."""
-        window = linear_window(system, noise, self.t, self.y, self.u, self.x, self.exact)
+        t, y, u = zip(*(self.samples.at(k) for k in range(len(self.samples))), strict=True)
+        window = linear_window(system, noise, t, y, u, self.x, self.exact)
         states = smoothed(window, system.state_residual(self.mean, window.r[0]), self.root)
         box, x = system.state_box, states.x
         if box is not None and box.outside(x).any():

@@ -278,18 +278,15 @@ def injection(L: np.ndarray, H: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return weighted @ inverse
 
 
-def time_since(
-    last: np.ndarray | None, t: float, missing: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def time_since(last: np.ndarray, t: float, missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the time (s) that has passed since each output's last sample, zero for a missing
     output, and the time of its last sample after this one, (batch, ny) each.
 
     Args:
-        last: times of the last samples, (batch, ny); None at the first sample, before which no time
+        last: times of the last samples, (batch, ny); NaN at the first sample, before which no time
             has passed.
         t: time of this sample in s.
         missing: whether each output is missing, (batch, ny).
     """
-    if last is None:
-        return np.zeros(missing.shape), np.full(missing.shape, t)
-    return np.where(missing, 0.0, t - last), np.where(missing, last, t)
+    first = np.isnan(last)
+    return np.where(missing | first, 0.0, t - last), np.where(missing & ~first, last, t)

@@ -31,6 +31,8 @@ class RecursiveEstimator(Estimator):
     template: ClassVar[str] = ""
     """The template of `pinnobs_gym.simulation.kernels` that computes the same; empty if there is
     none. It is not used for a subclass that overrides a method of the class that names it."""
+    computes: ClassVar[tuple[str, ...]] = ("xhat", "P", "innovation", "S")
+    """The fields of `Estimates` that the estimator has, if there is a template."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -117,10 +119,15 @@ class RecursiveEstimator(Estimator):
         """Return the settings that the compiled code takes, by the fields of ``struct plan``."""
         return {}
 
-    def carried_memory(self, state: State) -> tuple[Any, dict[str, np.ndarray]]:
-        """Return the memory of the next state, and those of its arrays, by the fields of ``struct
-        call``, that the compiled code reads and changes."""
-        return state.memory, {}
+    def carried_memory(self, memory: Any) -> tuple[Any, dict[str, np.ndarray]]:
+        """Return the memory of the next state, given that of the last one, and those of its arrays,
+        by the fields of ``struct call``, that the compiled code reads and changes."""
+        return memory, {}
+
+    def given_noise(self, memory: Any) -> np.ndarray | None:
+        """Return the covariance of the output noise of all samples, (ny, ny, batch or 1), that a
+        memory has in place of the known one; None if it has none."""
+        return None
 
     def memory_rows(self, memory: Any, rows: np.ndarray) -> Any:
         """Return the memory of some rows of the batch."""

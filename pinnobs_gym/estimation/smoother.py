@@ -26,6 +26,7 @@ from pinnobs_gym.simulation.matrices import (
 from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import rows_of
 
@@ -237,9 +238,9 @@ def flows(
     n, batch, nx = x.shape
     ends, (F, Q) = np.empty((n - 1, batch, nx)), np.empty((2, n - 1, nx, nx, batch))
     count = max(1, _ROWS // batch)
-    for first in range(0, n - 1, count):
-        size = min(count, n - 1 - first)
-        starts, stops = slice(first, first + size), slice(first + 1, first + size + 1)
+    alike = (part[i : i + count] for part in _alike(system, t) for i in range(0, len(part), count))
+    for starts in alike:
+        size, stops = len(starts), starts + 1
         t0, t1 = np.repeat(t[starts], batch), np.repeat(t[stops], batch)
         u0, u1 = (u[part].reshape(size * batch, u.shape[-1]) for part in (starts, stops))
         each = rows_of(system, np.tile(np.arange(batch), size))
@@ -249,3 +250,15 @@ def flows(
             part = np.broadcast_to(part, (nx, nx, size * batch)).reshape(nx, nx, size, batch)
             whole[starts] = part.transpose(2, 0, 1, 3)
     return ends, F, Q
+
+
+def _alike(system: System, t: np.ndarray) -> list[np.ndarray]:
+    """Return the numbers of the intervals between times t (s), those together for which the model
+    takes the same number of steps: all rows of a call take that of the one with the most."""
+    start, end = t[:-1], t[1:]
+    if system.discrete or system.stiff or system.own_flow or not len(start):
+        return [np.arange(len(start))]
+    number = np.maximum(np.ceil((end - start) / longest_step(system) - 1e-6), 1)
+    for k, at in enumerate(system.breakpoints()):  # it parts the interval in which it is
+        number[(start < at) & (at < end)] = -1 - k
+    return [np.flatnonzero(number == each) for each in np.unique(number)]

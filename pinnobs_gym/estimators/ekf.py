@@ -92,7 +92,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
         P0 = prior.cov
         wide = P0 + np.diag(vector(self.system.scale, self.system.nx, "scale") ** 2)
         bounds = self._gate_bounds()
-        beyond = np.zeros(len(P0), dtype=int)
+        beyond = np.zeros(len(P0))
         memory = EKFMemory(wide.transpose(1, 2, 0), bounds, beyond)
         L = prior_root(self.system, prior, self.noise.R(0.0))
         return wrapped_state(self.system, State(prior.mean, P=P0, memory=memory, root=L))
@@ -114,14 +114,15 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
 
     def plan_settings(self) -> dict[str, Any]:
         settings: dict[str, Any] = {"patience": self.patience, "huber": self.huber or 0.0}
-        return settings if self.gate is None else settings | {"gate": self._gate_bounds()}
+        if self.gate is None:
+            return settings
+        return settings | {"gate": self._gate_bounds(), "carried": 1}
 
-    def carried_memory(self, state: State) -> tuple[EKFMemory, dict[str, np.ndarray]]:
-        memory: EKFMemory = state.memory
+    def carried_memory(self, memory: EKFMemory) -> tuple[EKFMemory, dict[str, np.ndarray]]:
         if self.gate is None:
             return memory, {}
-        memory = replace(memory, beyond=memory.beyond.astype(np.int64))
-        return memory, {"beyond": memory.beyond}
+        memory = replace(memory, beyond=np.array(memory.beyond, dtype=float))
+        return memory, {"carried": memory.beyond}
 
     def memory_rows(self, memory: EKFMemory, rows: np.ndarray) -> EKFMemory:
         return replace(memory, P_restart=memory.P_restart[..., rows], beyond=memory.beyond[rows])

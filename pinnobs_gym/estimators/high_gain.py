@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,8 +19,13 @@ from pinnobs_gym.estimation.kalman import observe, predict
 from pinnobs_gym.estimation.observer_gains import default_rate
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import prior_root
-from pinnobs_gym.simulation.matrices import sandwich
+from pinnobs_gym.simulation.matrices import sandwich, total
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import vector
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.export.algorithm import Algorithm
+    from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,7 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     """Forgetting rate θ in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "high_gain"
+    template = "high_gain"
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u), \qquad
 P_k^- = g\, \Phi P_{k-1} \Phi^\top + Q \\
@@ -107,7 +114,7 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
     def _growth(self, memory: HighGainMemory, t: float) -> np.ndarray:
         """Return the logarithms (batch,) of the factors by which P has grown at time t (s) since
         the last sample with an output."""
-        theta = default_rate(self.system) if self.theta is None else self.theta
+        theta = self._theta()
         with np.errstate(divide="ignore", invalid="ignore"):  # a size is 0 if all states are known
             allowed = np.maximum(np.log(memory.largest / memory.size), 0.0)
         return np.minimum(theta * (t - memory.last), allowed)
@@ -124,6 +131,50 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top
         memory = replace(memory, size=size, last=last, added=added)
         return replace(new, memory=memory)
 
+    def _theta(self) -> float:
+        """Return θ in 1/s."""
+        return default_rate(self.system) if self.theta is None else self.theta
+
+    def plan_settings(self) -> dict[str, Any]:
+        system = self.system
+        carried = 4 + system.nx**2 if self.noise.stochastic else 3
+        per_scale = vector(system.scale, system.nx, "scale") ** -2
+        return {"theta": self._theta(), "per_scale": per_scale, "carried": carried}
+
+    def carried_memory(
+        self, memory: HighGainMemory
+    ) -> tuple[HighGainMemory, dict[str, np.ndarray]]:
+        parts, added = [memory.largest, memory.size, memory.last], memory.added
+        if self.noise.stochastic:
+            nx, batch = self.system.nx, len(memory.size)
+            known = np.full(batch, float(added is not None))
+            kept = np.zeros((nx, nx, batch)) if added is None else added
+            parts += [known, *kept.reshape(nx * nx, batch)]
+        carried = np.array(parts, dtype=float)
+        largest, size, last = carried[:3]
+        if added is not None:
+            added = carried[4:].reshape(added.shape)
+        return HighGainMemory(largest, size, last, added), {"carried": carried}
+
+    def memory_rows(self, memory: HighGainMemory, rows: np.ndarray) -> HighGainMemory:
+        added = None if memory.added is None else memory.added[..., rows]
+        return HighGainMemory(memory.largest[rows], memory.size[rows], memory.last[rows], added)
+
+    def with_memory_rows(
+        self, memory: HighGainMemory, rows: np.ndarray, part: HighGainMemory
+    ) -> HighGainMemory:
+        size, last = memory.size.copy(), memory.last.copy()
+        size[rows], last[rows] = part.size, part.last
+        added = memory.added
+        if added is not None and part.added is not None:
+            added = added.copy()
+            added[..., rows] = part.added
+        return HighGainMemory(memory.largest, size, last, added)
+
+    def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
+        return None
+
     def _size(self, P: np.ndarray) -> np.ndarray:
         """Return the sum of the variances in P (nx, nx, batch) over scale², shape (batch,)."""
-        return np.einsum("iib,i->b", P, np.asarray(self.system.scale, dtype=float) ** -2)
+        scale = vector(self.system.scale, self.system.nx, "scale")
+        return total(np.einsum("iib->ib", P) * scale[:, None] ** -2)

@@ -8,18 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Range, State
+from pinnobs_gym.estimation.constant_gain import ConstantGainObserver
+from pinnobs_gym.estimation.estimator import Range
 from pinnobs_gym.estimation.observer_gains import (
     default_rate,
-    injection,
     lmi_gain,
     placed_gain,
     settling_gain,
-    time_since,
 )
-from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.takes import EVERYTHING
-from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 
 if TYPE_CHECKING:
@@ -28,13 +25,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Luenberger(RecursiveEstimator):
+class Luenberger(ConstantGainObserver):
     """The Luenberger observer x̂' = f(t, x̂, u) + L(y − h(t, x̂, u)) with a constant gain
     (Luenberger 1964).
 
     Between samples the observer integrates the model. At a sample it applies the correction over
     the time since the output's previous sample, by Euler's implicit method
-    (`pinnobs_gym.estimation.observer_gains.injection`). A missing output contributes no correction.
+    (`pinnobs_gym.estimation.constant_gain`). A missing output contributes no correction.
     Gains are designed for scaled outputs, so that estimates do not depend on the outputs' units.
 
     Default tuning is the same rule for all systems. For each of 16 states of the benchmark's
@@ -56,6 +53,7 @@ class Luenberger(RecursiveEstimator):
     """Decay rate of errors in 1/s; 20 time constants per benchmark episode if None."""
 
     name = "luenberger"
+    template = "observer"
     takes = EVERYTHING - {"maps"}  # its gain is that of a rate of change
     equations = r"""
 \hat x_k &= \hat x_k^- + K\, (y_k - h(t_k, \hat x_k^-, u_k)) \\
@@ -94,32 +92,17 @@ H = \tfrac{\partial h}{\partial x}(t_k, \hat x_k^-, u_k) \\
             return placed_gain(self.system, rate, self.poles)
         return settling_gain(self.system, rate)
 
-    def reset(self, prior: Prior) -> State:
-        return State(prior.mean.astype(float), memory=(self.designed(), None))
-
-    def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        assert state.t is not None
-        xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
-        return State(xhat, state.t, state.u, memory=state.memory)
-
-    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, (L, last) = state.xhat, state.memory
-        missing = np.isnan(y)
-        dt, last = time_since(last, t, missing)
-        innovation = self.system.output_residual(y, self.system.h(t, xhat, u))
-        innovation = np.where(missing, 0.0, innovation)
-        H = np.asarray(self.system.h_jacobian(t, xhat, u))
-        K = injection(L, H, dt)
-        xhat = xhat + (K @ innovation[..., None])[..., 0]
-        return State(xhat, t, u, innovation=innovation, memory=(L, last))
-
     def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
         from pinnobs_gym.estimation.export.algorithm import Algorithm, model_parts, own
+        from pinnobs_gym.simulation.kernels.source import read
 
         ny = self.system.ny
         fields = (
             f"@real@ innovation[{ny}]; /* outputs less their predictions; 0 where missing */",
             f"double last[{ny}]; /* time of each output's last sample */",
         )
-        texts = own("solve.c"), own("between.c"), own("luenberger.c")
-        return Algorithm(model_parts(code), texts, {"gain": self.designed()}, fields)
+        lanes, texts = (
+            [*model_parts(code), read("solve.c")],
+            [own("between.c"), own("luenberger.c")],
+        )
+        return Algorithm(lanes, texts, {"gain": self.designed()}, fields)

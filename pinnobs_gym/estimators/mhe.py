@@ -17,6 +17,7 @@ from pinnobs_gym.estimation.least_squares import root
 from pinnobs_gym.estimation.moving_window import MovingWindow
 from pinnobs_gym.estimation.projection import nearest
 from pinnobs_gym.estimation.square_root import carried, covariance, prior_root
+from pinnobs_gym.estimation.window_samples import WindowSamples
 from pinnobs_gym.estimation.wrapping import say_what_turns
 from pinnobs_gym.simulation.matrices import mapped, sandwich
 from pinnobs_gym.simulation.record import Prior
@@ -30,9 +31,10 @@ class MHEMemory:
     """Windows whose states follow from their first one; None if all states of all windows are
     unknown."""
     whole: MovingWindow | None
-    """Windows of which all states are unknown; None if no row has one."""
+    """Windows of which all states are unknown: of all rows, or of those with a very wide prior if
+    there are windows of the other kind; None if no row has one."""
     rows: np.ndarray
-    """Numbers of the rows that have such a window, whose estimates count there."""
+    """Numbers of the rows with a very wide prior, see `pinnobs_gym.estimation.square_root`."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +96,20 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         prior = checked(prior)
         mean, P0, box = prior.mean, prior.cov, self.system.state_box
         start = mean if box is None else nearest(mean, P0, box)
+        samples = WindowSamples.none(self.system, len(mean))
         stochastic, R = self.noise.told.stochastic, self.noise.R(0.0)
-        roots, rows, wide = prior_root(self.system, prior, R), np.arange(0), None
+        roots, wide = prior_root(self.system, prior, R), None
+        rows = np.arange(0) if roots is None else carried(roots)
         # A noise of one's own that differs between rows is that of all rows, not of some.
         by_row = self.noise.samples is None and R.shape[-1] > 1
         if stochastic or (roots is not None and by_row):
             roots = root(P0.transpose(1, 2, 0)).transpose(2, 0, 1)
-            window = MovingWindow(mean, roots, start[None], exact=not stochastic)
-            return State(mean, P=P0, memory=MHEMemory(None, window, np.arange(len(mean))))
-        exact = ExactWindow(mean, P0.transpose(1, 2, 0), start)
+            window = MovingWindow(mean, roots, start[None], not stochastic, samples)
+            return State(mean, P=P0, memory=MHEMemory(None, window, rows))
+        exact = ExactWindow(mean, P0.transpose(1, 2, 0), start, samples)
         if roots is not None:
-            rows = carried(roots)
-            wide = MovingWindow(mean[rows], roots[rows], start[None, rows], exact=True)
+            own = samples.rows(rows)
+            wide = MovingWindow(mean[rows], roots[rows], start[None, rows], True, own)
         return State(mean, P=P0, memory=MHEMemory(exact, wide, rows))
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
@@ -113,13 +117,11 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         if state.t is None:
             sample, P = (t, y, u), covariances(state)
             say_what_turns(self.label, self.system, sample, state.xhat, P, self.noise.R(t))
-        if memory.exact is None:
-            return self._by_all_states(memory, t, y, u)
         compiled = self.compiled
         after = None if compiled is None else compiled.update(state, t, y, u)
         if after is None:
-            after = self.by_first_state(memory, t, y, u)
-        if memory.whole is None:
+            after = self.by_numpy(memory, t, y, u)
+        if memory.exact is None or memory.whole is None:
             return after
         # Rows with a very wide prior: their estimates are those with roots.
         rows = memory.rows
@@ -130,6 +132,12 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
             values[name][rows] = getattr(wide, name)
         return replace(after, **values, memory=replace(after.memory, whole=wide.memory.whole))
 
+    def by_numpy(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after a sample in NumPy, in rows without a wide prior if the states of
+        windows follow from their first one; compiled code has to agree with it."""
+        by = self._by_all_states if memory.exact is None else self._by_first_state
+        return by(memory, t, y, u)
+
     def _by_all_states(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
         """Return the state after a sample, in the rows of whose windows all states are unknown."""
         system, noise, window = self.system, self.noise, memory.whole
@@ -137,7 +145,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         if memory.exact is not None:
             noise = noise.rows(memory.rows)
         window = window.extended(system, t, y, u)
-        if len(window.t) > self.window:
+        if len(window.samples) > self.window:
             window = window.shortened(system, noise)
         # The last state is the prediction of this sample.
         innovation, H = observe(system, t, window.x[-1], y, u)
@@ -152,8 +160,7 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
 
     @cached_property
     def compiled(self) -> CompiledWindow | None:
-        """The compiled code of windows whose states follow from their first one; None if they are
-        computed in NumPy."""
+        """The compiled code of the windows; None if they are computed in NumPy."""
         found = compiled_window(self)
         return None if isinstance(found, str) else found
 
@@ -161,13 +168,12 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         if self.compiled is None:  # compiled windows contain the model's steps
             super().ask_model()
 
-    def by_first_state(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        """Return the state after a sample in NumPy, if the states of windows follow from their
-        first one; compiled code has to agree with it."""
+    def _by_first_state(self, memory: MHEMemory, t: float, y: np.ndarray, u: np.ndarray) -> State:
+        """Return the state after a sample, if the states of windows follow from their first one."""
         system, noise, window = self.system, self.noise, memory.exact
         assert window is not None
         window = window.extended(t, y, u)
-        if window.num_samples > self.window:
+        if len(window.samples) > self.window:
             window = window.shortened(system, noise)
         fit = window.fit(system, noise)
         # The trajectory from the previous first state ends at the prediction of this sample.

@@ -17,6 +17,8 @@ class OpenLoop(RecursiveEstimator):
     """The model integrated from x̂₀, without use of the outputs."""
 
     name = "open_loop"
+    template = "observer"
+    computes = ("xhat",)
     equations = r"""
 \dot{\hat x} &= f(t, \hat x, u), \qquad \hat x(t_0) = \hat x_0
 """

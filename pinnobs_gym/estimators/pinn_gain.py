@@ -4,7 +4,9 @@ only."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,11 +25,16 @@ from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.takes import EVERYTHING
+from pinnobs_gym.simulation.kernels.source import WIDEST
 from pinnobs_gym.simulation.matrices import mapped
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System, output_scale, vector
+
+if TYPE_CHECKING:
+    from pinnobs_gym.estimation.export.algorithm import Algorithm
+    from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,6 +93,7 @@ K'_{ij} &= K_{ij}\, 8^{\tanh(a_{ij} s_j)}
 \hat x_k &= \hat x_k^- + K' e_k, \qquad
 P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
 """
+    template = "learned_gain"
     needs_training = "pinn_gain"
     knows = ("model", "prior", "noise", "initial set")
 
@@ -142,3 +150,40 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         memory = np.where(np.isnan(y).all(axis=1), memory, new)  # a row without outputs is no step
         xhat = xhat + mapped(K, innovation)
         return State(xhat, t, u, innovation=innovation, memory=(fixed, memory))
+
+    def not_compiled(self) -> str:
+        if self.trained.variant == "gru":
+            return "its network is recurrent"
+        wide = self.trained.width > WIDEST
+        return f"its network is {self.trained.width} wide, more than {WIDEST}" if wide else ""
+
+    def plan_settings(self) -> dict[str, Any]:
+        parts = chain.from_iterable(self.trained.layers)
+        return {
+            "network": np.concatenate([np.ravel(part) for part in parts]),
+            "width": self.trained.width,
+            "scale": vector(self.system.scale, self.system.nx, "scale"),
+            "carried": self.system.ny,
+        }
+
+    def carried_memory(self, memory: Any) -> tuple[Any, dict[str, np.ndarray]]:
+        fixed, averages = memory
+        averages = np.array(averages, dtype=float, order="C")
+        return (fixed, averages), {"carried": averages}
+
+    def given_noise(self, memory: Any) -> np.ndarray | None:
+        return memory[0][1]
+
+    def memory_rows(self, memory: Any, rows: np.ndarray) -> Any:
+        (scale, R), averages = memory
+        R = R[..., rows] if R is not None and R.shape[-1] > 1 else R
+        return (scale, R), averages[:, rows]
+
+    def with_memory_rows(self, memory: Any, rows: np.ndarray, part: Any) -> Any:
+        fixed, averages = memory
+        averages = averages.copy()
+        averages[:, rows] = part[1]
+        return fixed, averages
+
+    def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
+        return None

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Range, State
-from pinnobs_gym.estimation.observer_gains import (
-    default_rate,
-    injection,
-    settling_gain,
-    time_since,
-)
-from pinnobs_gym.estimation.recursive import RecursiveEstimator
+from pinnobs_gym.estimation.constant_gain import ConstantGainObserver
+from pinnobs_gym.estimation.estimator import Range
+from pinnobs_gym.estimation.observer_gains import default_rate, settling_gain
 from pinnobs_gym.estimation.takes import EVERYTHING
-from pinnobs_gym.simulation.model import model_step
-from pinnobs_gym.simulation.record import Prior
 
 
 @dataclass(frozen=True)
-class SlidingMode(RecursiveEstimator):
+class SlidingMode(ConstantGainObserver):
     """The sliding-mode observer with a boundary layer (Slotine, Hedrick & Misawa 1987):
     x̂' = f(t, x̂, u) + L(e + ρ·sat(e/ε)), e = y − h(t, x̂, u).
 
@@ -43,6 +37,7 @@ class SlidingMode(RecursiveEstimator):
     """Width ε of the boundary layer in standard deviations of the output noise."""
 
     name = "sliding_mode"
+    template = "observer"
     knows = ("model", "prior", "noise", "initial set")
     exempt_from = {
         "noise_matrix": "its layer is as wide as each output's own noise",
@@ -68,25 +63,18 @@ K &= \Delta t\, L \operatorname{diag}(s)\, (I + \Delta t\, H L \operatorname{dia
             if value is not None and not 0 < value < np.inf:
                 raise ValueError(f"{name}={value}; expected a positive number")
 
-    def reset(self, prior: Prior) -> State:
+    def designed(self) -> np.ndarray:
+        """Return the gain L, shape (nx, ny), in state units per output unit and s.
+
+        Raises:
+            ValueError: in one line, if the design has no solution.
+        """
         rate = default_rate(self.system) if self.rate is None else self.rate
-        L = settling_gain(self.system, rate, 1 + self.switching)
-        return State(prior.mean.astype(float), memory=(L, None))
+        return settling_gain(self.system, rate, 1 + self.switching)
 
-    def predict(self, state: State, t: float, u: np.ndarray) -> State:
-        assert state.t is not None
-        xhat = model_step(self.system, state.t, t, state.xhat, state.u, u)
-        return State(xhat, state.t, state.u, memory=state.memory)
-
-    def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
-        xhat, (L, last) = state.xhat, state.memory
+    def secant(self, innovation: np.ndarray, t: float) -> np.ndarray:
         layer = self.layer * np.sqrt(np.einsum("iib->bi", self.noise.R(t)))
-        missing = np.isnan(y)
-        dt, last = time_since(last, t, missing)
-        innovation = self.system.output_residual(y, self.system.h(t, xhat, u))
-        innovation = np.where(missing, 0.0, innovation)
-        secant = 1 + self.switching / np.maximum(abs(innovation) / layer, 1.0)
-        H = np.asarray(self.system.h_jacobian(t, xhat, u))
-        K = injection(L, H, dt * secant)
-        xhat = xhat + (K @ innovation[..., None])[..., 0]
-        return State(xhat, t, u, innovation=innovation, memory=(L, last))
+        return 1 + self.switching / np.maximum(abs(innovation) / layer, 1.0)
+
+    def plan_settings(self) -> dict[str, Any]:
+        return super().plan_settings() | {"switching": self.switching, "layer": self.layer}

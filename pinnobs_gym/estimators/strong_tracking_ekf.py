@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from pinnobs_gym.estimation.square_root import prior_root
 from pinnobs_gym.estimation.wrapping import say_what_turns, wrapped_state
 from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import vector
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
     """Factor with which HPHᵀ is added to R."""
 
     name = "strong_tracking_ekf"
+    template = "ekf"
     exempt_from = {
         "sampled_noise": "an innovation ends the growth by the one before, however uncertain it is"
     }
@@ -81,11 +84,32 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R_k K^\top
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         # Rows without any output leave the growth to the next sample that has one.
         seen, sizes, R = ~np.isnan(y).all(axis=1), state.memory, self.noise.R(t, y)
-        growth = self.gamma * np.diag(np.square(self.system.scale))[..., None]
-        state = enlarged(state, growth * np.where(seen, sizes, 0.0))
+        growth = np.diag(self._growth())[..., None] * np.where(seen, sizes, 0.0)
+        state = enlarged(state, growth)
         P = covariances(state)
         say_what_turns(self.label, self.system, (t, y, u), state.xhat, P, R)
         innovation, H = observe(self.system, t, state.xhat, y, u)
         sizes = np.where(seen, squared_size(innovation, R) / self.system.ny, sizes)
         R = cautious(P, H, R, self.output_factor)
         return corrected(replace(state, memory=sizes), (t, u), P, innovation, H, R)
+
+    def _growth(self) -> np.ndarray:
+        """Return the variances (nx,) that an innovation of size 1 adds."""
+        return self.gamma * vector(self.system.scale, self.system.nx, "scale") ** 2
+
+    def plan_settings(self) -> dict[str, Any]:
+        return {"growth": self._growth(), "caution": self.output_factor, "carried": 1}
+
+    def carried_memory(self, memory: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        sizes = np.array(memory, dtype=float)
+        return sizes, {"carried": sizes}
+
+    def memory_rows(self, memory: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return memory[rows]
+
+    def with_memory_rows(
+        self, memory: np.ndarray, rows: np.ndarray, part: np.ndarray
+    ) -> np.ndarray:
+        sizes = memory.copy()
+        sizes[rows] = part
+        return sizes

@@ -18,6 +18,8 @@ from pinnobs_gym.simulation.truth import truth
 
 BATCHES = (1, 65, 1024)
 """Numbers of episodes of the truth."""
+PROCESS_NOISE = 0.01
+"""Process noise of the windows whose states are all unknown."""
 
 
 def main(name: str, repeats: str) -> None:
@@ -26,8 +28,7 @@ def main(name: str, repeats: str) -> None:
     found = {f"truth, {batch}": truth_time(source, batch, int(repeats)) for batch in BATCHES}
     record = repeated(name, 1, 61)
     for estimator in estimators(source):
-        window = f", window {estimator.window}" if isinstance(estimator, MHE) else ""
-        found[f"{estimator.label}{window}"] = update_time(estimator, record, int(repeats))
+        found[described(estimator)] = update_time(estimator, record, int(repeats))
     print(json.dumps(found))
 
 
@@ -41,7 +42,16 @@ def estimators(source: EpisodeSource) -> list[Estimator]:
             continue
         if isinstance(estimator, Estimator):
             made.append(estimator)
-    return [*made, MHE(source.system, window=20)]
+    noisy = MHE(source.system, process_noise=PROCESS_NOISE, window=20)
+    return [*made, MHE(source.system, window=20), noisy]
+
+
+def described(estimator: Estimator) -> str:
+    """Return the label of an estimator, of a moving horizon with its window and process noise."""
+    if not isinstance(estimator, MHE):
+        return estimator.label
+    noise = ", process noise" if estimator.noise.told.stochastic else ""
+    return f"{estimator.label}, window {estimator.window}{noise}"
 
 
 def update_time(estimator: Estimator, record: Record, repeats: int) -> float:

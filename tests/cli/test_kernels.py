@@ -45,16 +45,17 @@ def test_an_unknown_option_is_refused(folder, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+EKFS = "`ekf`, `robust_ekf`, `strong_tracking_ekf`"
+
+
 @needs_compiler
 def test_the_page_of_a_system_says_what_is_compiled():
-    assert "`ekf`, `robust_ekf`: compiled" in compiled(ReverseDuffing())
+    assert f"{EKFS}: compiled" in compiled(ReverseDuffing())
     stiff = type("Stiff", (ReverseDuffing,), {"stiff": True})
-    assert "`ekf`, `robust_ekf`: computed in NumPy: it is stiff" in compiled(stiff())
+    assert f"{EKFS}: computed in NumPy: it is stiff" in compiled(stiff())
 
 
 def test_without_a_compiler_the_page_says_so(monkeypatch):
     monkeypatch.delenv("PINNOBS_KERNELS", raising=False)
     monkeypatch.setattr("pinnobs_gym.simulation.kernels.plant_library.usable_compilers", lambda: [])
-    assert "`ekf`, `robust_ekf`: computed in NumPy: there is no C compiler" in compiled(
-        ReverseDuffing()
-    )
+    assert f"{EKFS}: computed in NumPy: there is no C compiler" in compiled(ReverseDuffing())

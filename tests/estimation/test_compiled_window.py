@@ -19,7 +19,8 @@ from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.induction_motor import InductionMotor
 
 pytestmark = needs_compiler
-EXACT = [plant for plant in many_plants.PLANTS if plant is not many_plants.escape]
+EXACT = [(plant, 0.0) for plant in many_plants.PLANTS if plant is not many_plants.escape]
+NOISY = [(plant, 0.05) for plant in many_plants.PLANTS]
 
 
 def in_numpy(estimator):
@@ -29,44 +30,49 @@ def in_numpy(estimator):
     return other
 
 
-def exact(system, record, **options):
-    """An estimator that is told that the model has no process noise."""
+def made(system, record, noise, **options):
+    """An estimator that is told of this process noise: without any, the states of a window follow
+    from its first one."""
     level = None if record.noise_std is None else SampledLevel(record.t, record.noise_std)
-    return MHE(system, level, 0.0, **options)
+    estimator = MHE(system, level, noise, **options)
+    assert estimator.compiled is not None, compiled_window(estimator)
+    return estimator
 
 
 @pytest.mark.parametrize("name", SYSTEMS.classes())
 @pytest.mark.parametrize("options", [{}, {"window": 4, "steps": 3}, {"window": 1}])
-def test_it_agrees_with_numpy_on_each_system(name, options):
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_it_agrees_with_numpy_on_each_system(name, options, noise):
     source = EpisodeSource(name)
-    record = record_of(source, 2).first_samples(40)
-    estimator = MHE.for_setup(source.system, source.setup, **options)
-    assert estimator.compiled is not None, compiled_window(estimator)
+    record = record_of(source, 2).first_samples(40 if noise == 0 else 20)
+    estimator = made(source.system, record, noise, **options)
     assert_near(estimator.run(record), in_numpy(estimator).run(record))
 
 
-@pytest.mark.parametrize("plant", EXACT)
-def test_it_agrees_with_numpy(plant):
+@pytest.mark.parametrize(("plant", "noise"), [*EXACT, *NOISY])
+def test_it_agrees_with_numpy(plant, noise):
     """Irregular times, missing outputs, maps, inputs, angles, bounds, tables, wide priors."""
     system, record = plant(7)
-    estimator = exact(system, record, window=5)
-    assert estimator.compiled is not None, compiled_window(estimator)
+    estimator = made(system, record, noise, window=5)
     assert_near(estimator.run(record), in_numpy(estimator).run(record))
 
 
 @pytest.mark.parametrize("plant", [many_plants.cart, many_plants.bounded_reactor])
-def test_a_row_is_the_same_alone_and_in_any_batch(plant):
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_a_row_is_the_same_alone_and_in_any_batch(plant, noise):
     system, record = plant(9)
-    whole = exact(system, record, window=5).run(record)
+    whole = made(system, record, noise, window=5).run(record)
     for rows in (np.arange(1), np.arange(3, 9), np.array([0, 2, 4, 6, 8])):
         part = record.rows(rows)
-        found = exact(system, part, window=5).run(part)
+        found = made(system, part, noise, window=5).run(part)
         for name in ("xhat", "P", "innovation", "S"):
             np.testing.assert_array_equal(getattr(found, name), getattr(whole, name)[rows])
 
 
-def test_either_goes_on_from_a_state_of_the_other():
-    estimator, record = MHE(Linear(), window=4), linear_record(3)
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_either_goes_on_from_a_state_of_the_other(noise):
+    record = linear_record(3)
+    estimator = made(Linear(), record, noise, window=4)
     other = in_numpy(estimator)
     whole = other.run(record)
     for first, second in ((estimator, other), (other, estimator)):
@@ -79,26 +85,24 @@ def test_either_goes_on_from_a_state_of_the_other():
         np.testing.assert_allclose(state.xhat, whole.xhat[:, -1], rtol=1e-9, atol=1e-12)
 
 
-def test_a_window_over_the_record_is_the_kalman_filter():
-    """Without process noise, full information of a linear plant is what the filter has."""
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_a_window_over_the_record_is_the_kalman_filter(noise):
+    """Full information of a linear plant is what the filter has."""
     record = linear_record(2)
-    estimator = MHE(Linear(), process_noise=0.0, assumed_noise=0.0, window=100)
+    options = {"process_noise": noise, "assumed_noise": 0.0}
+    estimator = MHE(Linear(), **options, window=100)
     assert estimator.compiled is not None
-    found = estimator.run(record)
-    expected = EKF(Linear(), process_noise=0.0, assumed_noise=0.0).run(record)
+    found, expected = estimator.run(record), EKF(Linear(), **options).run(record)
     np.testing.assert_allclose(found.xhat, expected.xhat, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(found.P, expected.P, rtol=1e-6, atol=1e-12)
+    for name in ("P", "S"):
+        a, b = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12)
 
 
-def test_a_plant_with_process_noise_has_windows_in_numpy():
-    estimator = MHE(Linear(), process_noise=0.1)
-    assert estimator.compiled is None
-    assert "process noise" in compiled_window(estimator)
-
-
-def test_inputs_that_the_plant_does_not_have_are_refused():
-    estimator = MHE.for_setup(*InductionMotor.configured())
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_inputs_that_the_plant_does_not_have_are_refused(noise):
     record = record_of(EpisodeSource("InductionMotor"), 1)
+    estimator = made(InductionMotor(), record, noise)
     state = estimator.reset(record.prior)
     for k in range(2):
         with pytest.raises(ValueError, match=r"is not that of InductionMotor\.input"):

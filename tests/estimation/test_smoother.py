@@ -1,5 +1,6 @@
 """The smoother that all share; against closed forms it stands in test_horizon_estimators."""
 
+import many_plants
 import numpy as np
 import pytest
 from linear import record_of
@@ -7,6 +8,7 @@ from linear import record_of
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.smoother import backward, flows, forward
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.record import Record
 
 
@@ -53,3 +55,16 @@ def test_caution_takes_smaller_steps():
     taken = [np.einsum("pib,ipb->b", f.H[0], f.K[0]) for f in (bold, careful)]
     # 1 / HK = 1 + R / HPHᵀ, and caution adds itself to R / HPHᵀ
     np.testing.assert_allclose(1 / taken[1], 1 / taken[0] + 0.5, rtol=1e-12)
+
+
+@pytest.mark.parametrize("plant", [many_plants.cart_with_joined_input, many_plants.henon])
+def test_a_step_is_the_same_whatever_other_steps_there_are(plant):
+    """At irregular times, over jumps of the model, and where an input meets the kink of a table."""
+    system, record = plant(2)
+    noise, t, u = EKF(system).noise, record.t, record.u.swapaxes(0, 1)
+    x = np.repeat(record.prior.mean[None], len(t), axis=0)
+    for k, (end, F, Q) in enumerate(zip(*flows(system, noise, t, x, u), strict=True)):
+        alone = model_step_moments(system, noise, t[k], t[k + 1], x[k], u[k], u[k + 1])
+        for found, expected in zip((end, F, Q), alone, strict=True):
+            expected = np.broadcast_to(expected, found.shape)
+            np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)

@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from learned_gains import gain_of
 from linear import Linear, Modulated, fed_through
 
 from pinnobs_gym.envs.episodes import EpisodeSource
@@ -17,16 +18,14 @@ from pinnobs_gym.estimation.kalman import update_with
 from pinnobs_gym.estimation.learned.gain_network import (
     Variant,
     memory_size,
-    shapes,
     update_with_network,
 )
-from pinnobs_gym.estimation.learned.trained_file import identity
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.estimators.pinn_gain import PinnGain, TrainedGain
+from pinnobs_gym.estimators.pinn_gain import PinnGain
 from pinnobs_gym.simulation.conformance import CheckFailed
 from pinnobs_gym.simulation.model import model_step_jacobian
 from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System, output_scale
+from pinnobs_gym.simulation.system import output_scale
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from pinnobs_gym.training.loop import train as run
@@ -43,32 +42,6 @@ SMALL = PinnGainConfig(
 def train(system, config, *, record, noise_std=None, **options):
     """What comes of a training."""
     return run(PinnGainTrainer(system, config, record=record, noise_std=noise_std), **options)
-
-
-def gain_of(system: System, size: float = 0.0, variant: str = "kalman", noise_std=None) -> PinnGain:
-    """A gain of random weights, those of the last layer times a size."""
-    rng = np.random.default_rng(5)
-    sizes = shapes(variant, system.nx, system.ny, 8)
-    layers = [[rng.standard_normal(s) / 2, rng.standard_normal(s[0]) / 2] for s in sizes]
-    layers[-1] = [size * a for a in layers[-1]]
-    benchmark = system.setups["benchmark"].noise_std
-    told = noise_std or tuple(np.broadcast_to(benchmark, system.ny).tolist())
-    about = {n: identity(system)[n] for n in ("system", "parameters")}
-    trained = TrainedGain(
-        **about,
-        trainer="pinn_gain",
-        layers=tuple(map(tuple, layers)),
-        variant=variant,
-        noise_std=told,
-        config={},
-        seed=0,
-        loss=1.0,
-        iterations=0,
-        seconds=0.0,
-        ending="finished",
-        condition="nominal",
-    )
-    return PinnGain(system, told, trained=trained)
 
 
 def played(name, seeds, duration=None, **changes):

@@ -62,8 +62,8 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
     found = estimator.exported(code, prior)
     if found is None:
         raise ValueError(
-            f"estimator {estimator.label!r} is not exported; expected ekf, robust_ekf, ukf, ckf, "
-            "luenberger, or a KKL observer"
+            f"estimator {estimator.label!r} is not exported; expected ekf, robust_ekf, "
+            "strong_tracking_ekf, ukf, ckf, luenberger, or a KKL observer"
         )
     source = _filled(_source(estimator, prior, found, code), found.places)
     check_name(name, [source, own("replay.c")])

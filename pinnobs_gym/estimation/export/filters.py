@@ -1,4 +1,5 @@
-"""The Kalman filters that run by templates: the extended, the unscented and the cubature filter."""
+"""The Kalman filters that run by templates: the extended and the strong-tracking, the unscented and
+the cubature filter."""
 
 from __future__ import annotations
 
@@ -60,7 +61,13 @@ def filter_code(estimator: RecursiveEstimator, code: PlantCode, prior: Prior) ->
         places = {
             "restart": _RESTART,
             "before": _BEFORE,
-            "after": "filter->beyond = (int32_t)memory.beyond[0];\n    ",
+            "after": "filter->beyond = (int32_t)memory.carried[0];\n    ",
+        }
+    elif settings.get("carried"):
+        fields.append("@real@ size; /* of the last innovation, e' R^-1 e / NY */")
+        places |= {
+            "before": "memory.carried[0] = filter->size;\n    ",
+            "after": "filter->size = memory.carried[0];\n    ",
         }
     ekf = cls.template != _SIGMA_POINTS
     angles = "angles.c" if ekf and system.state_period is not None else "no_angles.c"
@@ -80,6 +87,6 @@ def filter_code(estimator: RecursiveEstimator, code: PlantCode, prior: Prior) ->
 _RESTART = """memcpy(filter->P_restart, filter->P, sizeof filter->P);
     for (int i = 0; i < NX; i++) filter->P_restart[i * (NX + 1)] += restart_variance[i];
     """
-_BEFORE = """memory.beyond[0] = filter->beyond;
+_BEFORE = """memory.carried[0] = filter->beyond;
     memcpy(memory.P_restart, filter->P_restart, sizeof memory.P_restart);
     """

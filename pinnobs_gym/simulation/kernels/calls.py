@@ -30,6 +30,10 @@ class PlanStructure(ctypes.Structure):
         *(("state_period", _POINTER), ("output_period", _POINTER)),
         *(("low", _POINTER), ("high", _POINTER)),
         *(("gate", _POINTER), ("patience", _INT), ("huber", _DOUBLE)),
+        *(("growth", _POINTER), ("caution", _DOUBLE)),
+        *(("network", _POINTER), ("width", _INT), ("scale", _POINTER)),
+        *(("theta", _DOUBLE), ("per_scale", _POINTER)),
+        *(("switching", _DOUBLE), ("layer", _DOUBLE), ("carried", _INT)),
         *((name, _POINTER) for name in ("points", "weights", "roots")),
         ("num_points", _INT),
     ]
@@ -42,13 +46,16 @@ class CallStructure(ctypes.Structure):
         *(("plan", _POINTER), ("batch", _INT), ("samples", _INT)),
         *((name, _POINTER) for name in ("t", "y", "u", "x", "P", "innovation", "S")),
         *((name, _POINTER) for name in ("t_before", "u_before", "x_before", "P_before")),
-        *((name, _POINTER) for name in ("beyond", "x_predicted", "P_predicted", "F", "Q")),
+        *((name, _POINTER) for name in ("carried", "gain", "x_predicted", "P_predicted", "F", "Q")),
     ]
 
 
-def address(array: np.ndarray) -> int:
-    """Return the address of an array's first entry."""
-    return array.ctypes.data
+def address(array: Any) -> int:
+    """Return the address of an array's first entry, faster than NumPy if it is contiguous."""
+    try:
+        return ctypes.addressof(ctypes.c_double.from_buffer(array))
+    except (TypeError, ValueError, BufferError):
+        return array.ctypes.data
 
 
 def plant_numbers(system: System, numbers: Sequence[str]) -> np.ndarray:

@@ -130,7 +130,7 @@ class ModelKernel:
         call.end, call.end_point, call.end_row, call.end_state = start, batch, 1, points * batch
         call.F = start + 8 * ends[0]
         if m:
-            call.L, call.m, call.Q = _address(L), m, start + 8 * ends[1]
+            call.L, call.m, call.Q = address(L), m, start + 8 * ends[1]
         self._move(ctypes.addressof(call))
         del kept
         F = buffer[ends[0] : ends[1]].reshape(nx, nx, batch)
@@ -163,7 +163,7 @@ class ModelKernel:
                 steps = (*draws.strides[:3],)
                 steps = (8 * 0 if n == 1 else s for n, s in zip(draws.shape, steps, strict=False))
                 call.draws_step, call.draws_point, call.draws_row = (s // 8 for s in steps)
-                call.L, call.m, call.draws = _address(L), m, _address(draws)
+                call.L, call.m, call.draws = address(L), m, address(draws)
                 if self._box is not None:
                     call.low, call.high = address(self._box.low), address(self._box.high)
         end = np.empty_like(x)
@@ -209,7 +209,7 @@ class ModelKernel:
             times = 0.0, 0.0, address(kept[0]), address(kept[1])
         elif not self._usual_times(t0, t1):
             return None, None
-        states = _address(x), *_strides(x.strides, x.shape)
+        states = address(x), *_strides(x.strides, x.shape)
         inputs: Any = None, None, 0, 0, 0
         if self._input:
             joined = self._input == 2
@@ -221,7 +221,7 @@ class ModelKernel:
                 u0, u1 = kept_u = np.ascontiguousarray(u0), np.ascontiguousarray(u1)
                 kept = kept, kept_u
             strides = _strides(u0.strides, u0.shape)
-            inputs = _address(u0), _address(u1) if joined else None, *strides
+            inputs = address(u0), address(u1) if joined else None, *strides
         return _Moved(self._at, points, batch, *times, *states, *inputs), kept
 
     def _own_times(self, t0: Any, t1: Any, batch: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -259,7 +259,7 @@ class ModelKernel:
 
 
 def _set_end(call: _Moved, end: np.ndarray) -> None:
-    call.end = _address(end)
+    call.end = address(end)
     call.end_point, call.end_row, call.end_state = _strides(end.strides, end.shape)
 
 
@@ -272,11 +272,3 @@ def _strides(strides: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, int
         point, row = (s // 8 if n > 1 else 0 for s, n in zip(strides, shape[:2], strict=False))
         return point, row, strides[2] // 8
     return 0, 0, strides[0] // 8
-
-
-def _address(array: Any) -> int:
-    """Return the address of an array's first entry, faster than NumPy if it is contiguous."""
-    try:
-        return ctypes.addressof(ctypes.c_double.from_buffer(array))
-    except (TypeError, ValueError, BufferError):
-        return array.ctypes.data

@@ -16,6 +16,9 @@ _WIDE_ALONE = 4
 """The number where the code for one lane is not compiled: a single episode takes little longer in
 four lanes, but half as long again in eight."""
 
+WIDEST = 256
+"""Largest number of neurons in a layer of a network in compiled code."""
+
 
 @dataclass(frozen=True)
 class _Parts:
@@ -42,18 +45,35 @@ _OF_SETS = ("given_inputs.c", "streams.c", "members.c", "members_moments.c", "me
 
 def _parts(template: str) -> _Parts:
     """Return the files of an algorithm."""
-    if template in ("truth", "model"):
-        once = coefficients() if template == "truth" else ""
-        return _Parts((f"{template}_entry.c",), (f"{template}.c",), once=once)
-    if template == "smoother":
-        lanes = "filter_rows.c", "smoother.c"
-        return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED", _WIDE_ALONE)
-    if template in _SETS:
-        return _Parts((*_OF_SETS, *_SETS[template]), ())
-    if template == "window":
-        entries = "given_inputs.c", "window_entry.c"
-        return _Parts(entries, (), template, read("window.h"), _WIDE_ALONE)
-    return _Parts(("given_inputs.c", "filter.c"), ("filter_rows.c",), template)
+    filters, windows = ("given_inputs.c", "filter.c"), ("given_inputs.c", "window_entry.c")
+    rows = ("filter_rows.c",)
+    match template:
+        case "truth":
+            return _Parts(("truth_entry.c",), ("truth.c",), once=coefficients())
+        case "model":
+            return _Parts(("model_entry.c",), ("model.c",))
+        case "smoother":
+            lanes = *rows, "smoother.c"
+            return _Parts(("smoother_entry.c",), lanes, "ekf", "#define SMOOTHED", _WIDE_ALONE)
+        case "window":
+            once = read("window.h")
+            return _Parts(windows, ("window.c",), "window_samples", once, _WIDE_ALONE)
+        case "moving_window":
+            lanes = "roots.c", "linear_window.c", "moving_window.c"
+            return _Parts(windows, lanes, "window_samples", read("window.h"), _WIDE_ALONE)
+        case "observer":
+            once = f"#define OBSERVER\n#define CARRIED NY\n{read('solve.c')}"
+            return _Parts(filters, rows, template, once)
+        case "high_gain":
+            once = "#define FORGETTING\n#define CARRIED (4 + NX * NX)"
+            return _Parts(filters, ("forgetting.c", *rows), "ekf", once)
+        case "learned_gain":
+            once = f"#define CARRIED NY\n#define WIDEST {WIDEST}"
+            return _Parts(filters, rows, template, once)
+        case "ensemble" | "particles":
+            return _Parts((*_OF_SETS, *_SETS[template]), ())
+        case _:
+            return _Parts(filters, rows, template)
 
 
 def library_source(plant: PlantCode, template: str) -> str:

@@ -17,6 +17,7 @@ from pinnobs_gym.estimators.ckf import CKF
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.luenberger import Luenberger
 from pinnobs_gym.estimators.robust_ekf import RobustEKF
+from pinnobs_gym.estimators.strong_tracking_ekf import StrongTrackingEKF
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.system import Setup, System, stack
 from pinnobs_gym.systems import SYSTEMS
@@ -101,7 +102,12 @@ def test_a_plant_with_many_states(kind, tmp_path):
 
 @pytest.mark.parametrize(
     "estimator",
-    [EKF(Linear(), gate=0.9, patience=2), RobustEKF(Linear()), EKF(Linear(), huber=0.5)],
+    [
+        EKF(Linear(), gate=0.9, patience=2),
+        RobustEKF(Linear()),
+        EKF(Linear(), huber=0.5),
+        StrongTrackingEKF(Linear(), gamma=1e-2, output_factor=0.5),
+    ],
 )
 def test_gate_and_weights(estimator, tmp_path):
     record = linear_record(1)

@@ -15,8 +15,8 @@ static inline void mark_outside(const struct plan *plan, const real *x, int64_t 
 static inline void restart(const struct plan *plan, const real *H, const real *R, real *P, real *HP,
                            real *S, struct memory *memory)
 {
-    if (memory->beyond[0] < plan->patience) return;
-    memory->beyond[0] = 0;
+    if (memory->carried[0] < plan->patience) return;
+    memory->carried[0] = 0;
     memcpy(P, memory->P_restart, sizeof memory->P_restart);
     output_moments(H, P, R, HP, S);
 }

@@ -68,6 +68,15 @@ struct plan {
     const double *gate;       /* bounds of the NIS, (NY + 1,), or NULL */
     int64_t patience;
     double huber;             /* 0 for none */
+    const double *growth;     /* variances (NX,) that P grows by at an innovation of size 1, or NULL */
+    double caution;           /* factor with which H P H^T is added to R */
+    const double *network;    /* weights and biases of a learned gain, layer by layer, or NULL */
+    int64_t width;            /* number of neurons of its layers */
+    const double *scale;      /* (NX,) of the states, or NULL */
+    double theta;             /* rate of forgetting in 1/s */
+    const double *per_scale;  /* (NX,) scale^-2 of the states, or NULL */
+    double switching, layer;  /* of a sliding mode: ratio to the layer, and its width in deviations */
+    int64_t carried;          /* number of entries of ``carried`` of filter.h that are in use */
     /* sigma-point filters; at most 2 NX + 1 points */
     const double *points;     /* (num_points, NX) for the standard normal distribution */
     const double *weights;    /* (num_points,) in means */

@@ -1,4 +1,6 @@
-/* The extended Kalman filter, as pinnobs_gym/estimators/ekf.py says. */
+/* The extended Kalman filter, as pinnobs_gym/estimators/ekf.py says, and the strong-tracking one of
+   strong_tracking_ekf.py. ``carried`` of the one is the number of samples in a row beyond the gate,
+   that of the other the size e^T R^-1 e / NY of the last innovation. */
 
 /* The prediction: x moves by the model, and P by its linearisation. */
 static inline void AT_WIDTH(predict)(const struct interval *over, lanes *restrict x,
@@ -6,6 +8,33 @@ static inline void AT_WIDTH(predict)(const struct interval *over, lanes *restric
 {
     (void)bad;
     AT_WIDTH(move_moments)(over, x, P, NULL);
+}
+
+/* Add to P what the last innovation makes it grow by, at samples with any output. */
+static inline void AT_WIDTH(grow)(const struct plan *plan, const lanes *restrict y,
+                                  const lanes *restrict size, lanes *restrict P)
+{
+    lanes seen;
+    EACH_LANE seen[l] = 0;
+    for (int i = 0; i < NY; i++) EACH_LANE seen[l] = y[i][l] == y[i][l] ? 1 : seen[l];
+    for (int i = 0; i < NX; i++)
+        EACH_LANE P[i * NX + i][l] += plan->growth[i] * (seen[l] != 0 ? size[0][l] : 0);
+}
+
+/* Find the size of an innovation; a sample without any output leaves that of the last one. */
+static inline void AT_WIDTH(remember)(const struct sample *restrict s, lanes *restrict size,
+                                      int64_t *restrict bad)
+{
+    lanes Re[NY], sum, seen;
+    EACH_LANE sum[l] = seen[l] = 0;
+    for (int i = 0; i < NY; i++) EACH_LANE Re[i][l] = s->e[i][l];
+    AT_WIDTH(divide)(1, s->R, Re, bad);
+    for (int i = 0; i < NY; i++)
+        EACH_LANE {
+            sum[l] += Re[i][l] * s->e[i][l];
+            seen[l] = s->y[i][l] == s->y[i][l] ? 1 : seen[l];
+        }
+    EACH_LANE size[0][l] = seen[l] != 0 ? sum[l] / NY : size[0][l];
 }
 
 /* Correct x and P by the outputs of a sample. Lanes that NumPy has to correct are marked in
@@ -17,18 +46,12 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
     lanes *const y = s->y, *const e = s->e, *const R = s->R, *const S = s->S;
     lanes H[NY * NX], HP[NY * NX];
     double rest[W];
-    /* Innovation e = y - h and H; both are zero for missing outputs. */
-    AT_WIDTH(plant_h_linearised)(s->t, x, s->u, p, e, H);
-    for (int i = 0; i < NY; i++) {
-        EACH_LANE e[i][l] = y[i][l] - e[i][l];
-        if (plan->output_period && plan->output_period[i])
-            EACH_LANE e[i][l] = wrapped(e[i][l], plan->output_period[i]);
-        EACH_LANE e[i][l] = y[i][l] != y[i][l] ? 0 : e[i][l];
-        for (int j = 0; j < NX; j++)
-            EACH_LANE H[i * NX + j][l] = y[i][l] != y[i][l] ? 0 : H[i * NX + j][l];
-    }
+    if (plan->growth) AT_WIDTH(grow)(plan, y, memory->carried, P);
+    AT_WIDTH(observe)(plan, p, x, s, H);
     AT_WIDTH(output_moments)(H, P, R, HP, S);
+#ifndef FORGETTING /* such an observer has nothing to say of angles */
     AT_WIDTH(mark_wide)(plan, P, S, bad);
+#endif
     if (plan->gate) { /* restart after too many samples in a row beyond it, of lanes in NumPy */
         lanes Se[NY];
         for (int i = 0; i < NY; i++) EACH_LANE Se[i][l] = e[i][l];
@@ -40,9 +63,10 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
                 present += y[i][l] == y[i][l];
                 nis += Se[i][l] * e[i][l];
             }
-            if (present) memory->beyond[l] = nis <= plan->gate[present] ? 0 : memory->beyond[l] + 1;
+            if (present)
+                memory->carried[0][l] = nis <= plan->gate[present] ? 0 : memory->carried[0][l] + 1;
 #ifndef RESTARTS
-            bad[l] |= memory->beyond[l] >= plan->patience;
+            bad[l] |= memory->carried[0][l] >= plan->patience;
 #endif
         }
 #ifdef RESTARTS
@@ -62,6 +86,16 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
                     S[i * NY + j][l] += more - R[i * NY + j][l];
                     R[i * NY + j][l] = more;
                 }
+    }
+    if (plan->growth) AT_WIDTH(remember)(s, memory->carried, bad);
+    if (plan->caution) { /* R = R + caution H P H^T */
+        lanes HPH[NY * NY];
+        AT_WIDTH(symmetric)(NY, NX, HP, H, HPH);
+        for (int i = 0; i < NY * NY; i++)
+            EACH_LANE {
+                R[i][l] += plan->caution * HPH[i][l];
+                S[i][l] += plan->caution * HPH[i][l];
+            }
     }
     AT_WIDTH(kalman_update)(H, HP, S, R, e, x, P, rest);
     EACH_LANE bad[l] |= (rest[l] != 0) & !memory->lost[l];

@@ -13,13 +13,13 @@ static struct call later(const struct call *c, int64_t k)
     part.y += rows * NY;
     part.u += rows * NU;
     part.x += rows * NX;
-    part.P += rows * NX * NX;
-    part.innovation += rows * NY;
-    part.S += rows * NY * NY;
+    part.P += rows * PP;
+    if (part.innovation) part.innovation += rows * NY;
+    part.S += rows * SS;
     part.t_before = part.t - 1;
     part.u_before = part.u - c->batch * NU;
     part.x_before = part.x - c->batch * NX;
-    part.P_before = part.P - c->batch * NX * NX;
+    part.P_before = part.P - c->batch * PP;
     return part;
 }
 
@@ -40,7 +40,7 @@ static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t
    written, before the next samples. */
 int64_t run(const struct call *c, int64_t *reached)
 {
-    const int64_t entries = c->batch * (NX + NX * NX + NY + NY * NY);
+    const int64_t entries = c->batch * (NX + PP + NY + SS);
     const int64_t fitting = entries ? CACHED / entries : 0, block = fitting < 8 ? 8 : fitting;
     int64_t left = 0;
     for (int64_t row = 0; row < c->batch; row++) reached[row] = c->samples;
@@ -89,8 +89,8 @@ int64_t update(const struct plan *plan, int64_t batch, int64_t first, double t, 
                const double *u, double *to, const double *from, const struct call *more)
 {
     double *const to_y = to + 1, *const to_u = to_y + NY * batch, *const x = to_u + NU * batch,
-                  *const P = x + NX * batch, *const e = P + NX * NX * batch,
-                  *const S = e + NY * batch, *const end = S + NY * NY * batch;
+                  *const P = x + NX * batch, *const e = P + PP * batch,
+                  *const S = e + NY * batch, *const end = S + SS * batch;
     struct call c = {0};
     if (more) c = *more;
     c.plan = plan;

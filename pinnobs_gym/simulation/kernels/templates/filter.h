@@ -9,11 +9,23 @@ struct sample {
     lanes t, y[NY], u[LU], R[NY * NY], e[NY], S[NY * NY];
 };
 
-/* What is known of W rows beside x and P: the number of samples in a row beyond the gate, and
+/* What is known of W rows beside x and P: what the algorithm remembers from sample to sample, and
    whether x and P are NaN throughout. */
+#ifndef CARRIED
+#define CARRIED 1
+#endif
+#ifdef OBSERVER /* it has no covariances: the numbers of entries that are loaded and stored */
+#define PP 0
+#define SS 0
+#else
+#define PP (NX * NX)
+#define SS (NY * NY)
+#endif
 #define memory AT_WIDTH(memory)
 struct memory {
-    int64_t beyond[W], lost[W];
+    lanes carried[CARRIED];
+    const double *gain;
+    int64_t lost[W];
 #ifdef RESTARTS
     lanes P_restart[NX * NX]; /* covariances with which the gate restarts a filter */
 #endif
@@ -26,6 +38,22 @@ static inline void AT_WIDTH(leave_out_missing)(const lanes *restrict y, lanes *r
         for (int j = 0; j < NY; j++)
             if (i != j)
                 EACH_LANE if (y[i][l] != y[i][l] || y[j][l] != y[j][l]) R[i * NY + j][l] = 0;
+}
+
+/* Find innovations and output Jacobians of a sample at x, zero for missing outputs. */
+static inline void AT_WIDTH(observe)(const struct plan *plan, const lanes *restrict p,
+                                     const lanes *restrict x, struct sample *restrict s,
+                                     lanes *restrict H)
+{
+    AT_WIDTH(plant_h_linearised)(s->t, x, s->u, p, s->e, H);
+    for (int i = 0; i < NY; i++) {
+        EACH_LANE s->e[i][l] = s->y[i][l] - s->e[i][l];
+        if (plan->output_period && plan->output_period[i])
+            EACH_LANE s->e[i][l] = wrapped(s->e[i][l], plan->output_period[i]);
+        EACH_LANE s->e[i][l] = s->y[i][l] != s->y[i][l] ? 0 : s->e[i][l];
+        for (int j = 0; j < NX; j++)
+            EACH_LANE H[i * NX + j][l] = s->y[i][l] != s->y[i][l] ? 0 : H[i * NX + j][l];
+    }
 }
 
 /* Mark the lanes in which P (n, n) is finite and its factor L is not: it has none. */

@@ -18,8 +18,8 @@ struct call {
     const double *u_before;   /* (NU, batch) */
     const double *x_before;   /* (NX, batch) */
     const double *P_before;   /* (NX, NX, batch) */
-    /* EKF with a gate */
-    int64_t *beyond;          /* (batch,) samples in a row beyond the gate */
+    double *carried;          /* (plan->carried, batch) what an algorithm remembers, or NULL */
+    const double *gain;       /* (NX, NY) of an observer, or NULL */
     /* results of the forward pass of a smoother, or NULL; innovation and S are then NULL */
     double *x_predicted;      /* (samples, NX, batch) */
     double *P_predicted;      /* (samples, NX, NX, batch) */
@@ -47,7 +47,7 @@ static inline void AT_WIDTH(find_lost)(const lanes *restrict x, const lanes *res
     EACH_LANE {
         lost[l] = 1;
         for (int i = 0; i < NX; i++) lost[l] &= x[i][l] != x[i][l];
-        for (int i = 0; i < NX * NX; i++) lost[l] &= P[i][l] != P[i][l];
+        for (int i = 0; i < PP; i++) lost[l] &= P[i][l] != P[i][l];
     }
 }
 
@@ -106,10 +106,11 @@ SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count
     int64_t bad[W];
     EACH_LANE bad[l] = 0;
     for (int l = 0; l < count; l++) reached[l] = c->samples;
-    EACH_LANE own.beyond[l] = plan->gate ? c->beyond[row + MIN(l, count - 1)] : 0;
+    own.gain = c->gain;
+    AT_WIDTH(load)(plan->carried, c->carried, batch, row, count, own.carried);
     AT_WIDTH(load)(NP, plan->p, plan->p_rows ? batch : 0, row, count, p);
     AT_WIDTH(load)(NX, c->x_before, batch, row, count, x);
-    AT_WIDTH(load)(NX * NX, c->P_before, batch, row, count, P);
+    AT_WIDTH(load)(PP, c->P_before, batch, row, count, P);
     AT_WIDTH(find_lost)(x, P, own.lost);
     if (c->t_before) AT_WIDTH(load)(NU, c->u_before, batch, row, count, over.u1);
     for (int64_t k = 0; k < c->samples; k++) {
@@ -128,18 +129,25 @@ SEPARATE void AT_WIDTH(filter_rows)(const struct call *c, int64_t row, int count
         AT_WIDTH(store)(NX, x, c->x_predicted + k * NX * batch, batch, row, count);
         AT_WIDTH(store)(NX * NX, P, c->P_predicted + k * NX * NX * batch, batch, row, count);
 #else
+#ifdef FORGETTING
+        if (before) AT_WIDTH(forget)(&over, x, P, &own);
+#endif
         if (before) AT_WIDTH(predict)(&over, x, P, bad);
 #endif
         AT_WIDTH(correct)(plan, p, &now, x, P, &own, bad);
+#ifdef FORGETTING
+        AT_WIDTH(note_size)(plan, &now, P, &own);
+#endif
 #ifndef SMOOTHED
-        AT_WIDTH(store)(NY, now.e, c->innovation + k * NY * batch, batch, row, count);
-        AT_WIDTH(store)(NY * NY, now.S, c->S + k * NY * NY * batch, batch, row, count);
+        if (c->innovation)
+            AT_WIDTH(store)(NY, now.e, c->innovation + k * NY * batch, batch, row, count);
+        AT_WIDTH(store)(SS, now.S, c->S + k * SS * batch, batch, row, count);
 #endif
         if (AT_WIDTH(note_bad)(bad, k, c->samples, reached, count)) return;
         AT_WIDTH(store)(NX, x, c->x + k * NX * batch, batch, row, count);
-        AT_WIDTH(store)(NX * NX, P, c->P + k * NX * NX * batch, batch, row, count);
-        if (plan->gate)
+        AT_WIDTH(store)(PP, P, c->P + k * PP * batch, batch, row, count);
+        for (int i = 0; i < plan->carried; i++)
             for (int l = 0; l < count; l++)
-                if (!bad[l]) c->beyond[row + l] = own.beyond[l];
+                if (!bad[l]) c->carried[i * batch + row + l] = own.carried[i][l];
     }
 }

@@ -15,33 +15,6 @@ struct fit {
     struct sample last;
 };
 
-/* Find innovations and output Jacobians of a sample at x, zero for missing outputs. */
-static inline void AT_WIDTH(observe)(const struct plan *plan, const lanes *restrict p,
-                                     const lanes *restrict x, struct sample *restrict s,
-                                     lanes *restrict H)
-{
-    AT_WIDTH(plant_h_linearised)(s->t, x, s->u, p, s->e, H);
-    for (int i = 0; i < NY; i++) {
-        EACH_LANE s->e[i][l] = s->y[i][l] - s->e[i][l];
-        if (plan->output_period && plan->output_period[i])
-            EACH_LANE s->e[i][l] = wrapped(s->e[i][l], plan->output_period[i]);
-        EACH_LANE s->e[i][l] = s->y[i][l] != s->y[i][l] ? 0 : s->e[i][l];
-        for (int j = 0; j < NX; j++)
-            EACH_LANE H[i * NX + j][l] = s->y[i][l] != s->y[i][l] ? 0 : H[i * NX + j][l];
-    }
-}
-
-/* a - b for states, of which those that repeat are within half a period */
-static inline void AT_WIDTH(state_residual)(const struct plan *plan, const lanes *restrict a,
-                                            const lanes *restrict b, lanes *restrict difference)
-{
-    for (int i = 0; i < NX; i++) {
-        EACH_LANE difference[i][l] = a[i][l] - b[i][l];
-        if (plan->state_period && plan->state_period[i])
-            EACH_LANE difference[i][l] = wrapped(difference[i][l], plan->state_period[i]);
-    }
-}
-
 /* Move x over an interval, and derivatives Phi of it. */
 static inline void AT_WIDTH(move_linearised)(const struct interval *over, lanes *restrict x,
                                              lanes *restrict Phi)
@@ -66,30 +39,6 @@ static inline void AT_WIDTH(move_linearised)(const struct interval *over, lanes 
         AT_WIDTH(product)(NX, NX, NX, F, Phi, first);
         memcpy(Phi, first, sizeof first);
     }
-}
-
-/* Set the interval between two samples. */
-static inline void AT_WIDTH(set_interval)(const struct window *c, int64_t k,
-                                          const struct sample *before, const struct sample *now,
-                                          struct interval *over)
-{
-    over->t0 = c->t[k - 1];
-    over->t1 = c->t[k];
-    memcpy(over->u0, before->u, sizeof over->u0);
-    memcpy(over->u1, now->u, sizeof over->u1);
-}
-
-static inline void AT_WIDTH(load_sample)(const struct window *c, int64_t k, int64_t row, int count,
-                                         struct sample *s)
-{
-    const struct plan *plan = c->plan;
-    const int64_t own = plan->R_rows ? c->batch : 0;
-    EACH_LANE s->t[l] = c->t[k];
-    AT_WIDTH(load)(NY, c->y + k * NY * c->batch, c->batch, row, count, s->y);
-    AT_WIDTH(load)(NU, c->u + k * NU * c->batch, c->batch, row, count, s->u);
-    AT_WIDTH(load)(NY * NY, plan->R + k * plan->R_samples * NY * NY * (own ? own : 1), own, row,
-                   count, s->R);
-    AT_WIDTH(leave_out_missing)(s->y, s->R);
 }
 
 /* Take the first sample out of the window: the prior is updated with it, with the output linearised

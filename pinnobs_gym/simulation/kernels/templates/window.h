@@ -1,5 +1,7 @@
 /* The arrays of a call of a moving window, with the batch as the last axis. The window has the
-   samples before and, as the last one, a new sample. */
+   samples before and, as the last one, a new sample. Of windows whose states are all unknown, P is
+   the lower triangular root of the covariance, and ``start`` has the states at all samples but the
+   new one, ``start_after`` those of the window after it. */
 #ifndef WINDOW
 #define WINDOW
 struct window {
