@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.leaderboard.jobs.time_limit import TIME_LIMIT
 from pinnobs_gym.scoring.floor import run_floor
 
 EPISODES = 10
@@ -40,6 +41,11 @@ class FloorJob:
         system, condition = self.game.name.system, self.game.name.condition
         last = self.seed + self.episodes - 1
         return f"floor of {system}, {condition}, episodes {self.seed} to {last}"
+
+    @property
+    def time_limit(self) -> float:
+        """Longest time in s that it may take in a worker."""
+        return TIME_LIMIT
 
     def run(self) -> None:
         """Compute the missing rows and append them."""
