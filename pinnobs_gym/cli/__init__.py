@@ -10,8 +10,10 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import resources
 from io import TextIOWrapper
+from typing import NoReturn
 
 from pinnobs_gym.cli import commands
+from pinnobs_gym.cli.ending import end
 from pinnobs_gym.leaderboard.jobs.stopping import Stopped, stop_line
 from pinnobs_gym.registry import error_line
 
@@ -51,6 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0 if arguments else 2
     return guarded(lambda: _run(arguments[0], arguments[1:]))
+
+
+def program() -> NoReturn:
+    """Run the command of this process and end it; see `main`."""
+    status = main()
+    end(status)
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:

@@ -31,8 +31,8 @@ _TORCH_SEED = 67280421310721  # that with which torch begins when it is imported
 class Leftovers:
     """What a job leaves running in its process."""
 
-    threads = False
-    """Whether there are threads for which the process would wait at its end."""
+    running = False
+    """Whether there are processes, or threads for which this process would wait at its end."""
 
 
 @contextmanager
@@ -54,13 +54,26 @@ def isolated() -> Iterator[Leftovers]:
                 os._exit(0)
             for child in _children() - children:
                 child.kill()
-            left.threads = any(not each.daemon for each in set(threading.enumerate()) - threads)
+            new = set(threading.enumerate()) - threads
+            left.running = any(not each.daemon for each in new) or _is_parent()
 
 
 def _children() -> set[Any]:
     """Return the running processes that multiprocessing has started here."""
     module: Any = sys.modules.get("multiprocessing")
     return set() if module is None else set(module.active_children())
+
+
+def _is_parent() -> bool:
+    """Return whether this process has children of any kind, False where that is not known."""
+    wait: Any = getattr(os, "waitid", None)
+    if wait is None:
+        return False
+    try:
+        wait(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
 
 
 class _Uncloseable:

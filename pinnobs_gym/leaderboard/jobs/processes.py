@@ -9,16 +9,17 @@ from __future__ import annotations
 import os
 import re
 from concurrent.futures import Future
+from functools import cache
 from types import TracebackType
-from typing import NamedTuple
 
 from loky import BrokenProcessPool, ProcessPoolExecutor
+from loky.backend.resource_tracker import ensure_running
 
 from pinnobs_gym.leaderboard.jobs.interface import Origin, Outcome, Parcel, PicklableJob
 from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkerLost, WorkersLost
 from pinnobs_gym.leaderboard.jobs.stopping import ignoring_ctrl_c
 from pinnobs_gym.leaderboard.jobs.worker import attempt
-from pinnobs_gym.leaderboard.jobs.worker_process import begin, end_group
+from pinnobs_gym.leaderboard.jobs.worker_process import Guard, begin, end_group
 
 IDLE = 300
 """Seconds after which idle workers exit; the next run may reuse them until then."""
@@ -33,16 +34,50 @@ ONE_THREAD = dict.fromkeys(
     "1",
 )
 """Environment of the workers: one thread per numerical library."""
-_IDLE_WORKERS: list[ProcessPoolExecutor] = []
-"""The workers of earlier runs of this process, each an executor of one process."""
 
 
-class _Busy(NamedTuple):
-    """A worker with a job."""
+class _Worker:
+    """A worker process, as an executor of one process."""
 
-    executor: ProcessPoolExecutor
-    processes: list[int]
-    """Ids of its processes: one, unless it is being replaced."""
+    def __init__(self) -> None:
+        self.executor = ProcessPoolExecutor(1, timeout=IDLE, initializer=begin, env=ONE_THREAD)
+        self._processes: set[int] = set()
+
+    def submit(self, number: int, parcel: Parcel, origin: Origin, guard: Guard) -> Future[Outcome]:
+        """Submit a job; see `attempt`."""
+        future = self.executor.submit(attempt, number, parcel, origin)
+        for process in set(self.executor._processes) - self._processes:  # it is new, or replaced
+            self._processes.add(process)
+            guard.watch(process)
+        return future
+
+    def end_processes(self, guard: Guard) -> None:
+        """Kill its process, and what that has started."""
+        for process in self._processes:
+            end_group(process)
+            guard.forget(process)
+
+
+_IDLE_WORKERS: list[_Worker] = []
+"""The workers of earlier runs of this process."""
+
+
+@cache
+def _guard(client: int) -> Guard:
+    """Start the processes beside the workers, and return the guard of this process, whose id is
+    given, as a fork has none."""
+    before = os.environ.get("PYTHONWARNINGS")
+    # loky's resource tracker frees what a killed client leaves, and would warn of it.
+    quiet = "ignore:resource_tracker:UserWarning"
+    os.environ["PYTHONWARNINGS"] = f"{before},{quiet}" if before else quiet
+    try:
+        ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
+    return Guard()
 
 
 class ProcessPool(Pool):
@@ -56,34 +91,35 @@ class ProcessPool(Pool):
 
     def __init__(self, size: int) -> None:
         self.size = self.queued = size
-        self._busy: dict[Future[Outcome], _Busy] = {}
+        self._guard = _guard(os.getpid())
+        self._busy: dict[Future[Outcome], _Worker] = {}
 
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future[Outcome]:
         parcel = Parcel.of(job)
         with ignoring_ctrl_c():  # inherited by new workers
             while True:
-                executor = _IDLE_WORKERS.pop() if _IDLE_WORKERS else _new_worker()
+                worker = _IDLE_WORKERS.pop() if _IDLE_WORKERS else _Worker()
                 try:
-                    future = executor.submit(attempt, number, parcel, origin)
+                    future = worker.submit(number, parcel, origin, self._guard)
                 except BrokenProcessPool:  # it was killed while it was idle
                     continue
                 except OSError as error:
                     raise WorkersLost(f"no process can be started: {error}") from None
-                self._busy[future] = _Busy(executor, list(executor._processes))
+                self._busy[future] = worker
                 return future
 
     def outcome(self, future: Future[Outcome]) -> Outcome:
-        busy = self._busy.pop(future)
+        worker = self._busy.pop(future)
         try:
             outcome = future.result()
         except BrokenProcessPool as death:
-            _end([busy])  # what it started is still there
+            self._end([worker])  # what it started is still there
             codes = re.search(r"\{.*\}", str(death))  # such as {SIGKILL(-9)}
             raise WorkerLost(f"exit codes {codes[0]}" if codes else str(death)) from None
         if outcome.leftovers:
-            _end([busy])
+            self._end([worker])
         else:
-            _IDLE_WORKERS.append(busy.executor)
+            _IDLE_WORKERS.append(worker)
         return outcome
 
     def __exit__(
@@ -93,23 +129,13 @@ class ProcessPool(Pool):
         trace: TracebackType | None,
     ) -> None:
         if kind is not None:
-            idle = [_Busy(each, list(each._processes)) for each in _IDLE_WORKERS]
+            self._end([*self._busy.values(), *_IDLE_WORKERS])
             _IDLE_WORKERS.clear()
-            _end([*self._busy.values(), *idle])
 
-
-def _new_worker() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(
-        1, timeout=IDLE, initializer=begin, initargs=(os.getpid(),), env=ONE_THREAD
-    )
-
-
-def _end(workers: list[_Busy]) -> None:
-    """End workers and all that they have started, at once."""
-    for worker in workers:
-        for process in worker.processes:
-            end_group(process)
-    for worker in workers:
-        worker.executor.shutdown(wait=False, kill_workers=True)
-    for worker in workers:
-        worker.executor.shutdown(kill_workers=True)
+    def _end(self, workers: list[_Worker]) -> None:
+        """End workers and all that they have started, at once."""
+        for worker in workers:
+            worker.end_processes(self._guard)
+        for wait in (False, True):
+            for worker in workers:
+                worker.executor.shutdown(wait, kill_workers=True)

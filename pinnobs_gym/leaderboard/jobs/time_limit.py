@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import re
+import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,6 +62,12 @@ def exceeded(path: Path, within: str) -> str | None:
     for thread in re.split(r"\n(?=Thread |Current thread )", trace):
         calls = re.findall(r'File "(.*)", line (\d+) in (.*)', thread)
         if any(file.endswith(within) for file, _, _ in calls):
-            file, line, function = calls[0]
+            own = [call for call in calls if not _is_library(call[0])]
+            file, line, function = (own or calls)[0]
             message += f"; it was in {function} ({Path(file).name}, line {line})"
     return message
+
+
+def _is_library(file: str) -> bool:
+    """Return whether a file is of Python or of an installed package."""
+    return "site-packages" in file or file.startswith(sysconfig.get_path("stdlib"))

@@ -119,7 +119,7 @@ def run_isolated(job: PicklableJob) -> Outcome:
             raise
         except Exception as second:  # of a plug-in whose name cannot be told, say
             error += f"; this could not be recorded: {error_line(second)}"
-    return Outcome(error, seconds=seconds, leftovers=left.threads)
+    return Outcome(error, seconds=seconds, leftovers=left.running)
 
 
 def _note(number: int, outcome: Outcome, mark: Path) -> None:
@@ -144,7 +144,7 @@ def _prepare(origin: Origin) -> None:
     if (here, os.getpid()) == (origin.host, origin.pid):
         return
     if origin.children and os.name != "posix" and not is_held(origin.mark):
-        os._exit(1)  # the client was killed; see `worker_process` for other systems
+        os._exit(1)  # the client was killed, which has no guard here
     _one_thread()
     if origin.folder not in sys.path:
         sys.path.append(origin.folder)  # to import module:Class from the user's folder

@@ -1,30 +1,24 @@
 """A worker process of this machine: how it begins, and how it ends with all that it started.
 
 On POSIX systems a worker leads a process group, so that the processes that a plug-in has started
-are ended with it. A worker also ends within a second after its client was killed, which cannot end
-it then.
+are ended with it, and a `Guard` ends it if the client is killed.
 """
 
 from __future__ import annotations
 
 import os
 import signal
-import threading
-import time
+import subprocess
+import sys
 from contextlib import suppress
+from pathlib import Path
 
-LOOK = 0.5
-"""Seconds between two checks that the client lives."""
+_GUARD = Path(__file__).with_name("guard_process.py")
 
 
-def begin(client: int) -> None:
-    """Prepare this process, a child of the client: it ignores Ctrl-C, since the client handles it
-    and stops workers; it prints to standard error, as standard output is for results; and it reads
-    no input.
-
-    Args:
-        client: process id of the client.
-    """
+def begin() -> None:
+    """Prepare this process: it ignores Ctrl-C, since the client handles it and stops workers; it
+    prints to standard error, as standard output is for results; and it reads no input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
@@ -34,14 +28,6 @@ def begin(client: int) -> None:
     if os.name == "posix":
         with suppress(OSError):  # it leads one already
             os.setpgid(0, 0)
-        threading.Thread(target=_end_with, args=(client,), daemon=True).start()
-
-
-def _end_with(client: int) -> None:
-    """End this process group once the client is no longer its parent, which then was killed."""
-    while os.getppid() == client:
-        time.sleep(LOOK)
-    os.killpg(0, signal.SIGKILL)
 
 
 def end_group(process: int) -> None:
@@ -50,3 +36,39 @@ def end_group(process: int) -> None:
     if os.name == "posix":
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process, signal.SIGKILL)
+
+
+class Guard:
+    """Ends workers if this process is killed; see `pinnobs_gym.leaderboard.jobs.guard_process`."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        if os.name == "posix":
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", str(_GUARD)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
+                cwd="/",
+            )
+
+    def watch(self, process: int) -> None:
+        """Let a worker end with this process."""
+        self._tell(f"+{process}\n")
+
+    def forget(self, process: int) -> None:
+        """Let a worker, which has ended, be."""
+        self._tell(f"-{process}\n")
+
+    def _tell(self, line: str) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # it was killed
+                self._process.stdin.write(line.encode())
+                self._process.stdin.flush()
+
+    def close(self) -> None:
+        """End the guard, and with it the workers that it still watches."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+            self._process.wait()
