@@ -286,8 +286,7 @@ def error_line(error: BaseException) -> str:
         text = "".join(c if c.isprintable() else " " for c in format(str(error), ""))
     except BaseException:
         text = "an error without a readable text"
-    line = " ".join(f"{kind}: {text}".split()).removesuffix(":")
-    return line[:1000].encode("utf-8", "replace").decode()
+    return " ".join(f"{kind}: {text}".split()).removesuffix(":")[:1000]
 
 
 def _discard_stale_neighbours(module: str) -> None:

@@ -70,4 +70,5 @@ def exceeded(path: Path, within: str) -> str | None:
 
 def _is_library(file: str) -> bool:
     """Return whether a file is of Python or of an installed package."""
-    return "site-packages" in file or file.startswith(sysconfig.get_path("stdlib"))
+    library = sysconfig.get_path("stdlib"), "<"  # parts of Python are frozen
+    return "site-packages" in file or file.startswith(library)

@@ -6,6 +6,7 @@ are ended with it, and a `Guard` ends it if the client is killed.
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import subprocess
@@ -42,6 +43,7 @@ class Guard:
     """Ends workers if this process is killed; see `pinnobs_gym.leaderboard.jobs.guard_process`."""
 
     def __init__(self) -> None:
+        self._watched: set[int] = set()
         self._process: subprocess.Popen[bytes] | None = None
         if os.name == "posix":
             self._process = subprocess.Popen(
@@ -51,13 +53,16 @@ class Guard:
                 start_new_session=True,
                 cwd="/",
             )
+            atexit.register(self._close)
 
     def watch(self, process: int) -> None:
         """Let a worker end with this process."""
+        self._watched.add(process)
         self._tell(f"+{process}\n")
 
     def forget(self, process: int) -> None:
         """Let a worker, which has ended, be."""
+        self._watched.discard(process)
         self._tell(f"-{process}\n")
 
     def _tell(self, line: str) -> None:
@@ -66,8 +71,10 @@ class Guard:
                 self._process.stdin.write(line.encode())
                 self._process.stdin.flush()
 
-    def close(self) -> None:
-        """End the guard, and with it the workers that it still watches."""
+    def _close(self) -> None:
+        """End the guard; by then all workers have ended."""
+        for process in list(self._watched):
+            self.forget(process)
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):
                 self._process.stdin.close()
