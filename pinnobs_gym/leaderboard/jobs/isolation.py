@@ -43,7 +43,7 @@ def isolated() -> Iterator[Leftovers]:
     Yields what remains to be known of it, which is set at the end of the context.
     """
     left, process = Leftovers(), os.getpid()
-    threads, children = set(threading.enumerate()), _children()
+    threads, children, parent = set(threading.enumerate()), _children(), _is_parent()
     with ExitStack() as stack:
         for part in (_streams, _signals, _random_states, _torch, _settings):
             stack.enter_context(part())
@@ -55,7 +55,8 @@ def isolated() -> Iterator[Leftovers]:
             for child in _children() - children:
                 child.kill()
             new = set(threading.enumerate()) - threads
-            left.running = any(not each.daemon for each in new) or _is_parent()
+            left.running = any(not each.daemon for each in new)
+            left.running |= not parent and _is_parent()
 
 
 def _children() -> set[Any]:
