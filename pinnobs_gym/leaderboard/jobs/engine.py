@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -76,7 +76,7 @@ class Engine:
         """The running jobs, assumed to be those submitted first of all unfinished ones."""
         return list(self._under_way.values())[: self.processes]
 
-    def run(self, jobs: Sequence[PicklableJob]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[PicklableJob]) -> Generator[Ended, None, None]:
         """Run jobs in this order, and yield each as it ends.
 
         Raises:
