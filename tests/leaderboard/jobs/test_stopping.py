@@ -34,6 +34,13 @@ class Exits(EKF):
 
     def run(self, record):
         sys.exit(0)
+
+
+class Unmade(EKF):
+    name = "unmade"
+
+    def __post_init__(self):
+        sys.exit(0)
 '''
 
 
@@ -46,7 +53,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_terminated_leaderboard_keeps_its_rows_and_says_so_in_one_line(folder, capsys):
-    names = ["ekf", "asking_module:Asks", "open_loop"]
+    own = [f"asking_module:{name}" for name in ("Exits", "Unmade", "Asks")]
+    names = ["ekf", *own, "open_loop"]
     played = ["--systems", "ReverseDuffing", "--condition", "nominal", "--episodes", "1"]
     command = ["leaderboard", *played, "--jobs", "1", "--out", "lb", "--estimators", *names]
     assert main(command) == 143
@@ -54,7 +62,8 @@ def test_a_terminated_leaderboard_keeps_its_rows_and_says_so_in_one_line(folder,
     assert printed == "pinnobs: stopped by SIGTERM; what was written is kept\n"
     stored = rows.load(folder / "lb" / "rows.jsonl")
     assert [row["estimator"] for row in stored.rows] == ["ekf"]
-    assert stored.failures == []
+    failed = [(row["estimator"], row["error"]) for row in stored.failures]
+    assert failed == [("exits", "SystemExit: 0"), ("unmade", "SystemExit: 0")]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
