@@ -120,11 +120,12 @@ def test_a_killed_worker_ends_nothing(folder, started, undisturbed):
 
 def test_a_killed_client_loses_nothing_that_was_finished(folder, started, undisturbed, capsys):
     client = started(*COMMAND, "--jobs", "2")
-    held(folder)
+    at_work = held(folder)
     path = folder / "lb" / "rows.jsonl"
     until(lambda: path.exists() and len(rows.read(path)) == 4)  # of open_loop and ekf
     client.kill()
     client.wait()
+    until(lambda: not running(at_work))
     before = rows.read(path)
     (folder / "go").touch()
     assert again(folder) == 0
