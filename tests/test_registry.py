@@ -91,9 +91,7 @@ def test_a_plug_in_that_is_named_is_loaded_alone(tmp_path, monkeypatch):
     fresh = made("pinnobs_gym.systems")
     assert fresh.resolve("Decay").__module__ == "one_plug_in"
     assert not {"broken_plug_in", "other_plug_in"} & set(sys.modules)
-    with pytest.warns(
-        UserWarning, match="plug-in 'broken' is left out: RuntimeError: imported"
-    ):
+    with pytest.warns(UserWarning, match="plug-in 'broken' is left out: RuntimeError: imported"):
         assert fresh.resolve("Growth").__module__ == "other_plug_in"
     for name in ("one_plug_in", "other_plug_in"):
         del sys.modules[name]
