@@ -93,10 +93,12 @@ class Registry(Generic[T]):
                 break
             try:
                 classes.append(self.register(point.load()))
-            except Exception as error:  # whatever another package raises
-                warnings.warn(
-                    f"{self._kind} plug-in {point.name!r} is left out: {error}", stacklevel=2
-                )
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # whatever another package raises
+                line = error_line(error)
+                message = f"{self._kind} plug-in {point.name!r} is left out: {line}"
+                warnings.warn(message, stacklevel=2)
         return classes
 
     def register(self, cls: type[T]) -> type[T]:
@@ -197,7 +199,9 @@ class Registry(Generic[T]):
             if module not in sys.modules:
                 _discard_stale_neighbours(module)
             return self.register(getattr(importlib.import_module(module), name))
-        except Exception as error:  # whatever the user's module raises
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # whatever the user's module raises, such as SystemExit
             for cls in self._known.values():  # a class defined in a function or a notebook's cell
                 if (cls.__module__, cls.__qualname__) == (module, name):
                     return cls
@@ -207,8 +211,7 @@ class Registry(Generic[T]):
                     "a function, a notebook or the main guard has defined; expected a class at "
                     "the top level of a module"
                 ) from None
-            kind = type(error).__name__
-            raise ValueError(f"cannot load {self._kind} {spec!r}: {kind}: {error}") from error
+            raise ValueError(f"cannot load {self._kind} {spec!r}: {error_line(error)}") from error
 
     def _owner(self, name: str) -> tuple[str, str] | None:
         """Return the module and qualified name of the class with this name, or None."""
@@ -226,11 +229,11 @@ class Registry(Generic[T]):
         origin = self.sources[name].module
         try:
             module = importlib.import_module(origin)
-        except Exception as error:  # whatever the file raises
-            kind = type(error).__name__
-            raise ValueError(
-                f"cannot load {self._kind} {name!r} from {origin}: {kind}: {error}"
-            ) from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # whatever the file raises
+            message = f"cannot load {self._kind} {name!r} from {origin}: {error_line(error)}"
+            raise ValueError(message) from error
         for cls in vars(module).values():
             if (
                 self._is_concrete(cls)
@@ -267,6 +270,23 @@ def discard_stale_bytecode(source: Path) -> bool:
     except (OSError, SyntaxError, ValueError, EOFError, TypeError, NotImplementedError):
         return False  # without a compiled file, or one that Python does not take
     return True
+
+
+def error_line(error: BaseException) -> str:
+    """Return the kind and the text of an error in one line of at most 1000 printable characters.
+
+    The methods of an error that a plug-in defines may themselves raise anything; this function
+    never does.
+    """
+    try:
+        kind = str(type(error).__name__)
+    except BaseException:  # of a metaclass
+        kind = "an error without a name"
+    try:
+        text = "".join(c if c.isprintable() else " " for c in format(str(error), ""))
+    except BaseException:
+        text = "an error without a readable text"
+    return " ".join(f"{kind}: {text}".split()).removesuffix(":")[:1000]
 
 
 def _discard_stale_neighbours(module: str) -> None:

@@ -91,7 +91,7 @@ def test_a_plug_in_that_is_named_is_loaded_alone(tmp_path, monkeypatch):
     fresh = made("pinnobs_gym.systems")
     assert fresh.resolve("Decay").__module__ == "one_plug_in"
     assert not {"broken_plug_in", "other_plug_in"} & set(sys.modules)
-    with pytest.warns(UserWarning, match="system plug-in 'broken' is left out: imported"):
+    with pytest.warns(UserWarning, match="plug-in 'broken' is left out: RuntimeError: imported"):
         assert fresh.resolve("Growth").__module__ == "other_plug_in"
     for name in ("one_plug_in", "other_plug_in"):
         del sys.modules[name]
@@ -249,3 +249,11 @@ def test_registering_twice_is_harmless():
     env = gym.make("pinnobs/Academic-v0")
     observation, _ = env.reset(seed=0)
     assert np.isfinite(observation).all()
+
+
+def test_a_module_that_exits_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "exiting_module.py").write_text("import sys\nsys.exit(0)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    line = r"cannot load system 'exiting_module:Plant': SystemExit: 0"
+    with pytest.raises(ValueError, match=line):
+        made("pinnobs_gym.systems").resolve("exiting_module:Plant")

@@ -10,12 +10,20 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import resources
 from io import TextIOWrapper
+from typing import NoReturn
 
 from pinnobs_gym.cli import commands
+from pinnobs_gym.cli.ending import end
 from pinnobs_gym.leaderboard.display import one_line, show_messages_printable, words_of
+from pinnobs_gym.leaderboard.jobs.stopping import Stopped, stop_line
+from pinnobs_gym.registry import error_line
 
 COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 """Names of the commands."""
+
+
+class HelpShown(SystemExit):
+    """The help of a command was printed."""
 
 
 def usage() -> str:
@@ -39,13 +47,19 @@ def usage() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 for success, 1 if a job failed or an unexpected
-    error occurred, 2 for invalid input, 130 after Ctrl-C."""
+    error occurred, 2 for invalid input, 130 after Ctrl-C, 143 after SIGTERM."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     _print_anything()
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
         return 0 if arguments else 2
     return guarded(lambda: _run(arguments[0], arguments[1:]))
+
+
+def program() -> NoReturn:
+    """Run the command of this process and end it; see `main`."""
+    status = main()
+    end(status)
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:
@@ -83,12 +97,23 @@ def guarded(command: Callable[[], int]) -> int:
     except Exception as error:  # a fault of a plug-in or of this package
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
-        what = f"{one_line(type(error).__name__)}: {words_of(error)}"
-        print(f"pinnobs: error: {what} (PINNOBS_TRACEBACK=1 shows where)", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("pinnobs: stopped; what was written is kept", file=sys.stderr)
-        return 130
+        return _fault(error)
+    except HelpShown:
+        raise
+    except SystemExit as error:  # of a plug-in
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        return _fault(error)
+    except KeyboardInterrupt as stop:
+        print(stop_line(stop), file=sys.stderr)
+        return stop.status if isinstance(stop, Stopped) else 130
+
+
+def _fault(error: BaseException) -> int:
+    """Print what a plug-in or this package raised, and return the exit status."""
+    line = f"pinnobs: error: {error_line(error)} (PINNOBS_TRACEBACK=1 shows where)"
+    print(line, file=sys.stderr)
+    return 1
 
 
 def _print_anything() -> None:

@@ -1,8 +1,6 @@
 """``python -m pinnobs_gym.cli``: the command `pinnobs`."""
 
-import sys
-
-from pinnobs_gym.cli import main
+from pinnobs_gym.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -17,6 +17,7 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
+from pinnobs_gym.cli import HelpShown
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.hints import field_hints, fits, in_words
 
@@ -40,8 +41,8 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
             options |= {"config": (tyro.conf.OmitArgPrefixes,)}
             return tyro.cli(kind, prog=f"pinnobs {command}", args=arguments, **options)
     except SystemExit as end:
-        if not end.code:  # help was printed
-            raise
+        if not end.code:
+            raise HelpShown(0) from None
     message = _first_of(errors.getvalue()).removeprefix("Error parsing config: ")
     raise ValueError(f"{message}; see pinnobs {command} --help") from None
 

@@ -21,6 +21,7 @@ from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.truth import disturbed_truth, noise_shape, truth
+from pinnobs_gym.simulation.value_shape import of_shape
 from pinnobs_gym.systems import SYSTEMS
 
 _DRAWS = 64
@@ -198,7 +199,7 @@ class EpisodeSource:
                 "within which estimates are kept; scores are worse for it"
             )
         y[:] = self.noise.outputs(self.times, draws.noise.swapaxes(0, 1))
-        y += plant.h(self.times[:, None], x, u)
+        y += of_shape(plant, "h", plant.h(self.times[:, None], x, u), y.shape)
         if not self.trivial:
             sent = Outputs(self.times, y, noise_scale(self.system, self.setup))
             y[:] = self.condition.outputs(sent, rngs)

@@ -260,30 +260,19 @@ class Estimator(BaseEstimator):
 
     def run(self, record: Record) -> Estimates:
         """Return the estimates for a batch of records, from one `update` per sample."""
-        state = self._state_from("reset", self.reset(record.prior))
+        state = self.reset(record.prior)
         columns: dict[str, np.ndarray] = {}
         update = type(self).update
         update = getattr(update, "unchecked", update)  # the record is checked as a whole
         y, u = np.moveaxis(record.y, 1, 0).copy(), np.moveaxis(record.u, 1, 0).copy()
         with np.errstate(all="ignore"):  # diverged rows are marked by their non-finite values
             for k, t in enumerate(record.t):
-                state = self._state_from("update", update(self, state, float(t), y[k], u[k]))
+                state = update(self, state, float(t), y[k], u[k])
                 if k == 0:
                     columns = _empty_columns(state, record.num_samples)
                 for name, column in columns.items():
                     column[k] = getattr(state, name)
         return Estimates(**{name: np.moveaxis(c, 0, 1) for name, c in columns.items()})
-
-    def _state_from(self, method: str, state: Any) -> State:
-        """Return the result of a method, and check that it is a `State`.
-
-        Raises:
-            TypeError: in one line, if it is not.
-        """
-        if not isinstance(state, State):
-            name, kind = type(self).__name__, type(state).__name__
-            raise TypeError(f"{name}.{method} returned {kind}; expected a State")
-        return state
 
 
 @dataclass(frozen=True)

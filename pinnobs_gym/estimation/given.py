@@ -17,6 +17,7 @@ import numpy as np
 from numpy import vdot as _square
 
 from pinnobs_gym.estimation.projection import kept_inside
+from pinnobs_gym.estimation.returned import checked_estimates, checked_state
 from pinnobs_gym.simulation.noise import SampledLevel
 from pinnobs_gym.simulation.record import Prior, Record, check_use
 from pinnobs_gym.simulation.system import System
@@ -26,8 +27,8 @@ _FLOAT = np.dtype(float)
 
 
 def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method ``run(record)`` with `Record.check_fits` before it, and `kept_inside` after
-    it if the system's states have bounds.
+    """Return the method ``run(record)`` with `Record.check_fits` before it, and after it
+    `checked_estimates` and, if the system's states have bounds, `kept_inside`.
 
     Where the record has noise by sample, the method is that of an estimator which is told this
     noise.
@@ -41,6 +42,7 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
             self = replace(self, noise_std=level)
         self.ask_model()
         result, box = run(self, record), self.system.state_box
+        result = checked_estimates(self, result, record.batch, record.num_samples)
         return result if box is None else kept_inside(result, box)
 
     return checked
@@ -48,20 +50,20 @@ def checked_run(run: Callable[..., Any]) -> Callable[..., Any]:
 
 def checked_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
     """Return the method ``reset(prior)`` with `Prior.check_fits` before it, which also asks for the
-    compiled code that updates need."""
+    compiled code that updates need, and `checked_state` after it."""
 
     @wraps(reset)
     def checked(self: Any, prior: Prior) -> Any:
         prior.check_fits(self.system, len(prior.mean))
         self.ask_model()
-        return reset(self, prior)
+        return checked_state(self, "reset", reset(self, prior), len(prior.mean), None, None)
 
     return checked
 
 
 def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
     """Return the method ``update(state, t, y, u)`` with a check of the sample before it, and
-    `kept_inside` after it if the system's states have bounds.
+    after it `checked_state` and, if the system's states have bounds, `kept_inside`.
 
     The sample has to be what `Record` and `Record.check_fits` accept: a later time, a whole number
     if the system is a map, outputs that are finite or NaN, finite inputs, and those that the system
@@ -73,7 +75,7 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(update)
     def unchecked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
-        return _inside(self.system, update(self, state, t, y, u))
+        return _checked(self, state, t, len(y), update(self, state, t, y, u))
 
     @wraps(update)
     def checked(self: Any, state: Any, t: float, y: np.ndarray, u: np.ndarray) -> Any:
@@ -100,19 +102,21 @@ def checked_update(update: Callable[..., Any]) -> Callable[..., Any]:
         by_code = getattr(self, "compiled", None) is not None
         if ((nu and not system.measured_input) or system.discrete) and not by_code:
             check_use(system, np.array([t], dtype=float), np.asarray(u, dtype=float)[:, None])
-        return _inside(system, update(self, state, t, y, u))
+        return _checked(self, state, t, batch, update(self, state, t, y, u))
 
     checked.unchecked = unchecked  # pyright: ignore[reportAttributeAccessIssue]
     return checked
 
 
-def _inside(system: System, state: Any) -> Any:
-    """Return a state with its estimates within the system's bounds."""
-    box = system.state_box
-    # Compiled code has found the estimates of its states inside.
-    if box is None or getattr(state, "packed", None) is not None:
+def _checked(estimator: Any, before: Any, t: float, batch: int, state: Any) -> Any:
+    """Return the state after a sample of so many rows, checked, and with its estimates within the
+    system's bounds."""
+    # Compiled code returns arrays of these shapes, and has found the estimates inside.
+    if getattr(state, "packed", None) is not None:
         return state
-    return kept_inside(state, box)
+    state = checked_state(estimator, "update", state, batch, t, before)
+    box = estimator.system.state_box
+    return state if box is None else kept_inside(state, box)
 
 
 def _check_sample(

@@ -13,6 +13,7 @@ from pinnobs_gym.simulation.matrices import divide, identity, mapped, outer, pro
 from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import Array, System
+from pinnobs_gym.simulation.value_shape import of_shape
 
 
 def predict(
@@ -55,7 +56,8 @@ def observe(
         y: outputs, shape (batch, ny); NaN marks a missing output.
         u: inputs at the sample, shape (batch, nu).
     """
-    innovation = system.output_residual(y, system.h(t, xhat, u))
+    yhat = of_shape(system, "h", system.h(t, xhat, u), y.shape)
+    innovation = system.output_residual(y, yhat)
     H = system.h_jacobian(t, xhat, u).transpose(1, 2, 0)
     missing = np.isnan(y)
     if np.count_nonzero(missing):  # several times faster than any() for small arrays

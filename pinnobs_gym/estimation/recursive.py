@@ -86,8 +86,8 @@ class RecursiveEstimator(Estimator):
         """Return the state after the sample at time t by `predict` and `correct`, which compiled
         code has to agree with; see `update`."""
         if state.t is not None:
-            state = self._state_from("predict", self.predict(state, t, u))
-        return self._state_from("correct", self.correct(state, t, y, u))
+            state = _state_from(self, "predict", self.predict(state, t, u))
+        return _state_from(self, "correct", self.correct(state, t, y, u))
 
     @cached_property
     def compiled(self) -> Compiled | None:
@@ -136,3 +136,15 @@ class RecursiveEstimator(Estimator):
     def with_memory_rows(self, memory: Any, rows: np.ndarray, part: Any) -> Any:
         """Return the memory with that of some rows of the batch replaced."""
         return memory
+
+
+def _state_from(estimator: RecursiveEstimator, method: str, state: Any) -> State:
+    """Return the result of a method, and check that it is a `State`.
+
+    Raises:
+        TypeError: in one line, if it is not.
+    """
+    if not isinstance(state, State):
+        name, kind = type(estimator).__name__, type(state).__name__
+        raise TypeError(f"{name}.{method} returned {kind}; expected a State")
+    return state

@@ -52,7 +52,7 @@ def words_of(error: BaseException) -> str:
         words = one_line(str(error)) or type(error).__name__
         half = _LONGEST // 2
         return words if len(words) <= _LONGEST else f"{words[:half]} ... {words[-half:]}"
-    except Exception:
+    except BaseException:  # a plug-in's own method may raise anything
         return f"{one_line(type(error).__name__)} without a message that can be read"
 
 

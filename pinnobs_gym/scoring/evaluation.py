@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from operator import itemgetter
@@ -75,6 +75,12 @@ class Results:
         stored = (row for row in wanted if stored_key(row) in self.known)
         return {rows_module.key(row): row for row in stored}
 
+    def is_ahead(self, stored: Iterable[Row], date: str) -> bool:
+        """Return whether a row of other code may be later than a date, as after a clock has gone
+        back."""
+        known = [] if self.last_use is None else self.last_use.games.values()
+        return any(each > date for each in (*known, *(row.get("date", "") for row in stored)))
+
     def note_use(self, common: Row) -> None:
         """Append that the code of these rows is the present one, if other code was used later."""
         last_use = self.last_use
@@ -83,7 +89,7 @@ class Results:
             last_use = LastUse.of([*stored.rows, *stored.uses])
         if not last_use.is_last(common):
             used = {name: common[name] for name in NEEDED["use"] if name in common}
-            use = {"schema": SCHEMA, "kind": "use", **used, "date": now()}
+            use = {"schema": SCHEMA, "kind": "use", **used, "date": now(last_use.latest)}
             rows_module.append(self.path, [use])
 
 
@@ -256,6 +262,7 @@ def score_episodes(
     stored = {} if results is None else results.stored(wanted)
     missing = [row for row in wanted if rows_module.key(row) not in stored]
     first_played = None
+    noted = results is not None and (not missing or results.is_ahead(stored.values(), now()))
     for first in range(0, len(missing), size):
         batch = missing[first : first + size]
         played = play_batch([rows_module.seed_of(row) for row in batch])
@@ -271,7 +278,7 @@ def score_episodes(
         stored.update({rows_module.key(row): row for row in done})
         if progress is not None:
             progress(len(done))
-    if results is not None and not missing:
+    if results is not None and noted:
         results.note_use(common)
     rows = [stored[rows_module.key(row)] for row in wanted]
     return Evaluated(rows, first_played, len(wanted) - len(missing))

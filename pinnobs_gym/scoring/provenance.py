@@ -9,7 +9,7 @@ import math
 import platform
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import Any
 from uuid import uuid4
@@ -145,6 +145,11 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **installed}
 
 
-def now() -> str:
-    """Return the date and time (UTC) in the format of rows."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
+def now(after: str = "") -> str:
+    """Return the date and time (UTC) in the format of rows, but a later one than another date, also
+    if the clock has gone back since."""
+    date = datetime.now(UTC)
+    if after >= date.isoformat(timespec="milliseconds"):
+        last = datetime.fromisoformat(after)
+        date = (last if last.tzinfo else last.replace(tzinfo=UTC)) + timedelta(milliseconds=1)
+    return date.isoformat(timespec="milliseconds")

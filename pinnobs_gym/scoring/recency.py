@@ -47,6 +47,11 @@ class LastUse:
             {key: variant for key, variant in self.variants.items() if key[0] == game},
         )
 
+    @property
+    def latest(self) -> str:
+        """The latest date; empty if there is none."""
+        return max(self.games.values(), default="")
+
     def newest_game(self, game: GameName) -> str:
         """Return the ``game_hash`` that was used last."""
         dates = {code: date for (other, code), date in self.games.items() if other == game}

@@ -6,7 +6,7 @@ import gc
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import FileIO
 from operator import itemgetter
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from pinnobs_gym.envs.game import GameName
 from pinnobs_gym.files import CannotWrite, json_line, locked, replacing, write_whole
+from pinnobs_gym.scoring.failures import Failures
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.scoring.present import Present, present_in
 from pinnobs_gym.scoring.row_format import KEY, LOG_FILES, OPTIONAL, SCHEMA, Row, checked
@@ -55,6 +56,8 @@ class Stored(NamedTuple):
     """A warning about the file, or an empty string."""
     uses: list[Row] = []
     """The rows of kind ``use``, in the order of the file."""
+    recovered: Mapping[str, str] = {}
+    """When each job that had failed succeeded last, by ``job``."""
 
 
 key: Callable[[Row], tuple[Any, ...]] = itemgetter(*KEY)
@@ -190,7 +193,7 @@ def _merged(path: Path, lines: list[bytes]) -> Stored:
     """Return the content of the lines: each scored episode once, and the jobs that failed."""
     rows: dict[tuple[Any, ...], Row] = {}
     numbers: dict[tuple[Any, ...], int] = {}
-    failures: dict[str, Row] = {}
+    failures = Failures()
     uses: list[Row] = []
     # Blank lines, as an editor or a concatenation leaves them, do not count.
     kept = [(n, line) for n, line in enumerate(lines, 1) if line and not line.isspace()]
@@ -200,9 +203,7 @@ def _merged(path: Path, lines: list[bytes]) -> Stored:
         if row["kind"] == "use":
             uses.append(row)
         elif row["kind"] != "score":
-            known = failures.get(row["job"])
-            if known is None or known["date"] <= row["date"]:  # concatenated files are in any order
-                failures[row["job"]] = row
+            failures.add(row)
         elif (name := key(row)) not in rows:
             rows[name], numbers[name] = row, number
         elif differing := _differing(rows[name], row):
@@ -211,8 +212,7 @@ def _merged(path: Path, lines: list[bytes]) -> Stored:
                 f"episode: {dict(zip(KEY, name, strict=True))} differs in {differing}; delete one "
                 "of them"
             )
-    failed = [row for row in failures.values() if row["kind"] == "failure"]
-    return Stored(list(rows.values()), failed, uses=uses)
+    return Stored(list(rows.values()), failures.left(), uses=uses, recovered=failures.recovered)
 
 
 @contextmanager
@@ -261,11 +261,11 @@ def merge(sources: Iterable[tuple[Path, Stored]]) -> Stored:
         ValueError: in one line, if two sources give different scores of an episode.
     """
     rows: dict[tuple[Any, ...], tuple[Path, Row]] = {}
-    failures: dict[str, Row] = {}
+    failures = Failures()
     warnings: list[str] = []
     uses: list[Row] = []
     for path, stored in sources:
-        failures |= {row["job"]: row for row in stored.failures}
+        failures.merge(stored.failures, stored.recovered)
         warnings += [stored.warning] if stored.warning else []
         uses += stored.uses
         for row in stored.rows:
@@ -276,8 +276,8 @@ def merge(sources: Iterable[tuple[Path, Stored]]) -> Stored:
                     f"{dict(zip(KEY, key(row), strict=True))} differs in {differing}; leave one of "
                     "them out"
                 )
-    scored, failed = [row for _, row in rows.values()], list(failures.values())
-    return Stored(scored, failed, "; ".join(warnings), uses)
+    scored, failed = [row for _, row in rows.values()], failures.left()
+    return Stored(scored, failed, "; ".join(warnings), uses, failures.recovered)
 
 
 def _differing(row: Row, other: Row) -> str:

@@ -10,6 +10,7 @@ from pinnobs_gym.simulation.bounds import absorbed
 from pinnobs_gym.simulation.matrices import identity, outer, product, sandwich
 from pinnobs_gym.simulation.motion import Interval, Motion, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
+from pinnobs_gym.simulation.value_shape import of_shape
 
 
 class Map(Motion):
@@ -21,7 +22,7 @@ class Map(Motion):
 
     def step(self, over: Interval, x: np.ndarray) -> np.ndarray:
         for k, u, going in _steps(over):
-            x = _chosen(going, over.system.f(k, x, u), x)
+            x = _chosen(going, of_shape(over.system, "f", over.system.f(k, x, u), x.shape), x)
         return x
 
     def moments(
@@ -31,7 +32,7 @@ class Map(Motion):
         F, Q = identity(nx, batch), np.zeros((nx, nx, 1))
         for k, u, going in _steps(over):
             A = np.ascontiguousarray(system.f_jacobian(k, x, u).transpose(1, 2, 0))
-            x = _chosen(going, system.f(k, x, u), x)
+            x = _chosen(going, of_shape(system, "f", system.f(k, x, u), x.shape), x)
             row = going if going is None else going[:, 0]
             F = _chosen(row, product(A, F), F)  # chain rule over the steps
             if noise is not None:
@@ -50,7 +51,7 @@ class Map(Motion):
         box = over.system.state_box
         for k, u, _ in _steps(over):
             L = noise.L(float(k))[..., 0]
-            x = over.system.f(k, x, u)
+            x = of_shape(over.system, "f", over.system.f(k, x, u), x.shape)
             if L.shape[1]:
                 x = absorbed(x + weighted(L, normal(L.shape[1])), box)
         return x

@@ -22,6 +22,7 @@ from pinnobs_gym.simulation.own_flow import OwnFlow
 from pinnobs_gym.simulation.runge_kutta import longest_step, runge_kutta
 from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import Array, System, vector
+from pinnobs_gym.simulation.value_shape import of_shape
 
 if TYPE_CHECKING:
     from pinnobs_gym.simulation.kernels.model_kernel import ModelKernel
@@ -181,7 +182,7 @@ def _forced(
 def _rate(system: System, t: Array, u: Array, stage: int, x: Array) -> Array:
     """Return f at a stage of a step with times t (3, ...) and inputs u (3, ..., nu)."""
     k = _STAGES[stage]
-    return system.f(t[k], x, u[k])
+    return of_shape(system, "f", system.f(t[k], x, u[k]), x.shape)
 
 
 def model_step_jacobian(
@@ -319,7 +320,8 @@ def _linearised_steps(
             stage: int, at: np.ndarray, times: np.ndarray = times, inputs: np.ndarray = inputs
         ) -> np.ndarray:
             points[stage] = at
-            return system.f(times[stage], shown[stage], inputs[stage]).transpose(inside)
+            value, states = system.f(times[stage], shown[stage], inputs[stage]), shown[stage]
+            return of_shape(system, "f", value, states.shape).transpose(inside)
 
         x = runge_kutta(rate, x, h)
         # Jacobians A of f at the four stages.

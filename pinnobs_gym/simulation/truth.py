@@ -20,6 +20,7 @@ from pinnobs_gym.simulation.motion import Interval, check_steps
 from pinnobs_gym.simulation.noise import Noise, weighted
 from pinnobs_gym.simulation.stiff import Stiff
 from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.value_shape import of_shape
 
 if TYPE_CHECKING:
     from pinnobs_gym.simulation.kernels.truth_kernel import TruthKernel
@@ -284,7 +285,7 @@ def _take_step(
     # Each stage evaluates f at the state plus a combination of the earlier slopes.
     for i, row in enumerate(weights[:-1]):
         stage = _combined(row, flat[: i + 1]).reshape(stages.shape[1:])
-        stages[i + 1] = system.f(t[i], stage, u[i])
+        stages[i + 1] = of_shape(system, "f", system.f(t[i], stage, u[i]), stage.shape)
         if force is not None:
             stages[i + 1] += force.at(float(t[i]))
     flat[0] = _combined(weights[-1], flat)[0]

@@ -113,6 +113,10 @@ class Trivial:
         """Name of the job."""
         return "trivial"
 
+    @property
+    def time_limit(self) -> None:
+        """It needs no limit."""
+
     def run(self) -> None:
         """Append the row."""
         rows.append(self.folder / "rows.jsonl", [self.row])

@@ -105,5 +105,5 @@ def test_estimates_of_the_wrong_shape_are_refused():
             return type(estimates)(estimates.xhat[:, 1:])
 
     game = Game.of("Academic", **SHORT)
-    with pytest.raises(ValueError, match=r"Short returned estimates of shape \(1, 19, 2\); exp"):
+    with pytest.raises(ValueError, match=r"Short\.run returned xhat of shape \(1, 19, 2\); exp"):
         play(game, Short.for_setup(game.source.system, game.source.setup), [0])

@@ -716,7 +716,7 @@ def test_sound_estimator_passes(make: Callable[[System], Estimator]) -> None:
         (OverwritesOutputs, "purity", "update modifies its argument y"),
         (OverwritesPrior, "purity", "run modifies mean of the record"),
         (OverwritesState, "purity", "xhat of state 0 is modified"),
-        (WrongShape, "shapes", r"S after sample 0 has shape \(3, 2\); expected \(3, 1, 1\)"),
+        (WrongShape, "shapes", r"returned S of shape \(3, 2\); expected \(batch, ny, ny\)=\(3,"),
         (RegularOnly, "irregular_times", "ValueError: irregular"),
         (AnotherRun, "run_equals_updates", "xhat of run and of looped updates differ"),
         (

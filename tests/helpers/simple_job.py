@@ -15,6 +15,7 @@ class Simple:
     folder: Path
     number: int
     what: str = "work"
+    time_limit: float | None = None
 
     @property
     def name(self):

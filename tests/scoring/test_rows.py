@@ -94,7 +94,7 @@ def test_every_beginning_of_a_line_is_a_half_line(tmp_path):
     line = path.read_bytes()[:-1]
     for length in (*range(1, 16), *range(16, len(line), 25), len(line) - 1):
         path.write_bytes(line[:length])
-        assert rows.load(path) == ([], [], rows.load(path).warning, [])
+        assert rows.load(path) == ([], [], rows.load(path).warning, [], {})
         rows.append(path, [row(1)])
         assert [rows.seed_of(r) for r in rows.read(path)] == [1]
 
@@ -141,6 +141,18 @@ def test_failures_are_kept_apart_until_the_job_goes_well(tmp_path):
     rows.append(path, [event("dance")])
     with pytest.raises(ValueError, match='line 7: a row of kind "dance"; expected score'):
         rows.load(path)
+
+
+def test_a_clock_that_goes_back_keeps_no_failure_alive(tmp_path):
+    path, other = tmp_path / "rows.jsonl", tmp_path / "other.jsonl"
+    rows.append(path, [event(day=9), event(day=9, job="b")])
+    rows.append(path, [event("recovery", day=3)])
+    assert [r["job"] for r in rows.load(path).failures] == ["b"]
+    rows.append(path, [event("recovery", day=4, job="b"), event(day=10)])
+    assert [r["job"] for r in rows.load(path).failures] == ["a"]
+    rows.append(other, [event("recovery", day=11)])
+    for both in ((path, other), (other, path)):
+        assert rows.load_all(both).failures == []
 
 
 def test_files_are_merged_by_concatenation_in_any_order(tmp_path):

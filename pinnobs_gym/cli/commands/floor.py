@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.floor import is_floor
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs
+from pinnobs_gym.leaderboard.jobs.stopping import stoppable
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.evaluation import seeds_of
 from pinnobs_gym.scoring.exact_bayes import LEAST_ESS
@@ -90,8 +92,12 @@ def compute(jobs: Sequence[FloorJob], processes: int) -> int:
     """Compute the floors of some jobs, show the progress, and return how many jobs failed."""
     engine = Engine(Workers(processes))
     kinds = {job.name: Kind("floors", " ".join(job.game.name)) for job in jobs}
-    with RunView(list(kinds.values()), engine) as view:
-        for job, error, seconds in engine.run(jobs):
+    with (
+        stoppable(),
+        RunView(list(kinds.values()), engine) as view,
+        closing(engine.run(jobs)) as ended,
+    ):
+        for job, error, seconds in ended:
             view.ended(job.name, kinds[job.name], error, seconds)
     return view.failed
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pinnobs_gym.cli.console import console, print_table
+from pinnobs_gym.cli.board_report import report, say_outdated
+from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.run_view import Kind, RunView
-from pinnobs_gym.files import check_writable, replacing
+from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard import suites
-from pinnobs_gym.leaderboard.board import board
-from pinnobs_gym.leaderboard.chapters import chapters, markdown
-from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.jobs import plan
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
 from pinnobs_gym.leaderboard.jobs.job import Job
+from pinnobs_gym.leaderboard.jobs.stopping import stoppable
 from pinnobs_gym.leaderboard.jobs.trainings import Outlook, training_of
 from pinnobs_gym.leaderboard.published import manifest
 from pinnobs_gym.leaderboard.published.reading import published_floors
@@ -56,7 +56,11 @@ class Leaderboard:
     seed: int | None = None
     """Seed of the first episode."""
     jobs: int | None = None
-    """Number of processes on this machine, one thread each; 2 if not given."""
+    """Number of processes on this machine, one thread each; 2 if not given. With 1, jobs run in the
+    process of the command, unless a time limit is given."""
+    timeout: float | None = None
+    """Time limit of each job in s of wall-clock time; a job that exceeds it is ended and has
+    failed. If not given, two hours and four times the budget; none with 1 process."""
     backend: Literal["loky", "dask"] = "loky"
     """Where jobs run: processes of this machine, or the workers of a Dask scheduler."""
     scheduler: str | None = None
@@ -94,18 +98,22 @@ class Leaderboard:
         outdated = outlook.outdated(jobs)
         engine = Engine(workers)
         kinds = {_key(job): kind_of(job, outlook) for job in to_run}
-        with RunView(list(kinds.values()), engine) as view:
-            for job, error, seconds in engine.run(to_run):
+        with (
+            stoppable(),
+            RunView(list(kinds.values()), engine) as view,
+            closing(engine.run(to_run)) as ended,
+        ):
+            for job, error, seconds in ended:
                 view.ended(job.name, kinds[_key(job)], error, seconds)
         begun = time.monotonic()
         stored = rows.load(path)
         self._say_reuse(to_run, view.failed, earlier, stored)
         tensorboard.log_summaries(self.out, stored.rows)
-        self._report(stored, shipped, {job.game.name.condition for job in jobs})
+        report(stored, shipped, {job.game.name.condition for job in jobs}, self.out)
         parts = {**view.seconds(), "tables": time.monotonic() - begun}
         times = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in parts.items())
         console.print(f"{'time:':14} {times}", soft_wrap=True, highlight=False)
-        _say_outdated(outdated)
+        say_outdated(outdated)
         if left_out:
             console.print(
                 f"{len(left_out)} job(s) failed before and were left out; --retry-failed runs "
@@ -117,7 +125,13 @@ class Leaderboard:
 
     def planned(self) -> list[Job]:
         """Return the jobs of the suite with the options."""
-        suite = suites.load(self.suite).changed(
+        suite = self._suite()
+        published = None if self.retrain else manifest.FOLDER
+        jobs = plan.jobs_of(suite, self.out.absolute())
+        return [replace(job, published=published) for job in jobs]
+
+    def _suite(self) -> suites.Suite:
+        return suites.load(self.suite).changed(
             systems=self.systems,
             estimators=self.estimators,
             setup=self.setup,
@@ -127,10 +141,8 @@ class Leaderboard:
             budgets=self.budget,
             training_seeds=self.training_seeds,
             seed=self.seed,
+            timeout=self.timeout,
         )
-        published = None if self.retrain else manifest.FOLDER
-        jobs = plan.jobs_of(suite, self.out.absolute())
-        return [replace(job, published=published) for job in jobs]
 
     def _say_reuse(
         self,
@@ -161,55 +173,7 @@ class Leaderboard:
             raise ValueError(f"scheduler={self.scheduler!r} goes with --backend dask")
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"jobs={self.jobs}; expected at least 1")
-        return Workers(self.jobs or PROCESSES)
-
-    def _report(
-        self, stored: rows.Stored, shipped: Sequence[rows.Row], conditions: set[str]
-    ) -> None:
-        """Print and write the results; ``shipped`` are the published floors."""
-        results = board(stored, shipped)
-        path = self.out / "leaderboard.md"
-        hint = f"{path} has all"
-        found = chapters(results)
-        for chapter in found[::-1]:  # the overview last, where it is seen
-            wanted = [
-                layouts
-                for i, layouts in enumerate(chapter.tables)
-                if not chapter.games or chapter.games[i].game.condition in conditions
-            ]
-            if not wanted or (chapter.games and len(conditions) > 2):
-                continue
-            for layouts in wanted:
-                print_table(layouts, hint)
-            console.print(chapter.note + "\n", highlight=False)
-        for note in results.notes:
-            console.print(note, style="yellow", soft_wrap=True)
-        with replacing(path) as temporary:
-            temporary.write_text(markdown(results), encoding="utf-8")
-        for what, where in (
-            ("tables", path),
-            ("rows", self.out / "rows.jsonl"),
-            ("TensorBoard", self.out / "tensorboard"),
-            ("trained files", self.out / "trained"),
-        ):
-            if where.exists():
-                console.print(f"{what + ':':14} {where}", soft_wrap=True)
-        console.print(
-            f"to make a page: pinnobs report {quoted(str(self.out / 'rows.jsonl'))} "
-            f"-o {quoted(str(self.out / 'site'))}",
-            soft_wrap=True,
-        )
-
-
-def _say_outdated(outdated: Mapping[str, Sequence[str]]) -> None:
-    """Print which published trainings are of earlier code, if any are: systems by estimator."""
-    if outdated:
-        found = "; ".join(f"{name} on {', '.join(systems)}" for name, systems in outdated.items())
-        console.print(
-            f"trained by earlier code: {found}; --retrain trains anew",
-            style="yellow",
-            soft_wrap=True,
-        )
+        return Workers(self.jobs or PROCESSES, apart=self._suite().timeout is not None)
 
 
 def _key(job: Job) -> tuple[str, str]:

@@ -14,8 +14,9 @@ from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkersLost
-from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt
+from pinnobs_gym.leaderboard.jobs.interface import Origin, Outcome, Parcel, PicklableJob
+from pinnobs_gym.leaderboard.jobs.pool import DIED, Pool, WorkersLost
+from pinnobs_gym.leaderboard.jobs.worker import attempt
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -107,8 +108,9 @@ class DaskPool(Pool):
         self.size = len(workers)  # one job at a time per worker, whatever its threads
 
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future:
+        parcel = Parcel.of(job)
         try:
-            future = self._client.submit(attempt, number, job, origin, pure=False)
+            future = self._client.submit(attempt, number, parcel, origin, pure=False)
         except Exception as error:
             raise _connection_lost(error) from None
         self._futures.add(future)
@@ -121,7 +123,7 @@ class DaskPool(Pool):
         try:
             return future.result(timeout=CONNECT)
         except KilledWorker:
-            return Outcome("Dask gave it up", died=True)
+            return Outcome(f"{DIED} (Dask gave it up)", unrecorded=True)
         except (CancelledError, OSError, TimeoutError) as error:
             raise _connection_lost(error) from None
 

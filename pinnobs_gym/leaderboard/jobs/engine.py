@@ -11,19 +11,19 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 from uuid import uuid4
 
 from pinnobs_gym.files import CannotWrite, holding, is_held
-from pinnobs_gym.leaderboard.jobs.pool import Pool, ThisProcess, WorkerLost
-from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob
+from pinnobs_gym.leaderboard.jobs.interface import CannotSend, Origin, Outcome, PicklableJob
+from pinnobs_gym.leaderboard.jobs.pool import DIED, Pool, ThisProcess, WorkerLost
+from pinnobs_gym.leaderboard.jobs.worker import left_behind
 
 LISTEN = 0.5
 """Seconds between two checks for Ctrl-C while no job ends: Windows does not interrupt a wait."""
@@ -46,7 +46,9 @@ class Workers:
     processes: int = 1
     """Number of processes on this machine. With 1, jobs run in the current process: debuggers and
     profilers see them and no process has to be started, but a job that kills its process ends the
-    run. With more, jobs run in worker processes."""
+    run, and none has a time limit. With more, jobs run in worker processes."""
+    apart: bool = False
+    """Whether a single process, too, is a worker process, so that jobs have a time limit."""
     scheduler: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
 
@@ -54,9 +56,9 @@ class Workers:
 class Engine:
     """Runs jobs, one thread each, and yields each as it ends.
 
-    If the process of a job dies, other jobs of the pool may be lost with it. All lost jobs are run
-    again, one at a time after the others; a job whose process dies again has failed. Dask does this
-    by itself.
+    A job whose process dies is run again, on its own after the others, since the process may have
+    been killed for another reason; a job whose process dies again has failed. Dask does this by
+    itself. A job that exceeds its time limit has failed.
 
     Args:
         workers: the processes.
@@ -73,7 +75,7 @@ class Engine:
         """The running jobs, assumed to be those submitted first of all unfinished ones."""
         return list(self._under_way.values())[: self.processes]
 
-    def run(self, jobs: Sequence[PicklableJob]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[PicklableJob]) -> Generator[Ended, None, None]:
         """Run jobs in this order, and yield each as it ends.
 
         Raises:
@@ -93,39 +95,45 @@ class Engine:
     def _run(self, jobs: dict[int, PicklableJob], pool: Pool, origin: Origin) -> Iterator[Ended]:
         """Run all jobs, then those whose process died once more, each on its own."""
         suspects: dict[int, PicklableJob] = {}
-        for number, future in self._futures(jobs.items(), pool, origin):
-            try:
-                outcome = pool.outcome(future)
-            except WorkerLost:
+        for number, outcome in self._outcomes(jobs.items(), pool, origin):
+            if isinstance(outcome, WorkerLost):
                 suspects[number] = jobs[number].anew()  # it may have written rows
-                continue
-            yield _ended(jobs[number], outcome)
+            else:
+                yield _ended(jobs[number], outcome)
         for suspect in sorted(suspects.items()):
-            ((number, future),) = self._futures([suspect], pool, origin)
-            try:
-                outcome = pool.outcome(future)
-            except WorkerLost as lost:
-                outcome = Outcome(str(lost), died=True)
+            ((number, outcome),) = self._outcomes([suspect], pool, origin)
+            if isinstance(outcome, WorkerLost):
+                outcome = Outcome(f"{DIED} ({outcome})", unrecorded=True)
             yield _ended(suspects[number], outcome)
 
-    def _futures(
+    def _outcomes(
         self, jobs: Iterable[tuple[int, PicklableJob]], pool: Pool, origin: Origin
-    ) -> Iterator[tuple[int, Any]]:
-        """Submit jobs, up to the pool's queue length, and yield the number and future of each when
-        it is done."""
+    ) -> Iterator[tuple[int, Outcome | WorkerLost]]:
+        """Submit jobs, up to the pool's queue length, and yield the number and the outcome of each
+        when it is done."""
         done: SimpleQueue[tuple[int, Any]] = SimpleQueue()
         waiting = iter(jobs)
         while True:
-            free = None if pool.queued is None else pool.queued - len(self._under_way)
-            for number, job in islice(waiting, free):
+            while pool.queued is None or len(self._under_way) < pool.queued:
+                number, job = next(waiting, (0, None))
+                if job is None:
+                    break
+                try:
+                    future = pool.submit(number, job, origin)
+                except CannotSend as error:
+                    yield number, Outcome(str(error), unrecorded=True)
+                    continue
                 self._under_way[number] = job
-                future = pool.submit(number, job, origin)
                 future.add_done_callback(partial(_put, done, number))
             if not self._under_way:
                 return
             number, future = _next(done)
             del self._under_way[number]
-            yield number, future
+            try:
+                outcome = pool.outcome(future)
+            except WorkerLost as lost:
+                outcome = left_behind(number, origin.mark) or lost
+            yield number, outcome
 
 
 def _put(done: SimpleQueue[tuple[int, Any]], number: int, future: Any) -> None:
@@ -142,18 +150,16 @@ def _next(done: SimpleQueue[tuple[int, Any]]) -> tuple[int, Any]:
 
 
 def _ended(job: PicklableJob, outcome: Outcome) -> Ended:
-    """Return the result of a job, after recording a failure if its process died.
+    """Return the result of a job, after recording a failure that its process could not record.
 
     Raises:
         CannotWrite: if the outcome means that no other job can succeed.
     """
     if outcome.ends_all:
         raise CannotWrite(outcome.error)
-    error = outcome.error
-    if outcome.died:
-        error = " ".join(f"its process died more than once ({error})".split())
-        job.fail(error)
-    return Ended(job, error, outcome.seconds)
+    if outcome.unrecorded and outcome.error is not None:
+        job.fail(outcome.error)
+    return Ended(job, outcome.error, outcome.seconds)
 
 
 def _pool(workers: Workers) -> AbstractContextManager[Pool]:
@@ -162,7 +168,7 @@ def _pool(workers: Workers) -> AbstractContextManager[Pool]:
         from pinnobs_gym.leaderboard.jobs.cluster import connected
 
         return connected(workers.scheduler)
-    if workers.processes == 1:
+    if workers.processes == 1 and not workers.apart:
         return ThisProcess()
     from pinnobs_gym.leaderboard.jobs.processes import ProcessPool
 

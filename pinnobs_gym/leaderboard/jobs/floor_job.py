@@ -9,6 +9,7 @@ from typing import Self
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files import noticing_full_disks
+from pinnobs_gym.leaderboard.jobs.time_limit import TIME_LIMIT
 from pinnobs_gym.scoring.floor import run_floor
 
 EPISODES = 10
@@ -41,6 +42,11 @@ class FloorJob:
         system, condition = self.game.name.system, self.game.name.condition
         last = self.seed + self.episodes - 1
         return f"floor of {system}, {condition}, episodes {self.seed} to {last}"
+
+    @property
+    def time_limit(self) -> float:
+        """Longest time in s that it may take in a worker."""
+        return TIME_LIMIT
 
     def run(self) -> None:
         """Compute the missing rows and append them."""

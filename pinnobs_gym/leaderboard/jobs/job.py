@@ -62,6 +62,8 @@ class Job:
     published: Path | None = None
     """Folder of published results, whose trained files are used instead of training; None to train
     anew."""
+    time_limit: float | None = None
+    """Longest time in s of wall-clock time that it may take in a worker; None for no limit."""
 
     @property
     def rows(self) -> Path:
@@ -88,7 +90,7 @@ class Job:
     @property
     def digest(self) -> str:
         """Hash of the job's specification and of the code that it runs."""
-        aside = ("folder", "known", "last_use", "fresh", "failed", "published")
+        aside = ("folder", "known", "last_use", "fresh", "failed", "published", "time_limit")
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in aside}
         cls = ESTIMATORS.resolve(self.estimator)
         code = [game_hash(self.game.source), estimator_code(cls)]

@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.applicable import applies
 from pinnobs_gym.leaderboard.jobs.job import Job, called
+from pinnobs_gym.leaderboard.jobs.time_limit import TIME_LIMIT
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import trainer_class
 from pinnobs_gym.scoring.evaluation import StoredKey, stored_key
@@ -93,8 +94,17 @@ def _job(suite: Suite, entry: Entry, game: Game, folder: Path, **more: Any) -> J
         seed=suite.seed,
         folder=folder,
         label=entry.label,
+        time_limit=_time_limit(suite, more.get("training", {})),
         **more,
     )
+
+
+def _time_limit(suite: Suite, training: Mapping[str, Any]) -> float:
+    """Return the time limit of a job in s: that of the suite or, if it has none, a generous one,
+    with four times the CPU seconds of its training."""
+    if suite.timeout is not None:
+        return suite.timeout
+    return TIME_LIMIT + 4 * float(training.get("budget") or 0)
 
 
 def _learning(
@@ -220,3 +230,7 @@ def _check_settings(
     except (ValueError, TypeError) as error:
         message = f"settings of {entry.name!r}: {error}"
         raise suite.wrong("estimators" if entry.settings else "budgets", message) from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # of a plug-in that cannot be made at all: its jobs fail
+        return

@@ -7,7 +7,11 @@ from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt
+from pinnobs_gym.leaderboard.jobs.interface import Origin, Outcome, PicklableJob
+from pinnobs_gym.leaderboard.jobs.worker import attempt_here
+
+DIED = "its process died more than once"
+"""The error of a job whose process died without a reason that is known."""
 
 
 class WorkerLost(Exception):
@@ -31,9 +35,10 @@ class Pool(ABC):
 
     @abstractmethod
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Any:
-        """Queue an `attempt` at a job and return its future, which has an ``add_done_callback``.
+        """Queue an attempt at a job and return its future, which has an ``add_done_callback``.
 
         Raises:
+            CannotSend: in one line, if the job cannot be pickled.
             WorkersLost: in one line, if all workers are lost.
         """
 
@@ -67,7 +72,7 @@ class ThisProcess(Pool):
 
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future[Outcome]:
         future: Future[Outcome] = Future()
-        future.set_result(attempt(number, job, origin))
+        future.set_result(attempt_here(job))
         return future
 
     def outcome(self, future: Future[Outcome]) -> Outcome:

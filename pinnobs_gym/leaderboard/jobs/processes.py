@@ -1,21 +1,25 @@
 """Running jobs in worker processes of this machine, started by loky.
 
-loky's executor has the interface of `concurrent.futures` and three further properties: its workers
-are started afresh instead of forked, on every operating system; it can be shut down at once,
-including running jobs; and if a worker dies, the executor breaks instead of waiting for ever.
+loky starts processes afresh instead of forking them, on every operating system, and tells if one
+dies. Each worker has an executor of its own. If it dies, no other job is lost with it.
 """
 
 from __future__ import annotations
 
+import os
 import re
-import signal
 from concurrent.futures import Future
+from functools import cache
 from types import TracebackType
 
-from loky import BrokenProcessPool, ProcessPoolExecutor, get_reusable_executor
+from loky import BrokenProcessPool, ProcessPoolExecutor
+from loky.backend.resource_tracker import ensure_running
 
-from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkerLost
-from pinnobs_gym.leaderboard.jobs.worker import Origin, Outcome, PicklableJob, attempt, interrupts
+from pinnobs_gym.leaderboard.jobs.interface import Origin, Outcome, Parcel, PicklableJob
+from pinnobs_gym.leaderboard.jobs.pool import Pool, WorkerLost, WorkersLost
+from pinnobs_gym.leaderboard.jobs.stopping import ignoring_ctrl_c
+from pinnobs_gym.leaderboard.jobs.worker import attempt
+from pinnobs_gym.leaderboard.jobs.worker_process import Guard, begin, end_group
 
 IDLE = 300
 """Seconds after which idle workers exit; the next run may reuse them until then."""
@@ -32,10 +36,52 @@ ONE_THREAD = dict.fromkeys(
 """Environment of the workers: one thread per numerical library."""
 
 
+class _Worker:
+    """A worker process, as an executor of one process."""
+
+    def __init__(self) -> None:
+        self.executor = ProcessPoolExecutor(1, timeout=IDLE, initializer=begin, env=ONE_THREAD)
+        self._processes: set[int] = set()
+
+    def submit(self, number: int, parcel: Parcel, origin: Origin, guard: Guard) -> Future[Outcome]:
+        """Submit a job; see `attempt`."""
+        future = self.executor.submit(attempt, number, parcel, origin)
+        for process in set(self.executor._processes) - self._processes:  # it is new, or replaced
+            self._processes.add(process)
+            guard.watch(process)
+        return future
+
+    def end_processes(self, guard: Guard) -> None:
+        """Kill its process, and what that has started."""
+        for process in self._processes:
+            end_group(process)
+            guard.forget(process)
+
+
+_IDLE_WORKERS: list[_Worker] = []
+"""The workers of earlier runs of this process."""
+
+
+@cache
+def _guard(client: int) -> Guard:
+    """Start the processes beside the workers, and return the guard of this process, whose id is
+    given, as a fork has none."""
+    before = os.environ.get("PYTHONWARNINGS")
+    # loky's resource tracker frees what a killed client leaves, and would warn of it.
+    quiet = "ignore:resource_tracker:UserWarning"
+    os.environ["PYTHONWARNINGS"] = f"{before},{quiet}" if before else quiet
+    try:
+        ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
+    return Guard()
+
+
 class ProcessPool(Pool):
     """Worker processes of this machine.
-
-    If one dies, all submitted jobs are lost with it; new workers are started for the next job.
 
     Args:
         size: number of processes.
@@ -44,25 +90,37 @@ class ProcessPool(Pool):
     children = True
 
     def __init__(self, size: int) -> None:
-        self.size = size
-        self.queued = 2 * size  # a worker always finds its next job in the queue
-        self._executor = self._usable()
+        self.size = self.queued = size
+        self._guard = _guard(os.getpid())
+        self._busy: dict[Future[Outcome], _Worker] = {}
 
     def submit(self, number: int, job: PicklableJob, origin: Origin) -> Future[Outcome]:
-        with interrupts(signal.SIG_IGN, unless=signal.SIG_IGN):  # inherited by new workers
+        parcel = Parcel.of(job)
+        with ignoring_ctrl_c():  # inherited by new workers
             while True:
-                self._executor = self._usable()
+                worker = _IDLE_WORKERS.pop() if _IDLE_WORKERS else _Worker()
                 try:
-                    return self._executor.submit(attempt, number, job, origin)
-                except BrokenProcessPool:  # it broke since the check
+                    future = worker.submit(number, parcel, origin, self._guard)
+                except BrokenProcessPool:  # it was killed while it was idle
                     continue
+                except OSError as error:
+                    raise WorkersLost(f"no process can be started: {error}") from None
+                self._busy[future] = worker
+                return future
 
     def outcome(self, future: Future[Outcome]) -> Outcome:
+        worker = self._busy.pop(future)
         try:
-            return future.result()
+            outcome = future.result()
         except BrokenProcessPool as death:
+            self._end([worker])  # what it started is still there
             codes = re.search(r"\{.*\}", str(death))  # such as {SIGKILL(-9)}
             raise WorkerLost(f"exit codes {codes[0]}" if codes else str(death)) from None
+        if outcome.leftovers:
+            self._end([worker])
+        else:
+            _IDLE_WORKERS.append(worker)
+        return outcome
 
     def __exit__(
         self,
@@ -71,16 +129,13 @@ class ProcessPool(Pool):
         trace: TracebackType | None,
     ) -> None:
         if kind is not None:
-            self._executor.shutdown(kill_workers=True)
+            self._end([*self._busy.values(), *_IDLE_WORKERS])
+            _IDLE_WORKERS.clear()
 
-    def _usable(self) -> ProcessPoolExecutor:
-        """Return the executor, or a new one if it is broken. Workers ignore Ctrl-C, including those
-        that loky starts later: the client handles it and stops them."""
-        return get_reusable_executor(
-            self.size,
-            timeout=IDLE,
-            kill_workers=True,
-            initializer=signal.signal,
-            initargs=(signal.SIGINT, signal.SIG_IGN),
-            env=ONE_THREAD,
-        )
+    def _end(self, workers: list[_Worker]) -> None:
+        """End workers and all that they have started, at once."""
+        for worker in workers:
+            worker.end_processes(self._guard)
+        for wait in (False, True):
+            for worker in workers:
+                worker.executor.shutdown(wait, kill_workers=True)

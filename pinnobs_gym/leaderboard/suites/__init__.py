@@ -69,6 +69,9 @@ class Suite:
     """Seeds of each training; the trainer's default if empty."""
     budgets: tuple[float, ...] = (45.0,)
     """CPU seconds of each training; each budget is a separate training."""
+    timeout: float | None = None
+    """Longest time in s of wall-clock time that a job may take; if None, two hours and four times
+    the budget."""
     file: str = field(default="", kw_only=True)
     """The file it was read from."""
     given: frozenset[str] = field(default=frozenset(), kw_only=True)
@@ -197,6 +200,10 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "budgets": (
         "positive numbers of seconds",
+        lambda v: type(v) in (int, float) and 0 < v < float("inf"),
+    ),
+    "timeout": (
+        "a positive number of seconds",
         lambda v: type(v) in (int, float) and 0 < v < float("inf"),
     ),
 }

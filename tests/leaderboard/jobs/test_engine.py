@@ -17,7 +17,7 @@ from pinnobs_gym.cli import main
 from pinnobs_gym.files import CannotWrite
 from pinnobs_gym.leaderboard.jobs import cluster, worker
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
-from pinnobs_gym.leaderboard.jobs.worker import Origin
+from pinnobs_gym.leaderboard.jobs.interface import Origin, Parcel
 from pinnobs_gym.scoring import rows
 
 PLUG_IN = '''
@@ -121,11 +121,12 @@ def test_a_killed_worker_ends_nothing(folder, started, undisturbed):
 
 def test_a_killed_client_loses_nothing_that_was_finished(folder, started, undisturbed, capsys):
     client = started(*COMMAND, "--jobs", "2")
-    held(folder)
+    at_work = held(folder)
     path = folder / "lb" / "rows.jsonl"
     until(lambda: path.exists() and len(rows.read(path)) == 4)  # of open_loop and ekf
     client.kill()
     client.wait()
+    until(lambda: not running(at_work))
     before = rows.read(path)
     (folder / "go").touch()
     assert again(folder) == 0
@@ -259,7 +260,7 @@ def test_what_cannot_be_written_ends_the_run(tmp_path):
 def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "SEEN_AFTER", 0.1)
     origin = Origin(1, "client", str(tmp_path), tmp_path / "elsewhere" / ".running", children=False)
-    error, ends_all, *_ = worker.attempt(5, Simple(tmp_path, 5), origin)
+    error, ends_all, *_ = worker.attempt(5, Parcel.of(Simple(tmp_path, 5)), origin)
     assert ends_all
     here = socket.gethostname()
     told = f"the worker on {here} does not see folder {tmp_path / 'elsewhere'} of client; expected"
@@ -273,6 +274,9 @@ def test_a_job_whose_end_was_not_heard_of_is_not_run_again(tmp_path):
     origin = Origin(1, "client", str(tmp_path), mark, children=False)
     for number, what, error in ((11, "work", None), (1, "fail", "RuntimeError: out of luck")):
         for _ in range(2):
-            assert worker.attempt(number, Simple(tmp_path, number, what), origin).error == error
+            assert (
+                worker.attempt(number, Parcel.of(Simple(tmp_path, number, what)), origin).error
+                == error
+            )
     notes = (tmp_path / "notes").read_text().splitlines()
     assert notes == ["11 done", "1 RuntimeError: out of luck"]
