@@ -11,7 +11,8 @@ from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.simulation.augmented import augmented, with_constants
 from pinnobs_gym.simulation.augmented_system import Unknown
 from pinnobs_gym.simulation.noise import Level
-from pinnobs_gym.simulation.system import Setup, System, independent, is_number
+from pinnobs_gym.simulation.system import Setup, System, independent
+from pinnobs_gym.simulation.values import is_number
 from pinnobs_gym.systems import SYSTEMS
 
 TOLERANCE = 0.1

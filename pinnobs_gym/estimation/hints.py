@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
+from pinnobs_gym.simulation.values import shortly
+
 _NUMBERS: dict[Any, tuple[type, str]] = {
     int: (Integral, "whole number"),
     float: (Real, "number"),
@@ -103,12 +105,6 @@ def as_tuple(value: Any, hint: Any) -> Any:
     within = (hint, *get_args(hint))  # also within an optional type
     wanted = isinstance(value, list) and any(tuple in (h, get_origin(h)) for h in within)
     return tuple(value) if wanted else value
-
-
-def shortly(value: Any) -> str:
-    """Return a value's representation in one line of limited length."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def in_words(hint: Any) -> str:

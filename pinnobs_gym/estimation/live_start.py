@@ -15,7 +15,8 @@ from pinnobs_gym.estimation.live_steps import ByNumpy, InBuffers, Point, Steps
 from pinnobs_gym.simulation.plant_form import first_row
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.start_law import check_covariance
-from pinnobs_gym.simulation.system import System, is_number, vector
+from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.values import is_number
 
 
 def check_online(estimator: Any) -> None:

@@ -16,7 +16,8 @@ import numpy as np
 from pinnobs_gym.simulation.bounds import beyond, box
 from pinnobs_gym.simulation.residual import check_periods
 from pinnobs_gym.simulation.start_law import Box, Points
-from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number, vector
+from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
+from pinnobs_gym.simulation.values import is_number
 
 _NAMES = ("state_names", "output_names", "input_names", "uncertain")
 """Attributes that are several names."""
