@@ -156,4 +156,4 @@ def given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.n
     if not np.all(source.contains(x0)):
         name = type(source.system).__name__
         gym.logger.warn(f"x0={x0.tolist()} is outside the initial set of {name}")
-    return np.broadcast_to(x0, (batch, nx)).copy()
+    return np.broadcast_to(x0, (batch, source.system.nx)).copy()

@@ -115,8 +115,10 @@ def check_parameters(system: type, values: Mapping[str, Any]) -> None:
         value: Any = values.get(each.name)
         if value is None or value is each.default or not is_number(each.default):
             continue
+        # An array has a number for each episode of a batch.
         try:
-            array = real_array(each.name, value)
+            known = is_number(value) or isinstance(value, np.ndarray)
+            array = real_array(each.name, value) if known else np.array(np.nan)
         except ValueError:
             array = np.array(np.nan)
         if not (np.isfinite(array) | (np.isinf(array) & np.isinf(each.default))).all():
