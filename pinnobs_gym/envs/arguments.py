@@ -87,9 +87,10 @@ def masked_rows(mask: Any, num_envs: int) -> np.ndarray:
     except ValueError:  # of lists of unequal lengths
         array = np.array(None)
     if array.shape != (num_envs,) or array.dtype != bool:
-        raise ValueError(f"reset_mask={shortly(mask)}; expected {num_envs} booleans")
+        given = shortly(mask.tolist() if isinstance(mask, np.ndarray) else mask)
+        raise ValueError(f"reset_mask={given}; expected {num_envs} booleans")
     if not array.any():
-        raise ValueError(f"reset_mask={shortly(mask)} selects no row; expected at least one")
+        raise ValueError(f"reset_mask={array.tolist()} selects no row; expected at least one")
     return np.flatnonzero(array)
 
 

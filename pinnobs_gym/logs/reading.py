@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from pinnobs_gym.logs.columns import chosen, unused
+from pinnobs_gym.logs.csv_lines import shown
 from pinnobs_gym.logs.formulas import Formula
-from pinnobs_gym.logs.table import Table, listed, read_table, shown
+from pinnobs_gym.logs.table import Table, listed, read_table
 from pinnobs_gym.logs.times import check_times, read_times, without_rounding
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System

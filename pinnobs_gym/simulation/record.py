@@ -34,7 +34,7 @@ class Prior:
 
     def __post_init__(self) -> None:
         for name in ("mean", "cov"):
-            array = real_array(f"the prior's {name}", getattr(self, name))
+            array = real_array(f"the prior's {name}", getattr(self, name), truths=True)
             if not np.isfinite(array).all():
                 wrong = float(array[~np.isfinite(array)][0])
                 raise ValueError(f"the prior's {name} has the entry {wrong}; expected finite ones")
