@@ -9,12 +9,14 @@ import pkgutil
 import sys
 from collections.abc import Callable, Sequence
 from importlib import resources
-from io import TextIOWrapper
 
 from pinnobs_gym.cli import commands
+from pinnobs_gym.cli.streams import print_anything, until_pipe_closes
 
 COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 """Names of the commands."""
+_LONGEST = 1500
+"""Largest number of characters of a message."""
 
 
 def usage() -> str:
@@ -38,13 +40,17 @@ def usage() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 for success, 1 if a job failed or an unexpected
-    error occurred, 2 for invalid input, 130 after Ctrl-C."""
+    error occurred, 2 for invalid input, 130 after Ctrl-C, 141 if the reader of its output left."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    _print_anything()
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage())
-        return 0 if arguments else 2
+        print_anything()
+        return until_pipe_closes(lambda: _help(0 if arguments else 2))
     return guarded(lambda: _run(arguments[0], arguments[1:]))
+
+
+def _help(status: int) -> int:
+    print(usage())
+    return status
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:
@@ -56,37 +62,52 @@ def _run(name: str, arguments: Sequence[str]) -> int:
 def guarded(command: Callable[[], int]) -> int:
     """Run a command as a process of its own: with one numerical thread, and with errors told in one
     line. Returns its exit status, see `main`."""
-    _print_anything()
+    print_anything()
     _one_thread()
-    sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
+    sys.path += _working_folder()  # so that module:Class finds the user's own files
     try:
-        return command()
-    except (ValueError, TypeError, FloatingPointError) as error:
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        print(f"pinnobs: error: {error}", file=sys.stderr)
-        return 2
-    except ConnectionError as error:  # connection lost to other machines during the run
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        print(f"pinnobs: error: {error}", file=sys.stderr)
-        return 1
-    except Exception as error:  # a fault of a plug-in or of this package
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        print(f"pinnobs: error: {what} (PINNOBS_TRACEBACK=1 shows where)", file=sys.stderr)
-        return 1
+        return until_pipe_closes(lambda: _status(command))
     except KeyboardInterrupt:
         print("pinnobs: stopped; what was written is kept", file=sys.stderr)
         return 130
+    except Exception as error:
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        status, line = _told(error)
+        print(f"pinnobs: error: {line}", file=sys.stderr)
+        return status
 
 
-def _print_anything() -> None:
-    """Replace what the output cannot show: redirected output on Windows has few characters."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")
+def _status(command: Callable[[], int]) -> int:
+    try:
+        return command()
+    except SystemExit as end:  # help was printed
+        return int(end.code or 0)
+
+
+def _working_folder() -> list[str]:
+    """Return the working folder in a list, which is empty if the folder has been deleted."""
+    try:
+        return [os.getcwd()]
+    except OSError:
+        return []
+
+
+def _told(error: Exception) -> tuple[int, str]:
+    """Return the exit status of an error, and what is said of it."""
+    text = " ".join(str(error).split())
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+    if isinstance(error, OSError) and not _working_folder():
+        return 2, "the working folder has been deleted; expected to run in one that exists"
+    if isinstance(error, ValueError | TypeError | FloatingPointError):
+        return 2, text
+    if isinstance(error, MemoryError):
+        return 2, f"not enough memory: {text or 'none is left'}; expected smaller sizes"
+    if isinstance(error, ConnectionError):  # connection lost to other machines during the run
+        return 1, text
+    # A fault of a plug-in or of this package.
+    return 1, f"{type(error).__name__}: {text} (PINNOBS_TRACEBACK=1 shows where)"
 
 
 def _one_thread() -> None:

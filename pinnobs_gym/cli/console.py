@@ -17,8 +17,15 @@ from rich.progress import (
 
 from pinnobs_gym.leaderboard.grid import PROSE, Layouts, fitting
 
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to `pinnobs_gym.cli.streams`, which ends all commands in one way."""
+        raise BrokenPipeError
+
+
 _PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
-console = Console(**_PLAIN) if Console().is_terminal else Console(width=PROSE, **_PLAIN)
+console = _Console(**_PLAIN) if Console().is_terminal else _Console(width=PROSE, **_PLAIN)
 """The console for all output. Names are data: brackets and colons in them are printed as they
 are."""
 

@@ -70,7 +70,8 @@ def _not_decoded(path: Path, kind: str) -> str:
     except UnicodeDecodeError as error:
         before = data[: error.start].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         line = 1 + before.count(b"\n")
-        return f"cannot read {kind} {path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; expected a text in UTF-8"
+        byte = f"byte 0x{data[error.start]:02x} is not UTF-8"
+        return f"cannot read {kind} {path}, line {line}: {byte}; expected a text in UTF-8"
     return f"cannot read {kind} {path}, which has changed; expected a text in UTF-8"
 
 

@@ -16,6 +16,7 @@ from pinnobs_gym.logs.table import Table, listed, read_table
 from pinnobs_gym.logs.times import check_times, read_times, without_rounding
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import LARGEST
 
 
 @dataclass(frozen=True)
@@ -102,10 +103,10 @@ def _values(table: Table, quantity: str, formula: Formula) -> np.ndarray:
     """Return the values (num_samples,) of a quantity, NaN where a cell in its formula is empty."""
     columns = {name: table.numbers(name) for name in formula.columns}
     found = formula.values(columns, len(table.rows))
-    wrong = ~np.isfinite(found)
+    wrong = ~(abs(found) <= LARGEST)
     for values in columns.values():
         wrong &= ~np.isnan(values)
-    expected = "a finite number"
+    expected = f"a finite number up to {LARGEST:g}"
     if quantity.endswith("_std"):
         wrong |= found <= 0
         expected = "a number above 0, or no value"
