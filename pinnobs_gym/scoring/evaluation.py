@@ -28,7 +28,15 @@ from pinnobs_gym.scoring.provenance import (
     versions,
 )
 from pinnobs_gym.scoring.recency import LastUse
-from pinnobs_gym.scoring.row_format import NEEDED, OPTIONAL, SCHEMA, Row, check_names
+from pinnobs_gym.scoring.row_format import (
+    LAST_SEED,
+    MOST_EPISODES,
+    NEEDED,
+    OPTIONAL,
+    SCHEMA,
+    Row,
+    check_names,
+)
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.scoring.tuned import SUFFIX, TUNED, is_tuned, required_settings
@@ -143,12 +151,6 @@ def evaluate(
     log_episodes(log, evaluated.rows, evaluated.first_played)
     log_summary(log, evaluated.rows)
     return Rows(evaluated.rows)
-
-
-MOST_EPISODES = 10**7
-"""Largest number of episodes of an evaluation."""
-LAST_SEED = 2**63 - 1
-"""Largest seed of an episode in rows."""
 
 
 def seeds_of(seed: int, episodes: int) -> range:
