@@ -7,6 +7,7 @@ import select
 import sys
 from collections.abc import Callable
 from io import TextIOWrapper
+from typing import TextIO
 
 PIPE_CLOSED = 141
 """Exit status of a command whose output nobody reads any more: that of a process which SIGPIPE
@@ -32,27 +33,20 @@ def until_pipe_closes(command: Callable[[], int]) -> int:
         sys.stdout.flush()
         return status
     except BrokenPipeError:
-        if not _output_closed():
+        closed = [stream for stream in (sys.stdout, sys.stderr) if _has_no_reader(stream)]
+        if not closed:
             raise
-        _discard_output()
+        with open(os.devnull, "wb") as nowhere:  # for what Python writes at the end of the process
+            for stream in closed:
+                os.dup2(nowhere.fileno(), stream.fileno())
         return PIPE_CLOSED
 
 
-def _output_closed() -> bool:
-    """Return whether standard output or the error stream is a pipe whose reader has left."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            poll = select.poll()
-            poll.register(stream.fileno(), select.POLLOUT)
-            if any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
-                return True
-        except (AttributeError, OSError, ValueError):  # no such call, or a stream without a file
-            continue
-    return False
-
-
-def _discard_output() -> None:
-    """Send the rest of the output nowhere: Python writes it at the end of the process."""
-    with open(os.devnull, "wb") as nowhere:
-        for stream in (sys.stdout, sys.stderr):
-            os.dup2(nowhere.fileno(), stream.fileno())
+def _has_no_reader(stream: TextIO) -> bool:
+    """Return whether a stream is a pipe whose reader has left."""
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), select.POLLOUT)
+        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+    except (AttributeError, OSError, ValueError):  # without such a call, or a stream without a file
+        return False

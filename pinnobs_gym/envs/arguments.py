@@ -139,8 +139,10 @@ def given_prior(source: EpisodeSource, options: dict[str, Any], batch: int) -> P
         ValueError: in one line, if their shape is wrong, or they are not finite, beyond the bounds
             of the states, or absurdly large.
     """
-    prior = Prior.of(source.system, source.setup, batch, options.get("xhat0"))
-    source.check_near("xhat0", prior.mean)
+    xhat0 = options.get("xhat0")
+    prior = Prior.of(source.system, source.setup, batch, xhat0)
+    if xhat0 is not None:
+        source.check_near("xhat0", np.asarray(xhat0, dtype=float))
     return prior
 
 

@@ -414,6 +414,8 @@ WRONG = {
     "settings": ("[]", "null", "1"),
     "training": ("[]",),
     "versions": ("1",),
+    "batch": ("-1", "true", '"a"'),
+    "episode": ('"seed:-1"', '"seed:9223372036854775808"', '"seed:\uff11"'),
     "nominal_over_free": ("-1",),
     "effective_sample_size": ("-1", "true"),
     "monte_carlo": ("-0.1", '"a"'),
@@ -508,6 +510,41 @@ def test_infinite_errors_of_states_are_written_as_null(tmp_path):
     rows.append(path, [row(0, diverged=True, state_rmse={"steady": {"x1": float("inf")}})])
     assert "Infinity" not in path.read_text()
     assert rows.read(path)[0]["state_rmse"] == {"steady": {"x1": float("inf")}}
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (json.dumps(row(1))[:-1] + ', "mse": 1}', "line 2: mse is given twice; expected once"),
+        (
+            json.dumps(row(1) | {"options": {}}).replace(
+                '"options": {}', '"options": {"a": 1, "a": 2}'
+            ),
+            "line 2: a is given twice; expected once",
+        ),
+        (
+            json.dumps(row(1) | {"options": {"a": "?"}}).replace('"?"', "1e999"),
+            "line 2: options.a=Infinity; expected a value that JSON has",
+        ),
+        (
+            json.dumps(row(1) | {"nx": "?"}).replace('"?"', "1" * 5000),
+            "a number of too many digits",
+        ),
+        ("[]", "JSON of a list; expected an object"),
+        ("{'a': 1}", "Expecting property name enclosed in double quotes, column 2"),
+    ],
+)
+def test_why_a_line_is_no_row(tmp_path, line, reason):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(f"{json.dumps(row(0))}\n{line}\n{json.dumps(row(2))}\n")
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        rows.load(path)
+
+
+def test_a_text_with_what_looks_like_a_key_is_read(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(json.dumps(row(0) | {"options": {"a": 'b": c', "d": [{"e": 1}]}}) + "\n")
+    assert rows.read(path)[0]["options"]["d"] == [{"e": 1}]
 
 
 def test_endless_nesting_is_no_row(tmp_path):
