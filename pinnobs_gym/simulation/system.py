@@ -441,7 +441,8 @@ class System(ABC):
         changes: dict[str, Any] = {"dt": dt, "duration": duration, "noise_std": noise_std}
         changes = {name: value for name, value in changes.items() if value is not None}
         own = cls.setups[setup].transient
-        if own is not None and is_number(duration) and 0 < duration < own:
+        shorter = duration is not None and is_number(duration) and 0 < duration < (own or 0.0)
+        if shorter:
             changes["transient"] = None
         chosen = replace(cls.setups[setup], **changes)
         system = cls()

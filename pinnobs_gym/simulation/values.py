@@ -113,7 +113,8 @@ def check_parameters(system: type, values: Mapping[str, Any]) -> None:
     """
     for each in fields(system):
         value: Any = values.get(each.name)
-        if value is None or value is each.default or not is_number(each.default):
+        default: Any = each.default
+        if value is None or value is default or not is_number(default):
             continue
         # An array has a number for each episode of a batch.
         try:
@@ -121,7 +122,7 @@ def check_parameters(system: type, values: Mapping[str, Any]) -> None:
             array = real_array(each.name, value) if known else np.array(np.nan)
         except ValueError:
             array = np.array(np.nan)
-        if not (np.isfinite(array) | (np.isinf(array) & np.isinf(each.default))).all():
+        if not (np.isfinite(array) | (math.isinf(default) & np.isinf(array))).all():
             raise ValueError(
                 f"{each.name}={shortly(value)} of {system.__name__}; expected a finite number"
             )

@@ -413,7 +413,7 @@ WRONG = {
     "other digits": (changed(3, 3, "１"), f"bad.csv, line 4: x2='１'; {NUMBER}"),
     "a number beyond doubles": (changed(3, 3, "1e400"), f"bad.csv, line 4: x2='1e400'; {NUMBER}"),
     "a stray quote": (
-        changed(3, 3, '"1'),
+        lambda lines: [*lines[:3], '0,0.04,0.5,"1', *lines[4:]],
         "estimates bad.csv, line 4: '0,0.04,0.5,\"1' is no line of a CSV file (unexpected end of "
         "data); expected every quote to be closed in its line",
     ),

@@ -207,7 +207,7 @@ def test_plain_numbers_are_read():
 
 @pytest.mark.parametrize("text", ["1_0", "\uff11", "1e400", "nan", "9" * 5000])
 def test_numbers_of_settings_are_in_plain_digits(text):
-    with pytest.raises(ValueError, match="setting .*; expected") as caught:
+    with pytest.raises(ValueError, match=r"setting .*; expected") as caught:
         settings_of(Many, [f"number={text}"])
     assert len(str(caught.value)) < 150
 

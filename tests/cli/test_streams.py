@@ -3,6 +3,7 @@
 import io
 import os
 import sys
+from contextlib import contextmanager, redirect_stdout
 
 import pytest
 
@@ -10,13 +11,12 @@ from pinnobs_gym.cli import guarded, main
 from pinnobs_gym.cli.console import console
 
 
-@pytest.fixture
-def left(monkeypatch, capsys):
-    """Standard output as a pipe whose reader has left."""
+@contextmanager
+def left():
+    """Have standard output be a pipe whose reader has left."""
     reader, writer = os.pipe()
     os.close(reader)
-    with open(writer, "w", encoding="utf-8") as stream:
-        monkeypatch.setattr(sys, "stdout", stream)
+    with open(writer, "w", encoding="utf-8") as stream, redirect_stdout(stream):
         yield
         stream.flush()  # as Python does at the end of the process: without an error
 
@@ -36,8 +36,9 @@ def printed():
         lambda: guarded(printed),
     ],
 )
-def test_a_pipe_whose_reader_has_left_ends_the_command_without_a_word(left, capsys, command):
-    assert command() == 141
+def test_a_pipe_whose_reader_has_left_ends_the_command_without_a_word(capsys, command):
+    with left():
+        assert command() == 141
     assert not capsys.readouterr().err
 
 
