@@ -43,6 +43,7 @@ def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[s
     Its columns are t (s, or steps of a map), the outputs as y1, y2, ... or by their own names, and,
     if the system has inputs, these as u1, u2, ... or by their own names. Sample times may be
     irregular. An empty cell or ``nan`` is a missing output, or an input that keeps its last value.
+    Numbers are in digits from 0 to 9; those above 1e30 are none that a sensor measured.
     Columns y1_std or ``<output>_std`` hold the standard deviation of an output's noise at each
     sample, where it is known. Other columns are not used, which a note says.
 
