@@ -9,11 +9,11 @@ import pkgutil
 import sys
 from collections.abc import Callable, Sequence
 from importlib import resources
-from io import TextIOWrapper
 from typing import NoReturn
 
 from pinnobs_gym.cli import commands
 from pinnobs_gym.cli.ending import end
+from pinnobs_gym.cli.streams import print_anything, until_pipe_closes
 from pinnobs_gym.leaderboard.display import one_line, show_messages_printable, words_of
 from pinnobs_gym.leaderboard.jobs.stopping import Stopped, stop_line
 from pinnobs_gym.registry import error_line
@@ -47,12 +47,12 @@ def usage() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 for success, 1 if a job failed or an unexpected
-    error occurred, 2 for invalid input, 130 after Ctrl-C, 143 after SIGTERM."""
+    error occurred, 2 for invalid input, 130 after Ctrl-C, 141 if the reader of its output left, 143
+    after SIGTERM."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    _print_anything()
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage())
-        return 0 if arguments else 2
+        print_anything()
+        return until_pipe_closes(lambda: _help(0 if arguments else 2))
     return guarded(lambda: _run(arguments[0], arguments[1:]))
 
 
@@ -60,6 +60,11 @@ def program() -> NoReturn:
     """Run the command of this process and end it; see `main`."""
     status = main()
     end(status)
+
+
+def _help(status: int) -> int:
+    print(usage())
+    return status
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:
@@ -71,56 +76,54 @@ def _run(name: str, arguments: Sequence[str]) -> int:
 def guarded(command: Callable[[], int]) -> int:
     """Run a command as a process of its own: with one numerical thread, and with errors told in one
     line. Returns its exit status, see `main`."""
-    _print_anything()
+    print_anything()
     show_messages_printable()
     _one_thread()
-    sys.path.append(os.getcwd())  # so that module:Class finds the user's own files
+    sys.path += _working_folder()  # so that module:Class finds the user's own files
     try:
-        return command()
-    except (ValueError, TypeError, FloatingPointError) as error:
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        print(f"pinnobs: error: {words_of(error)}", file=sys.stderr)
-        return 2
-    except ConnectionError as error:  # connection lost to other machines during the run
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        print(f"pinnobs: error: {words_of(error)}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        place = "" if error.filename is None else f"{error.filename}: "
-        told = one_line(f"{place}{error.strerror}") if error.strerror else words_of(error)
-        print(f"pinnobs: error: {told}", file=sys.stderr)
-        return 2
-    except Exception as error:  # a fault of a plug-in or of this package
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        return _fault(error)
-    except HelpShown:
-        raise
-    except SystemExit as error:  # of a plug-in
-        if os.environ.get("PINNOBS_TRACEBACK"):
-            raise
-        return _fault(error)
+        return until_pipe_closes(lambda: _status(command))
     except KeyboardInterrupt as stop:
         print(stop_line(stop), file=sys.stderr)
         return stop.status if isinstance(stop, Stopped) else 130
+    except (Exception, SystemExit) as error:  # the latter of a plug-in
+        if os.environ.get("PINNOBS_TRACEBACK"):
+            raise
+        status, line = _told(error)
+        print(f"pinnobs: error: {line}", file=sys.stderr)
+        return status
 
 
-def _fault(error: BaseException) -> int:
-    """Print what a plug-in or this package raised, and return the exit status."""
-    line = f"pinnobs: error: {error_line(error)} (PINNOBS_TRACEBACK=1 shows where)"
-    print(line, file=sys.stderr)
-    return 1
+def _status(command: Callable[[], int]) -> int:
+    try:
+        return command()
+    except HelpShown:
+        return 0
 
 
-def _print_anything() -> None:
-    """Replace what the output cannot show: redirected output on Windows has few characters."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")
+def _working_folder() -> list[str]:
+    """Return the working folder in a list, which is empty if the folder has been deleted."""
+    try:
+        return [os.getcwd()]
+    except OSError:
+        return []
+
+
+def _told(error: BaseException) -> tuple[int, str]:
+    """Return the exit status of an error, and what is said of it."""
+    if isinstance(error, OSError) and not _working_folder():
+        return 2, "the working folder has been deleted; expected to run in one that exists"
+    if isinstance(error, ValueError | TypeError | FloatingPointError):
+        return 2, words_of(error)
+    if isinstance(error, MemoryError):
+        text = words_of(error) if str(error) else "none is left"
+        return 2, f"not enough memory: {text}; expected smaller sizes"
+    if isinstance(error, ConnectionError):  # connection lost to other machines during the run
+        return 1, words_of(error)
+    if isinstance(error, OSError):
+        place = "" if error.filename is None else f"{error.filename}: "
+        return 2, one_line(f"{place}{error.strerror}") if error.strerror else words_of(error)
+    # A fault of a plug-in or of this package.
+    return 1, f"{error_line(error)} (PINNOBS_TRACEBACK=1 shows where)"
 
 
 def _one_thread() -> None:

@@ -34,6 +34,10 @@ class PrintableConsole(Console):
             else:
                 yield Segment(printable_lines(segment.text), segment.style)
 
+    def on_broken_pipe(self) -> None:
+        """Leave it to `pinnobs_gym.cli.streams`, which ends all commands in one way."""
+        raise BrokenPipeError
+
 
 _PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
 console = PrintableConsole(**_PLAIN, width=None if Console().is_terminal else PROSE)

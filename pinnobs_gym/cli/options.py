@@ -18,8 +18,10 @@ from tyro.constructors import (
 )
 
 from pinnobs_gym.cli import HelpShown
+from pinnobs_gym.cli.numbers import NUMBERS
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.hints import field_hints, fits, in_words
+from pinnobs_gym.simulation.values import shortly
 
 T = TypeVar("T")
 
@@ -34,11 +36,15 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
         ValueError: in one line, if the arguments are invalid, or if an option that takes one value
             is repeated.
     """
-    arguments = _joined(arguments, _lists(kind))
+    lists = _lists(kind)
+    for option, values in by_option(arguments):
+        if option in lists and not values:
+            raise ValueError(f"{option} without a value; expected one or several")
+    arguments = _joined(arguments, lists)
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
-            options |= {"config": (tyro.conf.OmitArgPrefixes,)}
+            options |= {"config": (tyro.conf.OmitArgPrefixes,), "registry": NUMBERS}
             return tyro.cli(kind, prog=f"pinnobs {command}", args=arguments, **options)
     except SystemExit as end:
         if not end.code:
@@ -159,10 +165,13 @@ def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, 
         hint = {**nested, **own}.get(name)
         if not equals or hint is None:
             listed = ", ".join(sorted([*own, *nested])) or "none"
-            raise ValueError(f"setting {setting!r}; expected name=value with a name of: {listed}")
+            raise ValueError(
+                f"setting {shortly(setting)}; expected name=value with a name of: {listed}"
+            )
         value = _parsed(name, text, hint)
         if name in values and value != values[name]:
-            raise ValueError(f"setting {name!r} is given twice: {given[name]!r} and {text!r}")
+            both = f"{shortly(given[name])} and {shortly(text)}"
+            raise ValueError(f"setting {name!r} is given twice: {both}")
         values[name], given[name] = value, text
     if nested:
         recipe = {name: values.pop(name) for name in nested if name in values}
@@ -172,7 +181,8 @@ def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, 
 
 def _parsed(name: str, text: str, hint: Any) -> Any:
     """Convert the text of a setting to the type of its field, with tyro's rules for one option."""
-    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
+    with NUMBERS:
+        spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
     if isinstance(spec, UnsupportedTypeAnnotationError):
         raise ValueError(f"setting {name!r} can be given in Python only")
     parts = [text] if spec.nargs == 1 else [part for part in re.split(r"[\s,]+", text) if part]
@@ -183,4 +193,4 @@ def _parsed(name: str, text: str, hint: Any) -> Any:
                 return value
     except ValueError:
         pass
-    raise ValueError(f"setting {name + '=' + text!r}; expected {in_words(hint)}")
+    raise ValueError(f"setting {shortly(name + '=' + text)}; expected {in_words(hint)}")

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
+from pinnobs_gym.cli.numbers import finite_or_inf
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.simulation.augmented import augmented, with_constants
 from pinnobs_gym.simulation.augmented_system import Unknown
 from pinnobs_gym.simulation.noise import Level
-from pinnobs_gym.simulation.system import Setup, System, independent, is_number
+from pinnobs_gym.simulation.system import Setup, System, independent
+from pinnobs_gym.simulation.values import is_number
 from pinnobs_gym.systems import SYSTEMS
 
 TOLERANCE = 0.1
@@ -103,7 +105,7 @@ def _unknowns(system: System, also: Sequence[str]) -> dict[str, dict[str, Unknow
 def _given(text: str, values: str) -> Unknown:
     """Return the constant of a mean and a standard deviation."""
     try:
-        mean, std = map(float, values.split(","))
+        mean, std = map(finite_or_inf, values.split(","))
         return Unknown(mean, std)
     except ValueError:
         raise ValueError(

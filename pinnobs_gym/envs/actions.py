@@ -23,6 +23,7 @@ from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.noise import AssumedNoise
 from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import Setup, System, vector
+from pinnobs_gym.simulation.values import is_whole, shortly
 
 LARGEST_REWARD = 10.0
 """Bound of the absolute value of the reward ``improvement``."""
@@ -78,8 +79,8 @@ class Form(ABC):
     """The action space of one episode."""
 
     def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
-        if not (isinstance(stack, int | np.integer) and stack >= 1):
-            raise ValueError(f"stack={stack!r}; expected a whole number of at least 1")
+        if not is_whole(stack, 1):
+            raise ValueError(f"stack={shortly(stack)}; expected a whole number of at least 1")
         self.system, self.setup, self.stack = system, setup, int(stack)
         self.scale = vector(system.scale, system.nx, "scale")
         bound = system.state_bound or tuple(10 * s for s in system.scale)
@@ -142,12 +143,14 @@ class Form(ABC):
         """Return the memory with the estimates that result from actions (batch, ...)."""
 
     def checked(self, actions: np.ndarray) -> np.ndarray:
-        """Return actions (batch, ...) in double precision.
+        """Return actions (batch, ...) in double precision, NaN where they are infinite: an action
+        that is not finite has no finite estimate, even where the form clips.
 
         Raises:
             ValueError: in one line, if their shape is wrong.
         """
         actions = np.asarray(actions, dtype=float)
+        actions = np.where(np.isinf(actions), np.nan, actions)
         shape: tuple[int, ...] = self.action_space.shape
         if actions.shape[1:] != shape:
             raise ValueError(
@@ -332,8 +335,10 @@ def form_of(action_mode: str, system: System, setup: Setup, stack: int = 1) -> F
     Raises:
         ValueError: listing the known names, if it is unknown.
     """
-    if action_mode not in FORMS:
-        raise ValueError(f"unknown action_mode {action_mode!r}; known are {', '.join(FORMS)}")
+    if not isinstance(action_mode, str) or action_mode not in FORMS:
+        raise ValueError(
+            f"unknown action_mode {shortly(action_mode)}; known are {', '.join(FORMS)}"
+        )
     return FORMS[action_mode](system, setup, stack)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from pinnobs_gym.envs.actions import AgentMemory, Form, PredictionForm, form_of
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.simulation.values import is_whole, shortly
 
 
 class AgentSide:
@@ -20,9 +21,15 @@ class AgentSide:
     """
 
     def __init__(self, source: EpisodeSource, action_mode: str, reward: str, stack: int) -> None:
+        samples = source.setup.num_steps + 1
+        if not is_whole(stack, 1) or stack > samples:
+            raise ValueError(
+                f"stack_outputs={shortly(stack)}; expected a whole number from 1 to {samples}, the "
+                "samples of an episode"
+            )
         self.form: Form = form_of(action_mode, source.system, source.setup, stack)
         if reward not in ("error", "improvement"):
-            raise ValueError(f"reward={reward!r}; expected 'error' or 'improvement'")
+            raise ValueError(f"reward={shortly(reward)}; expected 'error' or 'improvement'")
         shape = self.form.action_space.shape
         assert shape is not None
         self.action_shape: tuple[int, ...] = shape

@@ -9,7 +9,9 @@ import gymnasium as gym
 import numpy as np
 
 from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import check_seed, is_whole, real_array, shortly
 
 NOT_FINITE_REWARD = -1e4
 """Reward of an action that is not finite, which ends the episode."""
@@ -53,16 +55,95 @@ def check_render_mode(mode: str | None, known: Sequence[str]) -> None:
         raise ValueError(f"render_mode={mode!r}; expected {' or '.join(known)}")
 
 
+def seeds_of_rows(seed: Any, num_envs: int) -> list[int | None]:
+    """Return the seed of each row of a vectorised env, None for one that is drawn.
+
+    Args:
+        seed: that of the first row, which those of the others follow; one for each row, or None for
+            rows whose seeds are drawn; or None for all.
+        num_envs: number of rows.
+
+    Raises:
+        ValueError: in one line, if it is something else.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
+        first = check_seed(seed)
+        return [first + i for i in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ValueError(f"{len(seed)} seeds; expected {num_envs}, one per row")
+    return [None if each is None else check_seed(each) for each in seed]
+
+
+def masked_rows(mask: Any, num_envs: int) -> np.ndarray:
+    """Return the indices of the rows that a mask of several truth values selects.
+
+    Raises:
+        ValueError: in one line, if it is no such mask, or selects none.
+    """
+    try:
+        array = np.asarray(mask)
+    except ValueError:  # of lists of unequal lengths
+        array = np.array(None)
+    if array.shape != (num_envs,) or array.dtype != bool:
+        given = shortly(mask.tolist() if isinstance(mask, np.ndarray) else mask)
+        raise ValueError(f"reset_mask={given}; expected {num_envs} booleans")
+    if not array.any():
+        raise ValueError(f"reset_mask={array.tolist()} selects no row; expected at least one")
+    return np.flatnonzero(array)
+
+
+def check_num_envs(num_envs: Any) -> int:
+    """Return the number of rows of a vectorised env.
+
+    Raises:
+        ValueError: in one line, if it is not a whole number of at least 1.
+    """
+    if isinstance(num_envs, int | np.integer) and num_envs < 1:
+        raise ValueError(f"num_envs={shortly(num_envs)}; expected at least 1")
+    if not is_whole(num_envs):
+        raise ValueError(f"num_envs={shortly(num_envs)}; expected a whole number of at least 1")
+    return int(num_envs)
+
+
+def action_array(action: Any) -> np.ndarray:
+    """Return an action, or those of several rows, in double precision.
+
+    Raises:
+        ValueError: in one line, if it holds anything else than real numbers.
+    """
+    if type(action) is np.ndarray and action.dtype.kind == "f":  # the usual case takes no time
+        return action.astype(float, copy=False)
+    return real_array("action", action, truths=True)
+
+
 def check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
     """Return the options of a reset, empty if None.
 
     Raises:
         ValueError: in one line, listing the known options, if one is unknown.
     """
+    if options is not None and not isinstance(options, dict):
+        raise ValueError(f"options={shortly(options)}; expected a dictionary of reset options")
     for name in options or {}:
         if name not in known:
-            raise ValueError(f"unknown reset option {name!r}; known are {', '.join(known)}")
+            raise ValueError(f"unknown reset option {shortly(name)}; known are {', '.join(known)}")
     return options or {}
+
+
+def given_prior(source: EpisodeSource, options: dict[str, Any], batch: int) -> Prior:
+    """Return the prior of the setup, with the mean ``xhat0`` of the reset options if given.
+
+    Raises:
+        ValueError: in one line, if their shape is wrong, or they are not finite, beyond the bounds
+            of the states, or absurdly large.
+    """
+    xhat0 = options.get("xhat0")
+    prior = Prior.of(source.system, source.setup, batch, xhat0)
+    if xhat0 is not None:
+        source.check_near("xhat0", np.asarray(xhat0, dtype=float))
+    return prior
 
 
 def given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.ndarray | None:
@@ -70,17 +151,12 @@ def given_x0(source: EpisodeSource, options: dict[str, Any], batch: int) -> np.n
     are outside the setup's set.
 
     Raises:
-        ValueError: in one line, if their shape is wrong or they are not finite.
+        ValueError: in one line, if their shape is wrong, or they are not finite or absurdly large.
     """
-    if "x0" not in options:
+    if options.get("x0") is None:
         return None
-    nx = source.system.nx
-    x0 = np.asarray(options["x0"], dtype=float)
-    if x0.shape not in ((nx,), (batch, nx)):
-        raise ValueError(f"x0 has shape {x0.shape}; expected ({nx},)")
-    if not np.isfinite(x0).all():
-        raise ValueError(f"x0={x0.tolist()} is not finite")
+    x0 = source.given_states(options["x0"], batch)
     if not np.all(source.contains(x0)):
         name = type(source.system).__name__
         gym.logger.warn(f"x0={x0.tolist()} is outside the initial set of {name}")
-    return np.broadcast_to(x0, (batch, nx)).copy()
+    return np.broadcast_to(x0, (batch, source.system.nx)).copy()

@@ -12,9 +12,11 @@ import numpy as np
 from pinnobs_gym.envs.agent_side import AgentSide
 from pinnobs_gym.envs.arguments import (
     NOT_FINITE_REWARD,
+    action_array,
     check_options,
     check_render_mode,
     errors_of,
+    given_prior,
     given_x0,
     reward_weights,
     seeds_of,
@@ -22,8 +24,8 @@ from pinnobs_gym.envs.arguments import (
 from pinnobs_gym.envs.episode_buffer import EpisodeBuffer
 from pinnobs_gym.envs.episodes import Changes, EpisodeSource, Stream
 from pinnobs_gym.envs.figures import EpisodePicture
-from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import check_seed
 
 
 class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -89,10 +91,11 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
+        seed = None if seed is None else check_seed(seed)
         options = check_options(options, ("x0", "xhat0"))
-        prior = Prior.of(self.source.system, self.source.setup, 1, options.get("xhat0"))
+        prior = given_prior(self.source, options, 1)
         x0 = given_x0(self.source, options, 1)
+        super().reset(seed=seed)
         if seed is not None or self._stream is None:
             self._stream = self.source.stream(seeds_of(self.np_random))
             self._buffer.forget([0])
@@ -116,7 +119,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         k = self._k
         if self._over:
             raise RuntimeError("the episode is over; call reset before step")
-        estimate = np.asarray(action, dtype=float)
+        estimate = action_array(action)
         x = self._state
         if not self.agent.plain:
             estimate = self.agent.act(estimate[None])[0]

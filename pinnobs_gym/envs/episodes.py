@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypedDict, Unpack
@@ -19,15 +19,23 @@ from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import longest_step
-from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.system import System, vector
 from pinnobs_gym.simulation.truth import disturbed_truth, noise_shape, truth
 from pinnobs_gym.simulation.value_shape import of_shape
+from pinnobs_gym.simulation.values import check_seed, real_array, shortly
 from pinnobs_gym.systems import SYSTEMS
 
 _DRAWS = 64
 """Number of initial states drawn at a time."""
 _ATTEMPTS = 1000
 """Number of such draws without an admissible state after which the initial set counts as empty."""
+
+
+FARTHEST = 1e5
+"""Largest size of a state that is given, over its scale and its usual initial size."""
+MOST_NUMBERS = 10**9
+"""Largest number of states, outputs and inputs of the episodes that are computed at a time, which
+take 8 GB."""
 
 
 class Changes(TypedDict, total=False):
@@ -115,9 +123,57 @@ class EpisodeSource:
         self.times = self.setup.times
         self.inputs = np.asarray(self.system.input(self.times))
         self.start = self.setup.start(self.system.nx)
+        self._corners = np.stack(self.start.corners)
         ask(self.system, "truth")
         step = longest_step(self.system)
         self._drawn = noise_shape(self.system, self.noise, self.setup.dt, step)
+
+    def check_batch(self, batch: int) -> None:
+        """Check that the arrays of a batch of episodes are not absurdly large.
+
+        Raises:
+            ValueError: in one line, if they are.
+        """
+        system = self.system
+        numbers = batch * len(self.times) * (system.nx + system.ny + system.nu)
+        if numbers > MOST_NUMBERS:
+            raise ValueError(
+                f"{batch} episodes of {len(self.times)} samples at a time are {numbers:.3g} "
+                f"numbers; expected at most {MOST_NUMBERS:.3g}"
+            )
+
+    def given_states(self, x0: object, batch: int) -> np.ndarray:
+        """Return initial states that are given, as an array (nx,) or (batch, nx).
+
+        Raises:
+            ValueError: in one line, if their shape is wrong, or they are not finite or absurdly
+                large.
+        """
+        states, nx = real_array("x0", x0), self.system.nx
+        if states.shape not in ((nx,), (batch, nx)):
+            raise ValueError(f"x0 has shape {states.shape}; expected ({nx},)")
+        if not np.isfinite(states).all():
+            raise ValueError(f"x0={states.tolist()} is not finite")
+        self.check_near("x0", states)
+        return states
+
+    def check_near(self, name: str, x: np.ndarray) -> None:
+        """Check that states (..., nx) are not farther away than any from which an episode can be
+        computed.
+
+        Raises:
+            ValueError: in one line that names the state and the largest value of it.
+        """
+        system = self.system
+        usual = np.maximum(vector(system.scale, system.nx, "scale"), abs(self._corners))
+        largest = FARTHEST * usual.max(axis=0)
+        wrong = abs(x) > largest
+        if wrong.any():
+            i = int(np.argwhere(wrong)[0][-1])
+            raise ValueError(
+                f"{name}={shortly(x.tolist())}; expected {system.state_names[i]} of at most "
+                f"{largest[i]:g}, {FARTHEST:g} times its usual size"
+            )
 
     def contains(self, x0: np.ndarray) -> np.ndarray:
         """Return which initial states (..., nx) belong to the setup's set: bool (...)."""
@@ -130,7 +186,12 @@ class EpisodeSource:
 
     def streams(self, seeds: Iterable[int | None]) -> list[Stream]:
         """Return the random number streams of these seeds; None is a seed that is drawn."""
-        return [self.stream(np.random.SeedSequence(seed)) for seed in seeds]
+        if isinstance(seeds, Sized):
+            self.check_batch(len(seeds))
+        return [
+            self.stream(np.random.SeedSequence(None if seed is None else check_seed(seed)))
+            for seed in seeds
+        ]
 
     def draw(self, streams: Sequence[Stream], noise: np.ndarray | None = None) -> Draws:
         """Draw the random numbers of the next episode of each stream; a stream may occur several

@@ -139,9 +139,16 @@ class Game:
 
         Args:
             seeds: one per episode.
-            x0: initial states (batch, nx) that replace the drawn ones.
+            x0: initial states (nx,) or (batch, nx) that replace the drawn ones.
+
+        Raises:
+            ValueError: in one line, if a seed is not a whole number of at least 0, the episodes are
+                too many for one batch, or initial states are of the wrong shape or not finite.
         """
-        return self.source.play(self.source.draw(self.source.streams(seeds)), x0)
+        draws = self.source.draw(self.source.streams(seeds))
+        if x0 is not None:
+            x0 = np.broadcast_to(self.source.given_states(x0, len(draws.x0)), draws.x0.shape)
+        return self.source.play(draws, x0)
 
     def record(self, seeds: Iterable[int]) -> Record:
         """Return the record, given to estimators, of the episodes of these seeds."""

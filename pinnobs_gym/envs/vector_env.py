@@ -15,11 +15,16 @@ from gymnasium.vector.utils import batch_space
 from pinnobs_gym.envs.agent_side import AgentSide
 from pinnobs_gym.envs.arguments import (
     NOT_FINITE_REWARD,
+    action_array,
+    check_num_envs,
     check_options,
     check_render_mode,
+    given_prior,
     given_x0,
+    masked_rows,
     reward_of,
     reward_weights,
+    seeds_of_rows,
 )
 from pinnobs_gym.envs.episode_buffer import EpisodeBuffer
 from pinnobs_gym.envs.episodes import Changes, Episodes, EpisodeSource, Stream
@@ -56,12 +61,12 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs}; expected at least 1")
+        num_envs = check_num_envs(num_envs)
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)
+        self.source.check_batch(num_envs)
         self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)
         self.single_observation_space = self.agent.form.observation_space
         self.single_action_space = self.agent.form.action_space
@@ -90,12 +95,9 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         options = check_options(options, ("x0", "xhat0", "reset_mask"))
         rows = self._rows
         if "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"])
-            if mask.shape != (self.num_envs,) or mask.dtype != bool:
-                raise ValueError(f"reset_mask={mask.tolist()}; expected {self.num_envs} booleans")
-            rows = np.flatnonzero(mask) if self._episodes is not None else rows
-        xhat0 = options.get("xhat0")
-        prior = Prior.of(self.source.system, self.source.setup, self.num_envs, xhat0)
+            chosen = masked_rows(options["reset_mask"], self.num_envs)
+            rows = chosen if self._episodes is not None else rows
+        prior = given_prior(self.source, options, self.num_envs)
         x0 = given_x0(self.source, options, self.num_envs)
         self._seed(seed, rows)
         self._begin(rows, prior.mean[rows], None if x0 is None else x0[rows])
@@ -109,7 +111,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         if self._episodes is None:
             raise RuntimeError("no episode has begun; call reset before step")
-        estimates = np.asarray(actions, dtype=float)
+        estimates = action_array(actions)
         shape = (self.num_envs, *self.agent.action_shape)
         if estimates.shape != shape:
             kind = f"as action_mode={self.agent.form.name!r} has them"
@@ -175,16 +177,9 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
         """Create the streams of these rows if a seed is given or there are none yet."""
-        seeds: list[int | None]
+        seeds = seeds_of_rows(seed, self.num_envs)
         if isinstance(seed, int | np.integer):
-            super().reset(seed=int(seed))
-            seeds = [int(seed) + i for i in range(self.num_envs)]
-        elif seed is None:
-            seeds = [None] * self.num_envs
-        else:
-            seeds = list(seed)
-            if len(seeds) != self.num_envs:
-                raise ValueError(f"{len(seeds)} seeds; expected {self.num_envs}, one per row")
+            super().reset(seed=seeds[0])
         if not self._streams:
             self._streams = self.source.streams(seeds)
         elif seed is not None:

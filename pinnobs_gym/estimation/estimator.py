@@ -19,6 +19,7 @@ from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System
+from pinnobs_gym.simulation.values import check_parameters
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.export.algorithm import Algorithm
@@ -140,6 +141,7 @@ class BaseEstimator(ABC):
 
     def __post_init__(self) -> None:
         probe(type(self.system))
+        check_parameters(type(self.system), self.system.parameters)
         noise = self.system.noise(self.noise_std, self.process_noise)  # raises for a wrong level
         check_taken(type(self), self.system, noise)
         check_settings(self, self.setting_fields())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import Field, fields
 from functools import cache
@@ -10,6 +11,8 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+from pinnobs_gym.simulation.values import LARGEST, shortly
 
 _NUMBERS: dict[Any, tuple[type, str]] = {
     int: (Integral, "whole number"),
@@ -31,8 +34,9 @@ def field_hints(kind: type) -> Mapping[str, Any]:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Return whether a value is of a type. A whole number is also a number, but True is none, and a
-    list is as good as a tuple, because TOML and JSON have lists only."""
+    """Return whether a value is of a type. A whole number is also a number, but True and NaN are
+    none, nor are numbers too large to compute with. A list is as good as a tuple, because TOML and
+    JSON have lists only."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return fits(value, parts[0])
@@ -43,7 +47,7 @@ def fits(value: Any, hint: Any) -> bool:
     if hint in (None, NoneType):
         return value is None
     if hint in _NUMBERS:
-        return isinstance(value, _NUMBERS[hint][0]) and not isinstance(value, bool)
+        return isinstance(value, _NUMBERS[hint][0]) and _usable(value)
     if hint is bool:
         return isinstance(value, bool | np.bool_)
     kind = origin or hint
@@ -64,6 +68,16 @@ def fits(value: Any, hint: Any) -> bool:
     if parts and isinstance(value, Mapping):
         return all(fits(n, parts[0]) and fits(v, parts[1]) for n, v in value.items())
     return True
+
+
+def _usable(value: Any) -> bool:
+    """Return whether a number can be computed with: it is no truth value, not NaN, and neither
+    finite and beyond `LARGEST`, nor a whole number of more than 64 bits."""
+    if isinstance(value, bool) or value != value:
+        return False
+    if isinstance(value, Integral):
+        return abs(int(value)) < 2**63
+    return abs(value) <= LARGEST or abs(value) == math.inf
 
 
 def _items_fit(value: Sequence[Any], parts: Sequence[Any]) -> bool:
@@ -103,12 +117,6 @@ def as_tuple(value: Any, hint: Any) -> Any:
     within = (hint, *get_args(hint))  # also within an optional type
     wanted = isinstance(value, list) and any(tuple in (h, get_origin(h)) for h in within)
     return tuple(value) if wanted else value
-
-
-def shortly(value: Any) -> str:
-    """Return a value's representation in one line of limited length."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def in_words(hint: Any) -> str:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import shortly
 
 _INF = math.inf
 _REAL = "biuf"
@@ -81,7 +82,7 @@ def _unusual(system: System, name: str, value: Any, count: int) -> list[float]:
         array = np.asarray(None)
     if array.size and array.dtype.kind not in _REAL:
         hint = ", NaN if it is missing" if name == "y" else ""
-        raise ValueError(f"{name}={value!r}; expected {count} number(s){hint}")
+        raise ValueError(f"{name}={shortly(value)}; expected {count} number(s){hint}")
     if array.shape != (count,) and not (count == 1 and array.ndim == 0):
         raise ValueError(
             f"{name} has shape {array.shape}; {type(system).__name__} has n{name}={count}, "
@@ -99,7 +100,7 @@ def _time(system: System, t: Any) -> float:
     """Return a time that is no usual number."""
     array = np.asarray(t)
     if array.ndim or array.dtype.kind not in "iuf" or not np.isfinite(array):
-        raise ValueError(f"t={t!r}; expected a finite number of {system.time_unit}")
+        raise ValueError(f"t={shortly(t)}; expected a finite number of {system.time_unit}")
     return float(array)
 
 

@@ -15,7 +15,8 @@ from pinnobs_gym.estimation.live_steps import ByNumpy, InBuffers, Point, Steps
 from pinnobs_gym.simulation.plant_form import first_row
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.start_law import check_covariance
-from pinnobs_gym.simulation.system import System, is_number, vector
+from pinnobs_gym.simulation.system import System, vector
+from pinnobs_gym.simulation.values import is_number, is_whole, shortly
 
 
 def check_online(estimator: Any) -> None:
@@ -56,10 +57,10 @@ def check_settings(late: Any, ring: Any, longest_gap: Any) -> None:
     """
     if late not in ("refuse", "replay"):
         raise ValueError(f"late={late!r}; expected 'refuse' or 'replay'")
-    if isinstance(ring, bool) or not isinstance(ring, int | np.integer) or ring < 1:
-        raise ValueError(f"ring={ring!r}; expected a whole number of at least 1 sample")
+    if not is_whole(ring, 1):
+        raise ValueError(f"ring={shortly(ring)}; expected a whole number of at least 1 sample")
     if not (is_number(longest_gap) and longest_gap > 0):
-        raise ValueError(f"longest_gap={longest_gap!r}; expected a positive number of s")
+        raise ValueError(f"longest_gap={shortly(longest_gap)}; expected a positive number of s")
 
 
 def prior_of(system: System, xhat0: Any, P0: Any) -> Prior:

@@ -137,6 +137,12 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
     def __post_init__(self) -> None:
         super().__post_init__()
 
+    @property
+    def training(self) -> dict[str, Any]:
+        """Training metadata; z that starts at T(x̂₀) knows the prior."""
+        facts = super().training
+        return {**facts, "knows": ("prior",)} if self.trained.start == "prior" else facts
+
     def reset(self, prior: Prior) -> State:
         return State(np.array(prior.mean, dtype=float))
 

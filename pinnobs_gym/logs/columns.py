@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 
+from pinnobs_gym.logs.csv_lines import shown
 from pinnobs_gym.logs.formulas import Formula, parsed
-from pinnobs_gym.logs.table import Table, listed, quoted, shown
+from pinnobs_gym.logs.table import Table, listed, quoted
 from pinnobs_gym.simulation.system import System
 
 _TIME = ("time", "stamp", "clock", "sec", "millis", "zeit")

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from pinnobs_gym.logs.columns import chosen, unused
+from pinnobs_gym.logs.csv_lines import shown
 from pinnobs_gym.logs.formulas import Formula
-from pinnobs_gym.logs.table import Table, listed, read_table, shown
+from pinnobs_gym.logs.table import Table, listed, read_table
 from pinnobs_gym.logs.times import check_times, read_times, without_rounding
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import LARGEST
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ def read_log(path: str | Path, system: System, prior: Prior, columns: Sequence[s
     Its columns are t (s, or steps of a map), the outputs as y1, y2, ... or by their own names, and,
     if the system has inputs, these as u1, u2, ... or by their own names. Sample times may be
     irregular. An empty cell or ``nan`` is a missing output, or an input that keeps its last value.
+    Numbers are in digits from 0 to 9; those above 1e30 are none that a sensor measured.
     Columns y1_std or ``<output>_std`` hold the standard deviation of an output's noise at each
     sample, where it is known. Other columns are not used, which a note says.
 
@@ -101,10 +104,10 @@ def _values(table: Table, quantity: str, formula: Formula) -> np.ndarray:
     """Return the values (num_samples,) of a quantity, NaN where a cell in its formula is empty."""
     columns = {name: table.numbers(name) for name in formula.columns}
     found = formula.values(columns, len(table.rows))
-    wrong = ~np.isfinite(found)
+    wrong = ~(abs(found) <= LARGEST)
     for values in columns.values():
         wrong &= ~np.isnan(values)
-    expected = "a finite number"
+    expected = f"a finite number up to {LARGEST:g}"
     if quantity.endswith("_std"):
         wrong |= found <= 0
         expected = "a number above 0, or no value"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -11,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from pinnobs_gym.logs.csv_lines import shown, split_lines
+from pinnobs_gym.simulation.values import LARGEST
+
 _SHOWN = 60
-"""Number of characters of a text that a message shows."""
+"""Number of characters of a name that a list of names shows."""
 _LISTED = 20
 """Number of names that a message lists."""
-_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,19 @@ class Table:
         if self.decimal_commas(name):
             cells = [cell.replace(",", ".") for cell in cells]
         try:
-            found = np.array([float(cell or "nan") for cell in cells])
+            found = np.array([number(cell or "nan") for cell in cells])
         except ValueError:
-            found = np.array([_float(cell) for cell in cells])
-        wrong = np.flatnonzero(np.isinf(found))
+            found = np.array([_number_or_inf(cell) for cell in cells])
+        wrong = np.flatnonzero(abs(found) > LARGEST)
         if len(wrong):
-            cell = shown(self.cells(name)[wrong[0]])
-            raise ValueError(f"{self.place(wrong[0])}: {name}={cell} is not a finite number")
+            k = wrong[0]
+            place = f"{self.place(k)}: {name}={shown(self.cells(name)[k])}"
+            if np.isfinite(found[k]):
+                raise ValueError(
+                    f"{place}; expected a number up to {LARGEST:g}, or an empty cell where a "
+                    "sensor gave none"
+                )
+            raise ValueError(f"{place} is not a finite number")
         return found
 
     def decimal_commas(self, name: str) -> bool:
@@ -80,10 +87,22 @@ class Table:
         return "," in text and "." not in text
 
 
-def _float(cell: str) -> float:
+def number(text: str) -> float:
+    """Return the number that a text is, as all programs read it: in digits from 0 to 9, without
+    the underscores and the digits of other scripts that Python reads, too.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"{shown(text)} is not a number")
+    return float(text)
+
+
+def _number_or_inf(cell: str) -> float:
     """Return the number of a cell, and infinity if it is none."""
     try:
-        return float(cell or "nan")
+        return number(cell or "nan")
     except ValueError:
         return math.inf
 
@@ -91,9 +110,6 @@ def _float(cell: str) -> float:
 def read_table(path: Path, kind: str = "log") -> Table:
     """Read a CSV file with a header. Its cells are separated by commas, semicolons or tabs: by what
     the header has most of. Lines without any text in their cells are left out.
-
-    Each line is parsed by itself, as no cell of a log extends over several lines: a quote that is
-    not closed is thus found in its own line, rather than at the end of the file.
 
     Args:
         path: the file.
@@ -104,42 +120,20 @@ def read_table(path: Path, kind: str = "log") -> Table:
     """
     header: list[str] = []
     separator, rows, lines = ",", [], []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            for number, line in enumerate(file, 1):
-                if not header and line.strip():
-                    separator = max(_SEPARATORS, key=line.count)
-                cells = _parsed(line, separator, f"{kind} {path}, line {number}")
-                if not any(cell.strip() for cell in cells):
-                    continue
-                if not header:
-                    header = [name.strip() for name in cells]
-                    continue
-                if len(cells) != len(header):
-                    raise ValueError(
-                        _miscounted(f"{kind} {path}, line {number}", cells, header, separator)
-                    )
-                rows.append(cells)
-                lines.append(number)
-    except UnicodeDecodeError as error:
-        raise ValueError(f"cannot read {kind} {path}: {error}; expected a text in UTF-8") from None
-    except OSError as error:
-        raise ValueError(f"cannot read {kind} {path}: {error}") from None
+    for number, separator, cells in split_lines(path, kind):
+        if not header:
+            header = [name.strip() for name in cells]
+        elif len(cells) != len(header):
+            place = f"{kind} {path}, line {number}"
+            raise ValueError(_miscounted(place, cells, header, separator))
+        else:
+            rows.append(cells)
+            lines.append(number)
     if not header:
         raise ValueError(f"{kind} {path} is empty; expected a header and rows of numbers")
     if not rows:
         raise ValueError(f"{kind} {path} has a header but no rows")
     return Table(path, header, rows, np.array(lines), separator, kind)
-
-
-def _parsed(line: str, separator: str, place: str) -> list[str]:
-    try:
-        return next(csv.reader([line], strict=True, delimiter=separator), [])
-    except csv.Error as error:
-        raise ValueError(
-            f"{place}: {shown(line)} is no line of a CSV file ({error}); expected every quote to "
-            "be closed in its line"
-        ) from None
 
 
 def _miscounted(place: str, cells: list[str], header: list[str], separator: str) -> str:
@@ -150,12 +144,6 @@ def _miscounted(place: str, cells: list[str], header: list[str], separator: str)
     if separator == "," and len(cells) > len(header) > 1:
         text += "; numbers with decimal commas need semicolons between them"
     return text
-
-
-def shown(text: str) -> str:
-    """Return the representation of a text, of which only the beginning is shown if it is long."""
-    text = text.strip()
-    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
 
 
 def quoted(argument: str) -> str:

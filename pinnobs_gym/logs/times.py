@@ -8,8 +8,9 @@ from datetime import datetime
 
 import numpy as np
 
+from pinnobs_gym.logs.csv_lines import shown
 from pinnobs_gym.logs.formulas import Formula
-from pinnobs_gym.logs.table import Table, quoted, shown
+from pinnobs_gym.logs.table import Table, number, quoted
 from pinnobs_gym.simulation.motion import check_steps
 from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import System
@@ -59,7 +60,7 @@ def read_times(table: Table, formula: Formula) -> tuple[np.ndarray, datetime | N
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell.replace(",", ".") or "nan")
+        number(cell.replace(",", ".") or "nan")
     except ValueError:
         return False
     return True

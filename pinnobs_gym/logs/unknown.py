@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pinnobs_gym.simulation.augmented import Unknown, augmented
-from pinnobs_gym.simulation.system import System, is_number
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import is_number
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from pinnobs_gym.logs.csv_lines import split_lines
+
 Format: TypeAlias = Literal["csv", "parquet"]
 """The formats of tables, which are also the suffixes of their files."""
 _LONGEST_SHOWN = 40
@@ -119,16 +121,14 @@ def read_cells(path: Path) -> Cells:
         raise ValueError(f"there is no file {path}")
     if path.suffix == ".parquet":
         return _read_parquet(path)
-    lines, rows = [], []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    lines.append(reader.line_num)
-                    rows.append(cells)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
+    lines, rows, separator = [], [], ","
+    for number, between, cells in split_lines(path, "estimates"):
+        separator = between
+        lines.append(number)
+        rows.append(cells)
+    if separator != ",":
+        kind = "semicolons" if separator == ";" else "tabs"
+        raise ValueError(f"{path} is separated by {kind}; expected commas")
     if len(rows) < 2:
         raise ValueError(f"{path} has no rows; expected a header and a line per sample")
     names = [name.strip() for name in rows[0]]

@@ -29,13 +29,22 @@ from pinnobs_gym.scoring.provenance import (
     versions,
 )
 from pinnobs_gym.scoring.recency import LastUse
-from pinnobs_gym.scoring.row_format import NEEDED, OPTIONAL, SCHEMA, Row, check_names
+from pinnobs_gym.scoring.row_format import (
+    LAST_SEED,
+    MOST_EPISODES,
+    NEEDED,
+    OPTIONAL,
+    SCHEMA,
+    Row,
+    check_names,
+)
 from pinnobs_gym.scoring.table import Rows
 from pinnobs_gym.scoring.tensorboard import log_episodes, log_summary
 from pinnobs_gym.scoring.tuned import SUFFIX, TUNED, is_tuned, required_settings
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.notices import say_first
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import is_finite, shortly
 from pinnobs_gym.training.by_name import LOGS
 from pinnobs_gym.training.log import SILENT, Log
 
@@ -156,15 +165,19 @@ def seeds_of(seed: int, episodes: int) -> range:
     """Return the seeds of a number of episodes, given the first.
 
     Raises:
-        ValueError: in one line, if the number of episodes is below one or the seed is negative, or
-            one of them is not a whole number.
+        ValueError: in one line, if the number of episodes is not from 1 to `MOST_EPISODES` or a
+            seed not from 0 to `LAST_SEED`, or one of them is not a whole number.
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0)):
+        if not is_finite(value) or int(value) != value:
+            raise ValueError(f"{name}={shortly(value)}; expected a whole number")
         if value < least:
             raise ValueError(f"{name}={value}; expected at least {least}")
-        if int(value) != value:
-            raise ValueError(f"{name}={value}; expected a whole number")
-    return range(int(seed), int(seed + episodes))
+    if episodes > MOST_EPISODES:
+        raise ValueError(f"episodes={episodes}; expected at most {MOST_EPISODES}")
+    if seed + episodes - 1 > LAST_SEED:
+        raise ValueError(f"seed={seed}; expected seeds of at most {LAST_SEED}")
+    return range(int(seed), int(seed) + int(episodes))
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,12 @@ NEEDED = {
 }
 """The required fields of each kind of row, beside ``schema`` and ``kind``."""
 
+LAST_SEED = 2**63 - 1
+"""Largest seed of an episode, and largest count."""
+MOST_EPISODES = 10**7
+"""Largest number of episodes of an evaluation."""
+_HUGE = re.compile(rb"[0-9][eE]\+?[0-9]{3}")
+"""The end of a number that may be beyond those of double precision."""
 _LONGEST_SHOWN = 60
 """Largest number of characters that an error shows of a value."""
 _MOST_STATES = 10**6
@@ -152,7 +158,7 @@ def _is_time(value: str) -> bool:
 
 
 def _is_count(value: object) -> bool:
-    return type(value) is int and value >= 0
+    return type(value) is int and 0 <= value <= LAST_SEED
 
 
 def _is_dimension(value: object) -> bool:
@@ -172,7 +178,9 @@ def _is_object(value: object) -> bool:
 
 
 def _is_episode(value: object) -> bool:
-    return type(value) is str and re.fullmatch(r"seed:(0|[1-9][0-9]{0,18})", value) is not None
+    if type(value) is not str or re.fullmatch(r"seed:(0|[1-9][0-9]{0,18})", value) is None:
+        return False
+    return len(value) < len("seed:") + 19 or int(value[5:]) <= LAST_SEED
 
 
 def _are_texts(value: object) -> bool:
@@ -236,7 +244,7 @@ def checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
     Args:
         path: the file, for messages.
         number: of the line, for messages.
-        line: the line.
+        line: the line; empty for a row that was stored otherwise.
         row: the object in the line; None if the line is not an object.
 
     Raises:
@@ -245,11 +253,13 @@ def checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
     if row is None:
         text = line[:40].decode(errors="replace")
         raise ValueError(
-            f"{path}, line {number}, is cut off or is not a row: {text!r}...; delete that line "
-            f"and run again, and only what it held is run anew"
+            f"{path}, line {number}, is cut off or is not a row: {text!r}... ({_reason(line)}); "
+            "delete that line and run again, and only what it held is run anew"
         )
     try:
-        _check(row, b"NaN" in line or b"Infinity" in line)
+        if line and line.count(b'":') != _number_of_keys(row):
+            json.loads(line, object_pairs_hook=_without_repeated)
+        _check(row, b"NaN" in line or b"Infinity" in line or _HUGE.search(line) is not None)
     except ValueError as error:
         raise ValueError(f"{path}, line {number}: {error}") from None
     except RecursionError:
@@ -257,12 +267,51 @@ def checked(path: Path, number: int, line: bytes, row: Row | None) -> Row:
     return row
 
 
+def _reason(line: bytes) -> str:
+    """Return why a line is not a JSON object."""
+    try:
+        return f"JSON of a {type(json.loads(line)).__name__}; expected an object"
+    except RecursionError:
+        return "nested too deeply"
+    except UnicodeDecodeError:
+        return "not in UTF-8"
+    except json.JSONDecodeError as error:
+        return f"{error.msg}, column {error.colno}"
+    except ValueError:  # Python reads no whole number of more than some thousand digits
+        return "a number of too many digits"
+
+
+def _number_of_keys(value: object) -> int:
+    """Return the number of keys of all objects in a value."""
+    if type(value) is dict:
+        return len(value) + sum(
+            _number_of_keys(v) for v in value.values() if type(v) in (dict, list)
+        )
+    if type(value) is list:
+        return sum(_number_of_keys(v) for v in value if type(v) in (dict, list))
+    return 0
+
+
+def _without_repeated(pairs: list[tuple[str, Any]]) -> Row:
+    """Return the object of these keys and values.
+
+    Raises:
+        ValueError: in one line, if a key is repeated.
+    """
+    found: Row = {}
+    for name, value in pairs:
+        if name in found:
+            raise ValueError(f"{_short(name)} is given twice; expected once")
+        found[name] = value
+    return found
+
+
 def _check(row: Row, constants: bool) -> None:
     """Check a row, and restore its infinities.
 
     Args:
         row: the row.
-        constants: whether it may hold NaN or Infinity, which Python reads though they are not JSON.
+        constants: whether it may hold NaN or infinity, which Python reads though JSON has neither.
     """
     if row.get("schema") != SCHEMA:
         raise ValueError(
@@ -285,6 +334,8 @@ def _check(row: Row, constants: bool) -> None:
         for name in LOG_FILES:
             if name in row and not is_name(row[name]):
                 raise ValueError(f"{name}={shown(row[name])}; expected {NAME_EXPECTED}")
+        if not _is_count(row.get("batch", 0)):
+            raise ValueError(f"batch={shown(row['batch'])}; expected {_COUNT[0]}")
         _check_training(row["training"])
         _restore(row)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pinnobs_gym.logs.table import number
 from pinnobs_gym.scoring.episode_table import Cells, shown
 
 _SHIFT = 1e-3
@@ -121,10 +122,14 @@ def _parsed(cells: Cells, name: str, i: int, parse: Callable[[Any], Any], expect
 
 
 def _float(cell: Any) -> float:
-    """Return a number; ``1_000``, which Python reads, is none."""
-    if isinstance(cell, str) and "_" in cell:
+    """Return the number of a cell: of a CSV file a text, which may be ``inf``."""
+    if not isinstance(cell, str):
+        return float(cell)
+    text = cell.strip()
+    value = number(text)
+    if math.isinf(value) and text.lower().lstrip("+-") != "inf":  # 1e400 has not diverged
         raise ValueError
-    return float(cell)
+    return value
 
 
 def _whole(cell: Any) -> int:

@@ -175,8 +175,6 @@ def _check_columns(cells: Cells, needed: Sequence[str], optional: Sequence[str])
         ValueError: in one line, if a column is missing, unknown or there twice.
     """
     path, names = cells.path, cells.names
-    if len(names) == 1 and ";" in names[0]:
-        raise ValueError(f"{path} is separated by semicolons; expected commas")
     listed = ", ".join(needed)
     for name in names:
         if names.count(name) > 1:

@@ -14,7 +14,8 @@ from pinnobs_gym.simulation.cached import cached_by_plant
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.noise import Level, noise_root
 from pinnobs_gym.simulation.start_law import Box, Joint
-from pinnobs_gym.simulation.system import PoorPrior, Setup, System, is_number, vector
+from pinnobs_gym.simulation.system import PoorPrior, Setup, System, vector
+from pinnobs_gym.simulation.values import is_number
 
 
 def augmented(

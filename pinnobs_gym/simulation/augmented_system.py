@@ -11,7 +11,8 @@ import numpy as np
 from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.derivatives import central_differences
 from pinnobs_gym.simulation.residual import Periods
-from pinnobs_gym.simulation.system import Array, System, is_number, stack
+from pinnobs_gym.simulation.system import Array, System, stack
+from pinnobs_gym.simulation.values import is_number
 
 
 @dataclass(frozen=True)

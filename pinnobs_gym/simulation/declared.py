@@ -16,10 +16,13 @@ import numpy as np
 from pinnobs_gym.simulation.bounds import beyond, box
 from pinnobs_gym.simulation.residual import check_periods
 from pinnobs_gym.simulation.start_law import Box, Points
-from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number, vector
+from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
+from pinnobs_gym.simulation.values import is_number
 
 _NAMES = ("state_names", "output_names", "input_names", "uncertain")
 """Attributes that are several names."""
+_NO_NAME = ',;"'
+"""Characters that the names of columns cannot have."""
 _CALLS = {
     "f": "t, x, u",
     "h": "t, x, u",
@@ -70,6 +73,12 @@ def _check_names(cls: type[System]) -> None:
         ):
             few = (names,) if isinstance(names, str) else ("a", "b")
             raise ValueError(f"{name}={names!r}; expected a tuple of names, such as {few!r}")
+        for each in names:
+            if not each.isprintable() or each != each.strip() or set(each) & set(_NO_NAME):
+                raise ValueError(
+                    f"{name}={names!r}; expected names for the header of a table, without "
+                    "commas, semicolons, quotes, line breaks, and blanks at their ends"
+                )
         twice = [each for each in names if list(names).count(each) > 1]
         if twice:
             raise ValueError(f"{name}={names!r}; expected {twice[0]!r} once")

@@ -12,6 +12,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.matrices import outer, product
 from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.values import LARGEST, real_array, shortly
 
 if TYPE_CHECKING:
     from pinnobs_gym.simulation.system import System
@@ -37,13 +38,15 @@ def noise_root(level: Level, size: int | None, name: str, plant: str = "") -> np
     """
     of = f" of {plant}" if plant else ""
     try:
-        given = np.asarray(level, dtype=float)
-    except (TypeError, ValueError):
+        given = real_array(name, level)
+    except ValueError:
         given = np.array(np.nan)
     if given.ndim < 2 and not (np.isfinite(given).all() and (given >= 0).all()):
-        raise ValueError(f"{name}={level!r}{of}; expected numbers of at least 0")
+        raise ValueError(f"{name}={shortly(level)}{of}; expected numbers of at least 0")
     if not np.isfinite(given).all():
-        raise ValueError(f"{name}={level!r}{of}; expected a matrix of finite numbers")
+        raise ValueError(f"{name}={shortly(level)}{of}; expected a matrix of finite numbers")
+    if abs(given).max(initial=0.0) > LARGEST:
+        raise ValueError(f"{name}={shortly(level)}{of}; expected at most {LARGEST:g}")
     rows = (given.shape or (1,))[0] if size is None else size
     if given.ndim > 2 or (given.ndim and len(given) != rows):
         raise ValueError(

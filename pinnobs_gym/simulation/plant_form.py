@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pinnobs_gym.simulation.system import System, is_number
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import is_number
 
 T = TypeVar("T")
 

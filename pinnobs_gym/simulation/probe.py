@@ -17,7 +17,8 @@ from pinnobs_gym.simulation.at_bounds import faults_at_bounds
 from pinnobs_gym.simulation.declared import check_declared, check_starts
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.notices import say_once
-from pinnobs_gym.simulation.system import Setup, System, initial_states, is_number
+from pinnobs_gym.simulation.system import Setup, System, initial_states
+from pinnobs_gym.simulation.values import is_number
 
 
 class ModelError(TypeError):

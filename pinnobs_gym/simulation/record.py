@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.system import Setup, System
+from pinnobs_gym.simulation.values import real_array
 
 _ROUNDING = 1e-6
 """Largest difference of an input from that which a system defines, relative to its size."""
@@ -34,7 +34,7 @@ class Prior:
 
     def __post_init__(self) -> None:
         for name in ("mean", "cov"):
-            array = _real(f"the prior's {name}", getattr(self, name))
+            array = real_array(f"the prior's {name}", getattr(self, name), truths=True)
             if not np.isfinite(array).all():
                 wrong = float(array[~np.isfinite(array)][0])
                 raise ValueError(f"the prior's {name} has the entry {wrong}; expected finite ones")
@@ -59,7 +59,7 @@ class Prior:
     def of(system: System, setup: Setup, batch: int, xhat0: object = None) -> Prior:
         """Return the prior of a setup; ``xhat0``, (nx,) or (batch, nx), replaces its mean."""
         own, cov = prior_moments(system, setup)
-        mean = own if xhat0 is None else np.asarray(xhat0, dtype=float)
+        mean = own if xhat0 is None else real_array("xhat0", xhat0)
         if mean.shape not in ((system.nx,), (batch, system.nx)):
             raise ValueError(f"xhat0 has shape {mean.shape}; expected ({system.nx},)")
         if not np.isfinite(mean).all():
@@ -98,7 +98,7 @@ class Record:
     def __post_init__(self) -> None:
         arrays = ["y", "u"] if self.noise_std is None else ["y", "u", "noise_std"]
         for name in ("t", *arrays):
-            object.__setattr__(self, name, _real(name, getattr(self, name)))
+            object.__setattr__(self, name, real_array(name, getattr(self, name), truths=True))
         steps = np.diff(self.t)
         if self.t.ndim != 1 or not len(self.t):
             raise ValueError(f"t has shape {self.t.shape}; expected (num_samples,)")
@@ -215,16 +215,3 @@ def _input_size(system: System) -> np.ndarray:
             axis=0
         )
     return kept[_SIZE]
-
-
-def _real(name: str, value: Any) -> np.ndarray:
-    """Return the value as an array in double precision.
-
-    Raises:
-        ValueError: in one line, if it does not consist of real numbers.
-    """
-    array = np.asarray(value)
-    if array.dtype.kind not in "biuf":
-        first = f", such as {array.flat[0]!r}" if array.size else ""
-        raise ValueError(f"{name} holds values of type {array.dtype}{first}; expected real numbers")
-    return array.astype(float, copy=False)

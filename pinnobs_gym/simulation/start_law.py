@@ -10,6 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
+from pinnobs_gym.simulation.values import finite_array, real_array, shortly
+
 _INSIDE = 0.95
 """Probability of the ellipsoid that counts as the set of a Gaussian law."""
 _DEVIATIONS = 3.0
@@ -73,8 +75,7 @@ class Box(StartLaw):
 
     def __post_init__(self) -> None:
         for name, corner in (("x0_low", self.low), ("x0_high", self.high)):
-            if np.ndim(corner) != 1 or not np.isfinite(corner).all():
-                raise ValueError(f"{name}={corner}; expected one finite number per state")
+            _check_state(name, corner)
         if len(self.low) != len(self.high):
             raise ValueError(
                 f"x0_low has {len(self.low)} number(s), x0_high {len(self.high)}; expected as many"
@@ -135,8 +136,7 @@ class Gaussian(StartLaw):
     be singular."""
 
     def __post_init__(self) -> None:
-        if np.ndim(self.x0_mean) != 1 or not np.isfinite(self.x0_mean).all():
-            raise ValueError(f"x0_mean={self.x0_mean}; expected one finite number per state")
+        _check_state("x0_mean", self.x0_mean)
         check_covariance(self.x0_cov, "x0_cov")
         if len(self.x0_cov) != len(self.x0_mean):
             raise ValueError(
@@ -213,9 +213,15 @@ class Points(StartLaw):
     """The states, nx numbers each, in state units."""
 
     def __post_init__(self) -> None:
-        lengths = {np.shape(state) for state in self.states}
-        if len(lengths) != 1 or len(next(iter(lengths))) != 1 or not np.isfinite(self.states).all():
-            raise ValueError(f"states={self.states}; expected rows of one finite number per state")
+        try:
+            states = finite_array("states", self.states)
+            known = states.ndim == 2 and states.size > 0
+        except ValueError:
+            known = False
+        if not known:
+            raise ValueError(
+                f"states={shortly(self.states)}; expected rows of one finite number per state"
+            )
 
     @cached_property
     def _states(self) -> np.ndarray:
@@ -305,13 +311,25 @@ class Joint(StartLaw):
         return self.first.fixed and self.second.fixed
 
 
+def _check_state(name: str, values: Sequence[float]) -> None:
+    """Raise ValueError, in one line, unless a value is several finite numbers."""
+    try:
+        known = finite_array(name, values).ndim == 1
+    except ValueError:
+        known = False
+    if not known:
+        raise ValueError(f"{name}={shortly(values)}; expected one finite number per state")
+
+
 def check_covariance(rows: Sequence[Sequence[float]], name: str) -> None:
     """Raise ValueError, in one line, unless the rows are those of a covariance; zero variances are
     allowed."""
     try:
-        P = np.array(rows, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}={rows!r}; expected a covariance, rows of numbers") from None
+        P = real_array(name, rows)
+    except ValueError:
+        raise ValueError(
+            f"{name}={shortly(rows)}; expected a covariance, rows of numbers"
+        ) from None
     if P.ndim != 2 or P.shape[0] != P.shape[1]:
         raise ValueError(f"{name}={rows}; expected a covariance, as many rows as columns")
     size = abs(P).max(initial=0.0)

@@ -14,7 +14,8 @@ from sympy.printing.conventions import split_super_sub
 
 from pinnobs_gym.simulation.expressions import Expressions, as_array, column, tidy
 from pinnobs_gym.simulation.plant_form import numeric_properties
-from pinnobs_gym.simulation.system import System, is_number
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.values import is_number
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,16 @@ from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, residual
 from pinnobs_gym.simulation.start_law import Box, Gaussian, StartLaw, check_covariance
+from pinnobs_gym.simulation.values import (
+    LARGEST,
+    check_mapping,
+    check_parameters,
+    finite_array,
+    is_finite,
+    is_number,
+    real_array,
+    shortly,
+)
 
 Array: TypeAlias = Any
 """An array of any library of the array API standard, such as numpy.ndarray or torch.Tensor."""
@@ -21,6 +31,8 @@ _FROM_DT: Any = None
 """A duration that follows from the time between samples."""
 _USUAL_STEPS = 100
 """Its number of steps."""
+MOST_SAMPLES = 10**7
+"""Largest number of samples of an episode."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +45,7 @@ class PoorPrior:
     """Covariance P₀, nx rows of nx numbers, in products of state units."""
 
     def __post_init__(self) -> None:
-        _check_finite(self.xhat0, "xhat0 of the poor prior")
+        finite_array("xhat0 of the poor prior", self.xhat0)
         check_covariance(self.P0, "P0")
 
 
@@ -99,8 +111,15 @@ class Setup:
             value = getattr(self, name)
             if name in ("transient", "truth_step") and value is None:
                 continue
-            if not (is_number(value) and 0 < value < np.inf):
-                raise ValueError(f"{name}={value} s; expected a positive number of seconds")
+            if not (is_finite(value) and value > 0):
+                raise ValueError(
+                    f"{name}={shortly(value)} s; expected a positive number of seconds"
+                )
+        if float(self.duration) / float(self.dt) > MOST_SAMPLES:
+            raise ValueError(
+                f"duration={self.duration:g} s has {self.duration / self.dt:.3g} samples of "
+                f"dt={self.dt:g} s; expected at most {MOST_SAMPLES}"
+            )
         if self.duration < self.dt * (1 - 1e-9):
             raise ValueError(
                 f"duration={self.duration} s is shorter than one sample, dt={self.dt} s"
@@ -115,11 +134,11 @@ class Setup:
         for name, kind in (("x0_law", StartLaw), ("poor_prior", PoorPrior)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
-                raise ValueError(f"{name}={value!r}; expected None or a {kind.__name__}")
-        if not isinstance(self.parameters, Mapping):
-            raise ValueError(f"parameters={self.parameters!r}; expected values by name")
+                raise ValueError(f"{name}={shortly(value)}; expected None or a {kind.__name__}")
+        check_mapping(self.parameters)
         for name in ("x0_low", "x0_high", "xhat0"):
-            _check_finite(getattr(self, name), name)
+            if getattr(self, name) is not None:
+                finite_array(name, getattr(self, name))
         corners = [name for name in ("x0_low", "x0_high") if getattr(self, name) is not None]
         if not corners and self.x0_law is None and self.xhat0 is not None and self.P0 is not None:
             check_covariance(self.P0, "P0")
@@ -415,22 +434,24 @@ class System(ABC):
             ValueError: naming the value, if the setup or a parameter is unknown, or a value is out
                 of range.
         """
-        if setup not in cls.setups:
+        if not isinstance(setup, str) or setup not in cls.setups:
             raise ValueError(
-                f"unknown setup {setup!r} of {cls.__name__}; it has {', '.join(cls.setups)}"
+                f"unknown setup {shortly(setup)} of {cls.__name__}; it has {', '.join(cls.setups)}"
             )
         changes: dict[str, Any] = {"dt": dt, "duration": duration, "noise_std": noise_std}
         changes = {name: value for name, value in changes.items() if value is not None}
         own = cls.setups[setup].transient
-        if own is not None and duration is not None and 0 < duration < own:
+        shorter = duration is not None and is_number(duration) and 0 < duration < (own or 0.0)
+        if shorter:
             changes["transient"] = None
         chosen = replace(cls.setups[setup], **changes)
         system = cls()
-        wanted = {**chosen.parameters, **(parameters or {})}
+        wanted = {**chosen.parameters, **check_mapping(parameters or {})}
         for name in wanted:
             if name not in system.parameters:
                 known = ", ".join(system.parameters) or "none"
                 raise ValueError(f"unknown parameter {name!r} of {cls.__name__}; it has {known}")
+        check_parameters(cls, wanted)
         system = replace(system, **wanted)
         system.noise(chosen.noise_std, chosen.process_noise)
         system.check_times(chosen)
@@ -509,16 +530,6 @@ class System(ABC):
             raise TypeError(f"system {cls.__name__}: uncertain names no parameter {unknown[0]!r}")
 
 
-def _check_finite(values: Any, name: str) -> None:
-    """Raise ValueError, naming the value, unless it is None, a number or several finite ones."""
-    try:
-        known = values is None or bool(np.isfinite(np.asarray(values, dtype=float)).all())
-    except (TypeError, ValueError):
-        known = False
-    if not known:
-        raise ValueError(f"{name}={values!r}; expected finite numbers")
-
-
 def _check_sizes(prior: Setup | PoorPrior, nx: int, where: str) -> None:
     """Raise ValueError, naming the value, unless x̂₀ and P₀, if given, are of the right size."""
     if prior.xhat0 is not None:
@@ -533,8 +544,11 @@ def independent(*std: float) -> tuple[tuple[float, ...], ...]:
     Raises:
         ValueError: if one of them is not finite or below 0.
     """
-    if not (np.isfinite(std).all() and min(std, default=0.0) >= 0):
-        raise ValueError(f"standard deviations {std}; expected numbers of at least 0")
+    if not all(is_finite(each) and 0 <= each <= LARGEST for each in std):
+        raise ValueError(
+            f"standard deviations {shortly(std)}; expected numbers of at least 0, at most "
+            f"{LARGEST:g}"
+        )
     return tuple(tuple(row) for row in np.diag(np.square(std, dtype=float)).tolist())
 
 
@@ -544,17 +558,12 @@ def vector(value: Sequence[float] | np.ndarray | float, size: int, name: str) ->
     Raises:
         ValueError: naming the value and the expected size.
     """
-    array = np.asarray(value, dtype=float)
+    array = real_array(name, value)
     if array.ndim == 0:
         array = np.full(size, float(array))
     if array.shape != (size,):
         raise ValueError(f"{name} has shape {array.shape}; expected {size} number(s)")
     return array
-
-
-def is_number(value: object) -> bool:
-    """Return whether a value is a number, truth values aside."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
 def stack(like: Array, *components: Array | float) -> Array:

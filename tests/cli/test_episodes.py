@@ -411,6 +411,13 @@ WRONG = {
     "an empty cell": (changed(3, 3, ""), f"bad.csv, line 4: x2=''; {NUMBER}"),
     "no number": (changed(3, 3, "NaN"), f"bad.csv, line 4: x2='NaN'; {NUMBER}"),
     "text": (changed(3, 3, "1_0"), f"bad.csv, line 4: x2='1_0'; {NUMBER}"),
+    "other digits": (changed(3, 3, "１"), f"bad.csv, line 4: x2='１'; {NUMBER}"),
+    "a number beyond doubles": (changed(3, 3, "1e400"), f"bad.csv, line 4: x2='1e400'; {NUMBER}"),
+    "a stray quote": (
+        lambda lines: [*lines[:3], '0,0.04,0.5,"1', *lines[4:]],
+        "estimates bad.csv, line 4: '0,0.04,0.5,\"1' is no line of a CSV file (unexpected end of "
+        "data); expected every quote to be closed in its line",
+    ),
     "a cell too many": (changed(3, 3, "1,2"), "bad.csv, line 4: 5 cells; expected 4"),
     "a header alone": (
         lambda lines: lines[:1],

@@ -1,5 +1,6 @@
 """Options of commands, and settings of estimators."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -173,3 +174,54 @@ def test_mistakes_are_one_line_and_status_two(tmp_path, monkeypatch, capsys, lin
     (printed,) = capsys.readouterr().err.splitlines()
     assert message in printed
     assert printed.startswith("pinnobs: error: ")
+
+
+@dataclass(frozen=True)
+class Numbers:
+    whole: int = 1
+    number: float = 1.0
+    several: tuple[float, ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--whole", "1_0"], "--whole: '1_0'; expected a whole number of at most 18 digits"),
+        (["--whole", "\uff11"], "--whole: '\uff11'; expected a whole number"),
+        (["--whole", "1" * 5000], "expected a whole number of at most 18 digits"),
+        (["--number", "1_0"], "--number: '1_0'; expected a number"),
+        (["--number", "1e400"], "--number: '1e400'; expected a number below 1e308"),
+        (["--several"], "--several without a value; expected one or several"),
+    ],
+)
+def test_numbers_are_in_plain_digits(arguments, says):
+    with pytest.raises(ValueError, match=re.escape(says)) as caught:
+        parse(Numbers, "x", arguments)
+    assert len(str(caught.value)) < 200
+
+
+def test_plain_numbers_are_read():
+    arguments = ["--whole", "-3", "--number", "inf", "--several", "1e-3", "-2", ".5"]
+    assert parse(Numbers, "x", arguments) == Numbers(-3, float("inf"), (1e-3, -2.0, 0.5))
+
+
+@pytest.mark.parametrize("text", ["1_0", "\uff11", "1e400", "nan", "9" * 5000])
+def test_numbers_of_settings_are_in_plain_digits(text):
+    with pytest.raises(ValueError, match=r"setting .*; expected") as caught:
+        settings_of(Many, [f"number={text}"])
+    assert len(str(caught.value)) < 150
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--episodes", "-1"], "episodes=-1; expected at least 1"),
+        (["--episodes", "10000001"], "episodes=10000001; expected at most 10000000"),
+        (["--seed", "-1"], "seed=-1; expected at least 0"),
+        (["--seed", "9223372036854775808"], "--seed: '9223372036854775808'; expected a whole"),
+    ],
+)
+def test_numbers_of_episodes(tmp_path, monkeypatch, capsys, arguments, says):
+    monkeypatch.chdir(tmp_path)
+    assert main(["evaluate", "--system", "ReverseDuffing", *arguments]) == 2
+    assert says in capsys.readouterr().err

@@ -291,7 +291,7 @@ def test_stacked_outputs() -> None:
         ({"reward": "log"}, "reward='log'; expected 'error' or 'improvement'"),
         ({"reward": "improvement"}, "needs a prediction; 'estimate' has none"),
         ({"action_mode": "gain", "stack_outputs": 2}, "stack=2 goes with estimates"),
-        ({"stack_outputs": 0}, "stack=0; expected a whole number of at least 1"),
+        ({"stack_outputs": 0}, "stack_outputs=0; expected a whole number from 1 to 1001"),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], says: str) -> None:

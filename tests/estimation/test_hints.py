@@ -18,9 +18,9 @@ class Duck(Protocol):
 @pytest.mark.parametrize(
     ("hint", "good", "bad"),
     [
-        (int, [3, np.int64(3)], [True, 3.0, "3", None, np.bool_(1)]),
-        (float, [3, 0.5, np.float32(1), np.inf], [True, "x", None, 1j, [1.0]]),
-        (complex, [1, 1j], ["1j", False]),
+        (int, [3, np.int64(3)], [True, 3.0, "3", None, np.bool_(1), 2**63, 10**5000]),
+        (float, [3, 0.5, np.float32(1), np.inf], [True, "x", None, 1j, [1.0], np.nan, 1e31, 2**70]),
+        (complex, [1, 1j], ["1j", False, complex("nan+1j")]),
         (bool, [True, np.bool_(0)], [0, 1, "False", None]),
         (str, ["", "x"], [1, None, ["x"]]),
         (Path, [Path("x")], ["x"]),

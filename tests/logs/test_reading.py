@@ -62,6 +62,16 @@ def test_without_input_columns_the_systems_own_input_is_taken(tmp_path):
         ('t,y1\n\n0,1\n1,2"\n2,3\n', """line 4: y1='2"' is not a finite number"""),
         ('t,y1\n0,"1"2\n', """line 2: '0,"1"2' is no line of a CSV file"""),
         ('t,"y1\n0,1\n', """line 1: 't,"y1' is no line"""),
+        ("t,y1\n0,1_000\n", "line 2: y1='1_000' is not a finite number"),
+        ("t,y1\n0,１２\n", "line 2: y1='１２' is not a finite number"),
+        ("t,y1\n١,2\n", "line 2: t='١' is neither|line 2: t='١' is not"),
+        ("t,y1\n0,infinity\n", "line 2: y1='infinity' is not a finite number"),
+        ("t,y1\n0,nan(ind)\n", r"line 2: y1='nan\(ind\)' is not a finite number"),
+        ("t,y1\n0,0x10\n", "line 2: y1='0x10' is not a finite number"),
+        ("t,y1\n0,1e400\n", "line 2: y1='1e400' is not a finite number"),
+        ("t,y1\n0,9.9e37\n", "line 2: y1='9.9e37'; expected a number up to 1e\\+30, or an empty"),
+        ("t,y1\n0,1\x00\n", r"line 2: y1='1\\x00' is not a finite number"),
+        ("t\x00,y1\n0,1\n", r"line 1: 't\\x00,y1'; expected a text in UTF-8"),
     ],
 )
 def test_bad_logs_are_one_clear_line(tmp_path, text, message):
@@ -90,6 +100,48 @@ def test_quoted_cells_and_blank_lines(tmp_path):
     record = read(written(tmp_path, '"t","y1"\r\n\r\n"0","1.5"\r\n"1",""\r\n')).record
     np.testing.assert_array_equal(record.t, [0.0, 1.0])
     np.testing.assert_array_equal(record.y[0, :, 0], [1.5, np.nan])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: b"\xef\xbb\xbf" + text.encode(),
+        lambda text: text.replace("\n", "\r\n").encode(),
+        lambda text: text.replace("\n", "\r").encode(),
+        lambda text: text.replace("\n", "\r\r\n").encode(),
+        lambda text: text.replace(",", " ,\t ").encode(),
+        lambda text: text.replace("\n", "\n\n \n").encode(),
+        lambda text: text.replace("1.5", "+1.5E0").encode(),
+        lambda text: text.replace("nan", "-NaN").encode(),
+    ],
+)
+def test_what_people_have_in_files_is_read(tmp_path, change):
+    path = tmp_path / "log.csv"
+    path.write_bytes(change("t,y1\n0,1.5\n1,nan\n2,-.5\n"))
+    record = read(path).record
+    np.testing.assert_array_equal(record.t, [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(record.y[0, :, 0], [1.5, np.nan, -0.5])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("t,y1\n0,1\n".encode("utf-16"), "which is in UTF-16; expected a text in UTF-8"),
+        ("t,y1,T\r\n0,1,20\r\n1,2,20 °\r\n".encode("cp1252"), "line 3: byte 0xb0 is not"),
+        ("t,y1,T\r0,1,20 °\r".encode("cp1252"), "line 2: byte 0xb0 is not UTF-8; expected a text"),
+    ],
+)
+def test_other_encodings_are_told_by_their_line(tmp_path, content, says):
+    (tmp_path / "log.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=f"cannot read log .*{says}"):
+        read(tmp_path / "log.csv")
+
+
+def test_a_formula_that_overflows_is_told(tmp_path):
+    path = written(tmp_path, "t,y1\n0,1\n1,2\n")
+    says = r"line 2: y1=1e\+200, from 'y1\*1e200'; expected a finite number up to 1e\+30"
+    with pytest.raises(ValueError, match=says):
+        read_log(path, ReverseDuffing(), Prior.of(*ReverseDuffing.configured(), 1), ["y1=y1*1e200"])
 
 
 def test_a_log_that_is_not_there(tmp_path):

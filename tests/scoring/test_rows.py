@@ -391,12 +391,13 @@ def test_processes_may_share_a_file(tmp_path):
     assert seeds == sorted(100 * i + j for i in range(3) for j in range(50))
 
 
+_BIG = f'"seed:{2**63}"'
 WRONG = {
     "nrmse": ("-1", '"a"', "true", "NaN", "[0.1]", '{"a": 1}'),
     "us_per_step": ("-1", '"a"'),
     "anees": ("-0.5", "[]"),
     "innovation_correlation": ("-1.5", '"a"'),
-    "episode": ("-1", "1", "true", "null", '"1"', '"seed:-1"', '"seed:01"', '"seed:1.5"'),
+    "episode": ("-1", "1", "true", "null", '"1"', '"seed:-1"', '"seed:01"', '"seed:1.5"', _BIG),
     "nx": ("-1", '"2"', "0", f"1{'0' * 30}", "2.0"),
     "nrmse_tail": ("9", "null", "NaN", "0.2001"),
     "mse": ("Infinity", "-Infinity", "1e999", f"1{'0' * 400}"),
@@ -419,6 +420,7 @@ WRONG = {
     "settings": ("[]", "null", "1"),
     "training": ("[]",),
     "versions": ("1",),
+    "batch": ("-1", "true", '"a"'),
     "nominal_over_free": ("-1",),
     "effective_sample_size": ("-1", "true"),
     "monte_carlo": ("-0.1", '"a"'),
@@ -513,6 +515,41 @@ def test_infinite_errors_of_states_are_written_as_null(tmp_path):
     rows.append(path, [row(0, diverged=True, state_rmse={"steady": {"x1": float("inf")}})])
     assert "Infinity" not in path.read_text()
     assert rows.read(path)[0]["state_rmse"] == {"steady": {"x1": float("inf")}}
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (json.dumps(row(1))[:-1] + ', "mse": 1}', "line 2: mse is given twice; expected once"),
+        (
+            json.dumps(row(1) | {"options": {}}).replace(
+                '"options": {}', '"options": {"a": 1, "a": 2}'
+            ),
+            "line 2: a is given twice; expected once",
+        ),
+        (
+            json.dumps(row(1) | {"options": {"a": "?"}}).replace('"?"', "1e999"),
+            "line 2: options.a=Infinity; expected a value that JSON has",
+        ),
+        (
+            json.dumps(row(1) | {"nx": "?"}).replace('"?"', "1" * 5000),
+            "a number of too many digits",
+        ),
+        ("[]", "JSON of a list; expected an object"),
+        ("{'a': 1}", "Expecting property name enclosed in double quotes, column 2"),
+    ],
+)
+def test_why_a_line_is_no_row(tmp_path, line, reason):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(f"{json.dumps(row(0))}\n{line}\n{json.dumps(row(2))}\n")
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        rows.load(path)
+
+
+def test_a_text_with_what_looks_like_a_key_is_read(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    path.write_text(json.dumps(row(0) | {"options": {"a": 'b": c', "d": [{"e": 1}]}}) + "\n")
+    assert rows.read(path)[0]["options"]["d"] == [{"e": 1}]
 
 
 def test_endless_nesting_is_no_row(tmp_path):

@@ -39,6 +39,8 @@ def declared(**attributes) -> type[System]:
         ("input_names", None, "None; expected a tuple of names"),
         ("state_names", (1, 2), r"\(1, 2\); expected a tuple of names"),
         ("state_names", ("a", "a"), ".*; expected 'a' once"),
+        ("state_names", ("a,b", "c"), ".*; expected names for the header of a table.*"),
+        ("output_names", ("y\n",), ".*; expected names for the header of a table.*"),
         ("output_names", (), ".*; expected at least one name"),
         ("uncertain", "k", "'k'; expected a tuple of names"),
         ("state_low", 0.0, "0.0; expected a number for each of 2 states, None for no bound"),

@@ -25,7 +25,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pinnobs_gym.scoring.row_format import LAST_SEED, MOST_EPISODES
 from pinnobs_gym.scoring.tuned import SUFFIX
+from pinnobs_gym.simulation.values import shortly
 from pinnobs_gym.training.settings import SEEDS
 
 FOLDER = Path(__file__).parent
@@ -118,6 +120,8 @@ def load(spec: str) -> Suite:
         raise ValueError(f"cannot read {file}: {error.strerror or error}") from None
     except ValueError as error:  # not TOML, or not text
         raise ValueError(f"{file} is no TOML: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{file} is nested too deeply") from None
     known = [f.name for f in fields(Suite) if not f.kw_only]
     values = {}
     for key, value in content.items():
@@ -135,14 +139,14 @@ def _checked(key: str, value: Any) -> Any:
     expected, fits = _EXPECTED[key]
     several = key in _SEVERAL
     if several and not isinstance(value, list):
-        raise ValueError(f"{key}={value!r}; expected a list of {expected}")
+        raise ValueError(f"{key}={shortly(value)}; expected a list of {expected}")
     for part in value if several else [value]:
         if not fits(part):
-            raise ValueError(f"{key}={value!r}; expected {'a list of ' * several}{expected}")
+            raise ValueError(f"{key}={shortly(value)}; expected {'a list of ' * several}{expected}")
     if key == "estimators":
         return tuple(_entry(part) for part in value)
     if several and len({repr(part) for part in value}) < len(value):
-        raise ValueError(f"{key}={value!r}; expected each but once")
+        raise ValueError(f"{key}={shortly(value)}; expected each but once")
     return tuple(value) if several else value
 
 
@@ -161,9 +165,13 @@ def _entry(value: Any) -> Entry:
     entry = Entry(**{"name": "", **value})
     if not (isinstance(entry.name, str) and entry.name):
         raise ValueError(f"estimators: {dict(value)!r} has no name")
-    if entry.label is not None and not re.fullmatch(r"\w[\w .,=+%-]*", str(entry.label)):
+    label = entry.label
+    if label is not None and not (
+        isinstance(label, str) and re.fullmatch(r"\w[\w .,=+%-]*", label)
+    ):
         raise ValueError(
-            f"estimators: label={entry.label!r}; expected letters, digits, spaces and _ . , = + % -"
+            f"estimators: label={shortly(label)}; expected letters, digits, spaces and "
+            "_ . , = + % -"
         )
     if not isinstance(entry.settings, Mapping):
         raise ValueError(f"estimators: settings={entry.settings!r}; expected a table")
@@ -174,14 +182,15 @@ def _entry(value: Any) -> Entry:
     return entry
 
 
-def _whole(least: int) -> Callable[[Any], bool]:
-    return lambda value: type(value) is int and value >= least
+def _whole(least: int, most: int) -> Callable[[Any], bool]:
+    return lambda value: type(value) is int and least <= value <= most
 
 
 def _name(value: Any) -> bool:
     return isinstance(value, str) and bool(value)
 
 
+_EPISODES = f"at least 1, at most {MOST_EPISODES}", _whole(1, MOST_EPISODES)
 _SEVERAL = ("systems", "estimators", "conditions", "training_seeds", "budgets")
 _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "systems": ("names", _name),
@@ -191,9 +200,12 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "conditions": ("names", _name),
     "setup": ("a name", _name),
-    "episodes": ("at least 1", _whole(1)),
-    "trained_episodes": ("at least 1", _whole(1)),
-    "seed": ("at least 0", _whole(0)),
+    "episodes": _EPISODES,
+    "trained_episodes": _EPISODES,
+    "seed": (
+        f"at least 0, at most {LAST_SEED - MOST_EPISODES}",
+        _whole(0, LAST_SEED - MOST_EPISODES),
+    ),
     "training_seeds": (
         f"whole numbers from 0 to {SEEDS - 1}",
         lambda v: type(v) is int and 0 <= v < SEEDS,

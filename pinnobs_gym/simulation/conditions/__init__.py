@@ -21,6 +21,7 @@ from pinnobs_gym.simulation.conditions.measurement import (
 from pinnobs_gym.simulation.conditions.plant import LoadStep, Mismatch, ProcessNoise
 from pinnobs_gym.simulation.conditions.start import FarGuess, GivenPoorPrior, OutsideSet
 from pinnobs_gym.simulation.system import Setup, System
+from pinnobs_gym.simulation.values import shortly
 
 
 @dataclass(frozen=True)
@@ -122,10 +123,12 @@ def canonical_name(name: str) -> str:
         ValueError: listing the known conditions, if a part is unknown; naming the parts, if two are
             of the same kind.
     """
-    named = name.split("+")
+    named = name.split("+") if isinstance(name, str) else [name]
     for part in named:
-        if part not in CONDITIONS:
-            raise ValueError(f"unknown condition {part!r}; known are {', '.join(CONDITIONS)}")
+        if not isinstance(part, str) or part not in CONDITIONS:
+            raise ValueError(
+                f"unknown condition {shortly(part)}; known are {', '.join(CONDITIONS)}"
+            )
     named.sort(key=list(CONDITIONS).index)
     for first, second in pairwise(named):
         if type(CONDITIONS[first]) is type(CONDITIONS[second]):
