@@ -26,7 +26,7 @@ def assert_near(found, expected):
     assert np.nan_to_num(abs(found - expected)).max(initial=0.0) <= 1e-9 * size
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_filters(seed):
     kind = (EKF, UKF, CKF)[seed % 3]
     system, record = random_case(seed, 5, 30, largest=3)
@@ -45,7 +45,7 @@ def test_filters(seed):
         np.testing.assert_array_equal(getattr(part, name), getattr(found, name)[:3])
 
 
-@pytest.mark.parametrize("seed", range(20, 24))
+@pytest.mark.parametrize("seed", range(20, 22))
 def test_steps_of_the_model(seed):
     system, record = random_case(seed, 9, 5, largest=4)
     noise, x = AssumedNoise.of(system, system.noise(None, None), 0.05), record.prior.mean
