@@ -14,7 +14,6 @@ import sys
 import warnings
 from functools import cache
 
-
 LIBRARIES = (
     *("numpy", "gymnasium", "matplotlib.pyplot", "matplotlib.animation", "pandas", "rich.console"),
     *("scipy.integrate", "scipy.optimize", "scipy.stats", "sympy", "torch", "tyro"),

@@ -407,7 +407,10 @@ def test_the_code_is_the_same_in_every_process() -> None:
         check=True,
         capture_output=True,
         text=True,
-        env={**os.environ, "PYTHONHASHSEED": "2" if os.environ.get("PYTHONHASHSEED") == "1" else "1"},
+        env={
+            **os.environ,
+            "PYTHONHASHSEED": "2" if os.environ.get("PYTHONHASHSEED") == "1" else "1",
+        },
     ).stdout
     assert there == "".join(code_of(formula) for formula in FORMULAS.values())
 

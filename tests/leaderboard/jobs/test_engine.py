@@ -174,7 +174,9 @@ def dask(folder, started):
     scheduler = started(*python, "distributed.cli.dask_scheduler", *port, "--scheduler-file", file)
 
     def written():
-        with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):  # not there, or not yet whole
+        with contextlib.suppress(
+            FileNotFoundError, json.JSONDecodeError
+        ):  # not there, or not yet whole
             return json.loads(file.read_text())["address"]
 
     address = until(written)
