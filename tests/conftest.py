@@ -1,4 +1,5 @@
 import atexit
+import gc
 import itertools
 import os
 import shutil
@@ -31,6 +32,17 @@ import pytest
 
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.systems import SYSTEMS
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """What is imported and collected stays, and is not searched for garbage time and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(autouse=True)
