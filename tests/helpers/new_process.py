@@ -9,10 +9,13 @@ import atexit
 import json
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import warnings
 from functools import cache
+
+from waiting import PATIENCE
 
 LIBRARIES = (
     *("numpy", "gymnasium", "matplotlib.pyplot", "matplotlib.animation", "pandas", "rich.console"),
@@ -31,6 +34,7 @@ def run_script(text, folder):
     server.stdin.write(json.dumps(order) + "\n")
     server.stdin.flush()
     status = server.stdout.readline()
+    assert status, "the process that forks has ended"
     told = [file.read_text(encoding="utf-8") for file in (printed, log)]
     printed.unlink()
     log.unlink()
@@ -63,6 +67,7 @@ def _serve():
 
 def _become(folder, environment):
     """Be the process that runs the script of a folder."""
+    signal.alarm(PATIENCE)
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
