@@ -116,6 +116,7 @@ def test_on_a_linear_system_exact_bayes_is_least_squares(cls, outputs):
         Phi = F @ Phi
 
 
+@pytest.mark.slow
 def test_no_filter_is_better():
     source = EpisodeSource("ReverseDuffing", duration=4.0)
     episodes = source.play(source.draw(source.streams(range(12))))
