@@ -1,6 +1,10 @@
+import atexit
+import gc
 import itertools
 import os
 import shutil
+import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -10,6 +14,13 @@ os.environ.pop("FORCE_COLOR", None)
 os.environ.pop("PINNOBS_TRACEBACK", None)
 os.environ.pop("PINNOBS_KERNELS", None)
 os.environ.pop("CC", None)
+if sys.dont_write_bytecode:
+    # Else each process of the tests compiles the package anew. Nothing is written beside sources,
+    # and nothing is kept for another session, in which folders of tests have the same names.
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = tempfile.mkdtemp("-pinnobs-bytecode")
+    atexit.register(shutil.rmtree, sys.pycache_prefix, ignore_errors=True)
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 # Compiled code is kept for all test processes and for the next run, apart from the user's own.
 os.environ["PINNOBS_CACHE"] = str(Path(__file__).parents[1] / ".pytest_cache" / "pinnobs")
 if not any(map(shutil.which, ("cc", "clang", "gcc"))):
@@ -21,6 +32,17 @@ import pytest
 
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.systems import SYSTEMS
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """What is imported and collected stays, and is not searched for garbage time and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(autouse=True)

@@ -1,11 +1,10 @@
 """Scores of code that was edited since never come back."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 from edited import write
+from new_process import run_script
 
 WHAT = ["--systems", "plant:Oscillator", "--estimators", "mine:Obs"]
 EVALUATE = ["evaluate", "--system", "plant:Oscillator", "--estimator", "mine:Obs"]
@@ -26,16 +25,11 @@ evaluate(Obs, env_id(Oscillator), episodes=3, results="out/rows.jsonl")
 
 def scores(folder, call):
     """The rows after a call in a new process, and whether it says that it took some from there."""
-    command = [sys.executable, "-W", "ignore", "-c"]
-    if isinstance(CALLS[call], str):
-        command.append(CALLS[call])
-    else:
-        command.append("import sys; from pinnobs_gym.cli import main; sys.exit(main(sys.argv[1:]))")
-        command += [*CALLS[call], "--out", "out"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    text = CALLS[call]
+    if not isinstance(text, str):
+        text = f"from pinnobs_gym.cli import main\nassert main({[*text, '--out', 'out']!r}) == 0"
+    said = "".join(run_script(text, folder))
     lines = (folder / "out" / "rows.jsonl").read_text().splitlines()
-    said = done.stdout + done.stderr
     return [json.loads(line) for line in lines], [x for x in said.splitlines() if "taken" in x]
 
 

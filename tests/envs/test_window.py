@@ -63,11 +63,10 @@ print("shown", len(frames))
 """
 
 
-@pytest.mark.parametrize("system", ["ReverseDuffing", "InductionMotor"])
-def test_an_episode_is_shown_in_a_window_that_close_closes(system):
+def test_an_episode_is_shown_in_a_window_that_close_closes():
     environment = os.environ | {"QT_QPA_PLATFORM": "offscreen"}
     run = subprocess.run(
-        [sys.executable, "-c", EPISODE, system],
+        [sys.executable, "-c", EPISODE, "InductionMotor"],
         env=environment,
         capture_output=True,
         text=True,

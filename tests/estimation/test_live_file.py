@@ -48,7 +48,7 @@ def test_it_goes_on_as_without_a_break(name, tmp_path):
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
-@pytest.mark.parametrize("name", ["ekf", "ukf", "mhe", "enkf", "particle", "high_gain"])
+@pytest.mark.parametrize("name", ["ekf", "ukf", "mhe", "particle"])
 def test_it_goes_on_as_without_a_break_on_other_plants(name, plant, tmp_path):
     if (found := on_plant(name, plant)) is None:
         pytest.skip("the estimator does not take this plant")

@@ -93,7 +93,7 @@ def in_fifty_digits(record, C, q):
 @pytest.mark.parametrize("name", EXACT)
 @pytest.mark.parametrize("kind", [Single, Twins])
 @pytest.mark.parametrize("q", [0.0, 3e-4])
-@pytest.mark.parametrize("ratio", [1e3, 1e7, 1e9])
+@pytest.mark.parametrize("ratio", [1e3, pytest.param(1e7, marks=pytest.mark.slow), 1e9])
 def test_wide_priors_are_filtered_as_in_fifty_digits(name, kind, q, ratio):
     """Also where the truth is as far from the prior mean as the prior says."""
     system = kind()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from benchmarks.plants.reactor import NOISE, QuietReactor, Reactor, reactor_record
-from kinds import untrained
+from kinds import FEW, untrained
 from linear import Linear, linear_record
 from scipy.optimize import least_squares
 
@@ -66,7 +66,7 @@ def test_estimates_stay_within_the_bounds(name):
 @pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "particle", "mhe", "batch_least_squares"])
 @pytest.mark.parametrize("kind", [Reactor, QuietReactor])
 def test_estimators_of_a_plant_with_bounds_conform(name, kind):
-    options = {"window": 3} if name == "mhe" else {}
+    options = {"window": 3} if name == "mhe" else FEW.get(name, {})
     check_estimator(ESTIMATORS.resolve(name)(plant_of(name, kind, QuietReactor)(), **options))
 
 

@@ -64,7 +64,7 @@ def test_a_gain_does_not_depend_on_the_unit_of_the_output(unit):
 
 
 @pytest.mark.parametrize("name", ["luenberger", "sliding_mode", "ekf"])
-@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e3, 1e9])
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
 def test_estimates_do_not_depend_on_the_unit_of_the_output(name, unit):
     def estimates(c):
         cls = oscillator(c)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kinds import untrained
+from kinds import FEW, untrained
 from linear import (
     FeedThrough,
     Linear,
@@ -170,7 +170,7 @@ def test_the_jacobians_by_hand_are_those_of_automatic_differentiation():
 
 @pytest.mark.parametrize("name", untrained())
 def test_they_keep_to_the_rules(name):
-    check_estimator(ESTIMATORS.resolve(name)(Modulated()))
+    check_estimator(ESTIMATORS.resolve(name)(Modulated(), **FEW.get(name, {})))
 
 
 @pytest.mark.parametrize("design", ["poles", "lmi"])

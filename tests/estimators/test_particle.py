@@ -120,11 +120,13 @@ def test_a_noise_in_some_directions_leaves_kernels_in_the_others():
     np.testing.assert_allclose(a, shrinkage_of(0.95), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_loses_no_track_of_a_radar():
     """Without kernels for the small noise of the turn rate, it loses 12 of 20."""
     assert (tracks("particle") <= LOST).all()
 
 
+@pytest.mark.slow
 def test_the_growth_model_is_near_the_filter_on_a_grid():
     path, record = growth_runs()
     least = np.sqrt(np.mean((grid_means(record.y[..., 0]) - path[..., 0]) ** 2))

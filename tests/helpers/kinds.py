@@ -2,6 +2,9 @@
 
 from pinnobs_gym.estimators import ESTIMATORS
 
+FEW = {"particle": {"particles": 100}, "enkf": {"members": 20}}
+"""Options of estimators that draw samples, for checks of rules that few keep to as well."""
+
 
 def untrained():
     """Names of those that need no trainer, neither beforehand nor on every record."""

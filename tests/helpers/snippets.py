@@ -2,11 +2,9 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
-from waiting import PATIENCE
+from new_process import run_script
 
 ROOT = Path(__file__).parents[2]
 
@@ -48,8 +46,7 @@ def _called(line):
 
 def run_python(text, folder):
     """Run a block by itself. Returns what it printed."""
-    (folder / "snippet.py").write_text(text, encoding="utf-8")
-    return _run([sys.executable, "-W", "error::UserWarning", "snippet.py"], folder)
+    return run_script(text, folder)[0]
 
 
 def run_page(path, folder):
@@ -74,10 +71,4 @@ def run_command(line, folder):
     """Run a line that begins with ``pinnobs``. Returns what it printed."""
     name, *arguments = line.split()
     assert name == "pinnobs", line
-    return _run([sys.executable, "-m", "pinnobs_gym.cli", *arguments], folder)
-
-
-def _run(command, folder):
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0, f"{command}: {done.stderr}"
-    return done.stdout
+    return run_python(f"from pinnobs_gym.cli import main\nassert main({arguments!r}) == 0", folder)

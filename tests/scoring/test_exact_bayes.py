@@ -116,6 +116,7 @@ def test_on_a_linear_system_exact_bayes_is_least_squares(cls, outputs):
         Phi = F @ Phi
 
 
+@pytest.mark.slow
 def test_no_filter_is_better():
     source = EpisodeSource("ReverseDuffing", duration=4.0)
     episodes = source.play(source.draw(source.streams(range(12))))
@@ -200,7 +201,10 @@ class Uncertain(Linear):
 
 @pytest.mark.parametrize(
     "condition",
-    ["nominal", "outliers", "delay2", "x0_outside+dropout30", "mismatch30", "noise5+gap"],
+    [
+        *("x0_outside+dropout30", "mismatch30"),
+        *(pytest.param(c, marks=pytest.mark.slow) for c in ("outliers", "delay2", "noise5+gap")),
+    ],
 )
 def test_its_covariance_is_that_of_its_errors_under_the_law(condition):
     """The mean of (x − x̂)ᵀP⁻¹(x − x̂) over the law is nx: its standard error is about 0.3 here."""

@@ -15,6 +15,7 @@ from benchmarks.plants.motion import (
     robertson_times,
 )
 from filterpy.kalman import ExtendedKalmanFilter
+from kinds import FEW
 from scipy.linalg import expm
 
 from pinnobs_gym.cli.system_page import page
@@ -156,7 +157,7 @@ def test_a_particle_filter_of_the_growth_model_is_nearly_the_grid_filter():
 
 @pytest.mark.parametrize("cls", [EKF, UKF, EnKF, ParticleFilter, MHE, RTSSmoother])
 def test_estimators_of_a_map_pass_their_checks(cls):
-    check_estimator(cls(Matrix()))
+    check_estimator(cls(Matrix(), **FEW.get(cls.name, {})))
 
 
 def test_a_map_passes_the_checks_of_systems_and_says_so():

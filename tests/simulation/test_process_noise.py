@@ -157,6 +157,7 @@ def test_rows_without_outputs_change_nothing(kind):
     np.testing.assert_allclose(many.P[:, ::100], few.P, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [EnKF, ParticleFilter], ids=lambda k: k.name)
 def test_nor_those_of_an_ensemble_on_average(kind):
     """Mean and spread over 20 seeds, within a tenth of the standard deviation."""

@@ -57,7 +57,7 @@ def error_of_a_step(z: complex) -> float:
     return abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24 - np.exp(z))
 
 
-@pytest.mark.parametrize("angle", [0.05, 0.2, 0.55, 1.1, 2.2, 4.0, 30.0])
+@pytest.mark.parametrize("angle", [0.05, 0.2, 0.55, 1.1, 2.2, 7.0])
 def test_the_longest_step_has_the_error_that_is_allowed(angle: float) -> None:
     """An oscillator that turns by an angle (rad) in a sample; its states are on the unit circle."""
     step = longest_step(Oscillator(angle / DT))

@@ -233,7 +233,7 @@ def test_T_changes_with_time_if_the_equations_do():
 
 
 @pytest.mark.parametrize("name", [n for n in TRAINERS if REGISTRY.resolve(n).labelled])
-@pytest.mark.parametrize("cls", [FeedThrough, Clocked])
+@pytest.mark.parametrize("cls", [FeedThrough, pytest.param(Clocked, marks=pytest.mark.slow)])
 def test_states_are_found_behind_outputs_that_change_with_time(name, cls, tmp_path):
     system = cls()
     trained = trained_on_linear(name, cls, iterations=150, share=1.0, start="zero", samples=80)
@@ -464,8 +464,9 @@ def test_the_faithful_preset_keeps_what_is_asked_for():
     assert {name: getattr(found, name) for name in chosen} == chosen
 
 
-@pytest.mark.parametrize("name", TRAINERS)
-@pytest.mark.parametrize("stage", ["T", "T*"])
+@pytest.mark.parametrize(
+    ("name", "stage"), [(name, "T*") for name in TRAINERS] + [("kkl_supervised", "T")]
+)
 def test_the_same_seed_gives_the_same_weights_and_resuming_is_exact(
     name, stage, tmp_path, monkeypatch
 ):
@@ -655,13 +656,19 @@ def test_a_measured_input_is_refused():
         trained_by("kkl_supervised", system, {}, record=short)
 
 
-@pytest.mark.parametrize("stop", [20, 115])  # in the second fit of the sweep, and after it
-def test_a_sweep_that_is_interrupted_goes_on_to_the_same_result(stop, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def swept():
+    """A sweep that nothing interrupted, and how it was trained."""
     game = Game.of("ReverseDuffing")
-    system, setup, record = game.source.system, game.source.setup, game.record([10**6])
     settings = {**SMALL, "iterations": 12, "width": 6, "sweep": "cutoff", "checkpoint_every": 5}
-    arguments = {"record": record, "noise_std": setup.noise_std}
-    whole = trained_by("kkl_supervised", system, settings, **arguments)
+    positional = ("kkl_supervised", game.source.system, settings)
+    arguments = {"record": game.record([10**6]), "noise_std": game.source.setup.noise_std}
+    return trained_by(*positional, **arguments), positional, arguments
+
+
+@pytest.mark.parametrize("stop", [20, 115])  # in the second fit of the sweep, and after it
+def test_a_sweep_that_is_interrupted_goes_on_to_the_same_result(stop, swept, tmp_path, monkeypatch):
+    whole, positional, arguments = swept
     original, made = TwoStageFit.step, []
 
     def step(fit):
@@ -673,12 +680,10 @@ def test_a_sweep_that_is_interrupted_goes_on_to_the_same_result(stop, tmp_path, 
     path = tmp_path / "checkpoint.pt"
     with monkeypatch.context() as patch:
         patch.setattr(TwoStageFit, "step", step)
-        part = trained_by("kkl_supervised", system, settings, checkpoint=path, **arguments)
+        part = trained_by(*positional, checkpoint=path, **arguments)
     assert part.ending == "interrupted"
     assert (len(part.facts["sweep"]) < 7) == (stop == 20)
-    again = trained_by(
-        "kkl_supervised", system, settings, checkpoint=path, resume=True, **arguments
-    )
+    again = trained_by(*positional, checkpoint=path, resume=True, **arguments)
     assert again.facts["sweep"] == whole.facts["sweep"]
     assert again.config == whole.config
     for layer, other in zip(whole.decoder, again.decoder, strict=True):

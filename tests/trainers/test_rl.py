@@ -136,6 +136,7 @@ def test_the_estimator_is_the_agent_in_its_env() -> None:
 # What it learns
 
 
+@pytest.mark.slow
 def test_the_best_gain_of_a_schedule_is_learned() -> None:
     """In 8,192 steps the agent comes from the model alone (NRMSE about one) to a small tail."""
     config = RLConfig(steps=8192, rows=32, batch=256, check_every=4096, held_out=8)

@@ -45,8 +45,9 @@ def test_values_that_an_inner_dataclass_refuses_are_those_of_the_file(tmp_path):
         TrainedNetwork.load(path, system)
 
 
-@pytest.mark.parametrize("entry", ["iteration", "seconds"])
-@pytest.mark.parametrize("value", ["x", None, [1]])
+@pytest.mark.parametrize(
+    ("entry", "value"), [("iteration", "x"), ("iteration", [1]), ("seconds", None)]
+)
 def test_a_checkpoint_with_an_entry_of_another_type(tmp_path, entry, value):
     config = TRAINERS.resolve("pinn_obs").configured({"depth": 1, "width": 3})
     game, path = Game.of("ReverseDuffing"), tmp_path / "checkpoint.pt"

@@ -1,12 +1,12 @@
 """The engine on real processes, which are killed while they work."""
 
+import contextlib
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -73,7 +73,8 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
     (folder / "held_module.py").write_text(PLUG_IN)
     (folder / "go").touch()
-    subprocess.run([*COMMAND, "--jobs", "1"], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    with contextlib.chdir(folder):
+        assert again() == 0
     return facts(folder / "lb" / "rows.jsonl")
 
 
@@ -98,12 +99,12 @@ def started(folder):
 
     yield start
     for process in processes:
-        with suppress(ProcessLookupError):
+        with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
 
 
-def again(folder):
+def again():
     """The same command once more, in this process."""
     return main([*COMMAND[3:], "--jobs", "1"])
 
@@ -129,7 +130,7 @@ def test_a_killed_client_loses_nothing_that_was_finished(folder, started, undist
     until(lambda: not running(at_work))
     before = rows.read(path)
     (folder / "go").touch()
-    assert again(folder) == 0
+    assert again() == 0
     assert facts(path) == undisturbed
     assert rows.read(path)[: len(before)] == before
     assert not list((folder / "lb").glob(".running-*"))
@@ -147,7 +148,7 @@ def test_ctrl_c_stops_at_once_and_keeps_what_was_finished(folder, started, undis
     assert "Traceback" not in printed
     until(lambda: not running(at_work))
     (folder / "go").touch()
-    assert again(folder) == 0
+    assert again() == 0
     assert facts(path) == undisturbed
 
 
@@ -175,7 +176,9 @@ def dask(folder, started):
     scheduler = started(*python, "distributed.cli.dask_scheduler", *port, "--scheduler-file", file)
 
     def written():
-        with suppress(FileNotFoundError, json.JSONDecodeError):  # not there, or not yet whole
+        with contextlib.suppress(
+            FileNotFoundError, json.JSONDecodeError
+        ):  # not there, or not yet whole
             return json.loads(file.read_text())["address"]
 
     address = until(written)
@@ -198,7 +201,7 @@ def test_a_killed_scheduler_and_then_another_run(folder, started, dask, undistur
     assert last.startswith("pinnobs: error: the Dask scheduler is gone")
     assert "Traceback" not in printed
     (folder / "go").touch()
-    assert again(folder) == 0
+    assert again() == 0
     assert facts(path) == undisturbed
 
 

@@ -26,7 +26,9 @@ def assert_near(found, expected):
     assert np.nan_to_num(abs(found - expected)).max(initial=0.0) <= 1e-9 * size
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize(
+    "seed", [*range(6), *(pytest.param(k, marks=pytest.mark.slow) for k in range(6, 12))]
+)
 def test_filters(seed):
     kind = (EKF, UKF, CKF)[seed % 3]
     system, record = random_case(seed, 5, 30, largest=3)
@@ -45,7 +47,9 @@ def test_filters(seed):
         np.testing.assert_array_equal(getattr(part, name), getattr(found, name)[:3])
 
 
-@pytest.mark.parametrize("seed", range(20, 24))
+@pytest.mark.parametrize(
+    "seed", [20, 21, *(pytest.param(k, marks=pytest.mark.slow) for k in (22, 23))]
+)
 def test_steps_of_the_model(seed):
     system, record = random_case(seed, 9, 5, largest=4)
     noise, x = AssumedNoise.of(system, system.noise(None, None), 0.05), record.prior.mean

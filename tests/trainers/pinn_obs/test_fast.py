@@ -115,7 +115,7 @@ def test_a_fast_oscillation_is_found():
     assert fast_frequencies(replace(record, y=np.stack([slow, slow], -1)[None])) == ()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_papers_example_is_solved_better_than_in_the_paper(seed):
     game = Game.of("ReverseDuffing", "paper")
     system, record = game.source.system, game.record([0])

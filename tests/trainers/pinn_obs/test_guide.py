@@ -171,23 +171,23 @@ def played(name, seed, setup="benchmark"):
     return record, episodes.x[: record.num_samples, 0]
 
 
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["ReverseDuffing", "Satellite"])
-def test_from_any_seed_direct_estimates_and_replay_find_the_states(name):
+def test_from_any_seed_direct_estimates_and_replay_find_the_states(name, seed):
     record, x = played(name, 10**6)
     source = Game.of(name).source
     system, setup = source.system, source.setup
     tail, scale = slice(3 * len(x) // 4, None), np.asarray(system.scale)
-    for seed in (0, 1):
-        config = PinnObsConfig(iterations=500, seed=seed)
-        trained = train_pinn_obs(system, config, record=record, noise_std=setup.noise_std)
-        replayed = PinnObsReplay(system, trained=trained).run(record).xhat[0]
-        for xhat in (trained.xhat(record.t), replayed):
-            assert np.sqrt(np.mean(((xhat - x)[tail] / scale) ** 2)) < 0.01
-        assert trained.covariance is not None
-        P = trained.covariance(record.t)
-        error = trained.xhat(record.t) - x
-        nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(P), error)[5:]
-        assert 0.1 < nees.mean() / system.nx < 4
+    config = PinnObsConfig(iterations=500, seed=seed)
+    trained = train_pinn_obs(system, config, record=record, noise_std=setup.noise_std)
+    replayed = PinnObsReplay(system, trained=trained).run(record).xhat[0]
+    for xhat in (trained.xhat(record.t), replayed):
+        assert np.sqrt(np.mean(((xhat - x)[tail] / scale) ** 2)) < 0.01
+    assert trained.covariance is not None
+    P = trained.covariance(record.t)
+    error = trained.xhat(record.t) - x
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(P), error)[5:]
+    assert 0.1 < nees.mean() / system.nx < 4
 
 
 def test_a_state_that_moves_little_is_scaled_by_its_range_and_others_by_the_systems_scale():
