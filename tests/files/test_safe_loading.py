@@ -12,6 +12,8 @@ LOADS = r"(?:pickle|cloudpickle|dill|joblib|marshal|shelve|torch|np|numpy)\.(?:l
 ALLOWED = {
     # Of this process alone: a law of initial states, as the key of a cache
     ("initial_set.py", "pickle.loads(pickled)"),
+    # A job on its way from the client of a run to its workers
+    ("interface.py", "cloudpickle.loads(self.data)"),
     # Python's own compiled files, as Python reads them
     ("registry.py", "marshal.loads(content[16:]) == code:"),
     # Weights alone, from parts that were checked

@@ -15,6 +15,7 @@ SOURCE = "import math\nfrom . import near\n\nGAIN = 1\n"
 @pytest.fixture
 def source(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    monkeypatch.setattr(sys, "pycache_prefix", None)
     file = tmp_path / "thing.py"
     file.write_text(SOURCE)
     return file

@@ -41,7 +41,7 @@ def test_an_encrypted_scheduler_is_reached_with_dasks_configuration(tmp_path):
         configured(files),
         dask.config.set({"distributed.comm.require-encryption": True}),
         LocalCluster(
-            **options, protocol="tls://", security=Security(), dashboard_address=None
+            **options, protocol="tls://", security=Security(), dashboard_address=":0"
         ) as cluster,
         connected(cluster.scheduler_address) as pool,
     ):
