@@ -24,6 +24,7 @@ from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.matrices import divide, einsum, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: EnsembleMemory = state.memory
         members = memory.members
-        mean, outputs = total(members) / self.members, np.asarray(self.system.h(t, members, u))
+        mean, outputs = total(members) / self.members, outputs_at(self.system, t, members, u)
         outputs = gathered(outputs, self.system.output_period)
         yhat = total(outputs) / self.members
         # v = Gw with G of R, for each member.

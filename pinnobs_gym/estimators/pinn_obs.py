@@ -23,6 +23,7 @@ from pinnobs_gym.simulation.motion import inputs_at
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import runge_kutta
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +209,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
                 stage: int, x: np.ndarray, t: np.ndarray = t, u: np.ndarray = u, L: np.ndarray = L
             ) -> np.ndarray:
                 k = (0, 1, 1, 2)[stage]  # index of the stage's time: start, midpoint or end
-                outputs = self.system.h(t[k], x, u[k])
+                outputs = outputs_at(self.system, t[k], x, u[k])
                 given = y0 + (t[k] - start) * slope
                 innovation = self.system.output_residual(given, outputs)
                 innovation = np.where(missing, 0.0, innovation)
