@@ -25,6 +25,7 @@ from pinnobs_gym.simulation.matrices import divide, einsum, outer, product, spre
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.value_shape import outputs_at
+from pinnobs_gym.simulation.values import check_points
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """
 
     members: int = 50
-    """Size of the ensemble."""
+    """Size of the ensemble, from 2 to 1000000."""
     inflation: float = 1.01
     """Largest factor of the deviations from the ensemble mean after each analysis."""
     localisation: float | None = None
@@ -97,8 +98,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.members < 2:
-            raise ValueError(f"members={self.members}; expected at least 2")
+        check_points("members", self.members)
         if not 1 <= self.inflation < np.inf:
             raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
         if self.localisation is not None:

@@ -29,6 +29,7 @@ from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.value_shape import outputs_at
+from pinnobs_gym.simulation.values import check_points
 
 _FEW = 10
 """The likelihood is tempered if it would reduce the effective number of particles to less than
@@ -96,7 +97,7 @@ class ParticleFilter(RecursiveEstimator):
     """
 
     particles: int = 500
-    """Number of particles."""
+    """Number of particles, from 2 to 1000000."""
     discount: float | None = None
     """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set. If
     None, their variance follows from the process noise."""
@@ -125,8 +126,7 @@ w_i := \frac1N \\
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.particles < 2:
-            raise ValueError(f"particles={self.particles}; expected at least 2")
+        check_points("particles", self.particles)
         if self.discount is not None and not 1 / 3 < self.discount <= 1:
             raise ValueError(f"discount={self.discount}; expected a number in (1/3, 1]")
 

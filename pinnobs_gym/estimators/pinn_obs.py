@@ -24,6 +24,7 @@ from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import runge_kutta
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.value_shape import outputs_at
+from pinnobs_gym.simulation.values import shortly
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,6 +316,15 @@ class PinnObs(OfflineEstimator):
     knows = ("model", "prior")
     trains_on_record = "pinn_obs"
     variants = (MappingProxyType({}), MappingProxyType({"preset": "plain"}))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expected = type(self.trainer_config({}))
+        if not isinstance(self.config, expected):
+            raise ValueError(
+                f"config={shortly(self.config)}; expected a {expected.__name__} of "
+                f"{expected.__module__}"
+            )
 
     @property
     def training(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import sys
 from contextlib import contextmanager, redirect_stdout
 
 import pytest
+import torch
 
 from pinnobs_gym.cli import guarded, main
 from pinnobs_gym.cli.console import console
@@ -98,3 +99,9 @@ def test_too_little_memory_is_told(capsys):
 
     assert guarded(failed) == 2
     assert "not enough memory: Unable to allocate 364. TiB" in capsys.readouterr().err
+
+    def of_torch():
+        torch.empty(2**50)
+
+    assert guarded(of_torch) == 2
+    assert "not enough memory: [enforce fail" in capsys.readouterr().err
