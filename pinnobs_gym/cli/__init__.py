@@ -87,7 +87,7 @@ def guarded(command: Callable[[], int]) -> int:
     except KeyboardInterrupt as stop:
         print(stop_line(stop), file=sys.stderr)
         return stop.status if isinstance(stop, Stopped) else 130
-    except (Exception, SystemExit) as error:  # the latter of a plug-in
+    except BaseException as error:  # a plug-in may raise anything
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
         status, line = _told(error)
