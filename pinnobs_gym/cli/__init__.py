@@ -20,6 +20,8 @@ from pinnobs_gym.registry import error_line
 
 COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 """Names of the commands."""
+_NO_MEMORY = "can't allocate memory", "CUDA out of memory"
+"""What torch says if there is not enough, as a RuntimeError."""
 
 
 class HelpShown(SystemExit):
@@ -85,7 +87,7 @@ def guarded(command: Callable[[], int]) -> int:
     except KeyboardInterrupt as stop:
         print(stop_line(stop), file=sys.stderr)
         return stop.status if isinstance(stop, Stopped) else 130
-    except (Exception, SystemExit) as error:  # the latter of a plug-in
+    except BaseException as error:  # a plug-in may raise anything
         if os.environ.get("PINNOBS_TRACEBACK"):
             raise
         status, line = _told(error)
@@ -114,8 +116,8 @@ def _told(error: BaseException) -> tuple[int, str]:
         return 2, "the working folder has been deleted; expected to run in one that exists"
     if isinstance(error, ValueError | TypeError | FloatingPointError):
         return 2, words_of(error)
-    if isinstance(error, MemoryError):
-        text = words_of(error) if str(error) else "none is left"
+    if isinstance(error, MemoryError) or any(each in words_of(error) for each in _NO_MEMORY):
+        text = words_of(error) if error.args else "none is left"
         return 2, f"not enough memory: {text}; expected smaller sizes"
     if isinstance(error, ConnectionError):  # connection lost to other machines during the run
         return 1, words_of(error)

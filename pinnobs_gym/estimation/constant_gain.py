@@ -13,6 +13,7 @@ from pinnobs_gym.estimation.observer_gains import injection, time_since
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class ConstantGainObserver(RecursiveEstimator):
         xhat, (L, last) = state.xhat, state.memory
         missing = np.isnan(y)
         dt, last = time_since(last, t, missing)
-        innovation = self.system.output_residual(y, self.system.h(t, xhat, u))
+        innovation = self.system.output_residual(y, outputs_at(self.system, t, xhat, u))
         innovation = np.where(missing, 0.0, innovation)
         H = np.asarray(self.system.h_jacobian(t, xhat, u))
         K = injection(L, H, dt * self.secant(innovation, t))

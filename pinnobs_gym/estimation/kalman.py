@@ -13,7 +13,7 @@ from pinnobs_gym.simulation.matrices import divide, identity, mapped, outer, pro
 from pinnobs_gym.simulation.model import model_step_moments
 from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.system import Array, System
-from pinnobs_gym.simulation.value_shape import of_shape
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 
 def predict(
@@ -56,7 +56,7 @@ def observe(
         y: outputs, shape (batch, ny); NaN marks a missing output.
         u: inputs at the sample, shape (batch, nu).
     """
-    yhat = of_shape(system, "h", system.h(t, xhat, u), y.shape)
+    yhat = outputs_at(system, t, xhat, u)
     innovation = system.output_residual(y, yhat)
     H = system.h_jacobian(t, xhat, u).transpose(1, 2, 0)
     missing = np.isnan(y)

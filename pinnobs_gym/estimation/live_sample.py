@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.simulation.values import shortly
+from pinnobs_gym.simulation.values import LARGEST, shortly
 
-_INF = math.inf
 _REAL = "biuf"
 """Kinds of NumPy's types that are real numbers."""
 
@@ -60,12 +59,11 @@ def _values(system: System, name: str, value: Any, count: int) -> list[float]:
         values = value.tolist() if type(value) is np.ndarray else value
         if type(values) is not list:
             values = values if type(values) is tuple else (values,)
-        total = sum(values)
-        if len(values) == count and (isinstance(total, float) or not count):
-            # The sum of finite numbers is finite, unless some are huge.
-            if total - total == 0.0:
-                return [*values]
-            if name == "y" and _INF not in values and -_INF not in values:
+        if len(values) == count and (isinstance(sum(values), float) or not count):
+            for each in values:
+                if not -LARGEST <= each <= LARGEST and (each == each or name != "y"):
+                    break
+            else:
                 return [*values]
     except TypeError:  # of what are no numbers
         pass
@@ -90,9 +88,10 @@ def _unusual(system: System, name: str, value: Any, count: int) -> list[float]:
         )
     values: list[float] = array.astype(float).reshape(count).tolist()
     for i, each in enumerate(values):
-        if math.isinf(each) or (math.isnan(each) and name == "u"):
+        if not abs(each) <= LARGEST and not (math.isnan(each) and name == "y"):
             hint = ", or NaN if it is missing" if name == "y" else ""
-            raise ValueError(f"{name}{i + 1}={each}; expected a finite number{hint}")
+            expected = f"a finite number up to {LARGEST:g}{hint}"
+            raise ValueError(f"{name}{i + 1}={each}; expected {expected}")
     return values
 
 

@@ -103,7 +103,10 @@ def placed_gains(
             A, H, scale = linearised_scaled(system, t, x)
             scaled = _scaled_gain(A, H, rate, poles)
             found.append((scale[:, None] * scaled / output_scale(system), A, H))
-        except (ValueError, np.linalg.LinAlgError) as error:
+        except np.linalg.LinAlgError as error:  # of the Riccati equation, if the rate is too large
+            name = type(system).__name__
+            failed = ValueError(f"rate={rate:g}; {name} has no gain with such poles: {error}")
+        except ValueError as error:
             failed = error
     if not found:
         raise ValueError(str(failed)) from failed

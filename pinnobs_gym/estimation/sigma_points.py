@@ -28,7 +28,7 @@ from pinnobs_gym.simulation.model import model_step, model_step_moments
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.simulation.value_shape import of_shape
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,7 @@ def _step(
 
 def _output(system: System, t: float, u: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the outputs (..., ny) at states x (..., nx)."""
-    y = np.asarray(system.h(t, x, u))
-    return of_shape(system, "h", y, (*x.shape[:-1], system.ny))
+    return outputs_at(system, t, x, u)
 
 
 def _factor(state: State, memory: SigmaPointMemory) -> tuple[np.ndarray, SigmaPointMemory]:

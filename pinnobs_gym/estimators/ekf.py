@@ -24,6 +24,7 @@ from pinnobs_gym.simulation.matrices import squared_size
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import vector
+from pinnobs_gym.simulation.values import LARGEST
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,9 @@ P_k &= (I - K H)\, P_k^- (I - K H)^\top + K R K^\top \\
             raise ValueError(f"gate={self.gate}; expected a probability between 0 and 1")
         if self.patience < 1:
             raise ValueError(f"patience={self.patience}; expected at least 1 sample")
-        if self.huber is not None and not self.huber > 0:
-            raise ValueError(f"huber={self.huber}; expected a positive number")
+        if self.huber is not None and not self.huber >= 1 / LARGEST:
+            expected = f"a number of at least {1 / LARGEST:g}"
+            raise ValueError(f"huber={self.huber}; expected {expected}")
 
     def reset(self, prior: Prior) -> State:
         prior = checked(prior)

@@ -24,6 +24,8 @@ from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary
 from pinnobs_gym.simulation.matrices import divide, einsum, outer, product, spread, total
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.value_shape import outputs_at
+from pinnobs_gym.simulation.values import check_points
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
     """
 
     members: int = 50
-    """Size of the ensemble."""
+    """Size of the ensemble, from 2 to 1000000."""
     inflation: float = 1.01
     """Largest factor of the deviations from the ensemble mean after each analysis."""
     localisation: float | None = None
@@ -96,8 +98,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.members < 2:
-            raise ValueError(f"members={self.members}; expected at least 2")
+        check_points("members", self.members)
         if not 1 <= self.inflation < np.inf:
             raise ValueError(f"inflation={self.inflation}; expected a number of at least 1")
         if self.localisation is not None:
@@ -147,7 +148,7 @@ P_k = \tfrac{1}{N-1} \sum_i (x_k^i - \hat x_k)(x_k^i - \hat x_k)^\top
     def correct(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         memory: EnsembleMemory = state.memory
         members = memory.members
-        mean, outputs = total(members) / self.members, np.asarray(self.system.h(t, members, u))
+        mean, outputs = total(members) / self.members, outputs_at(self.system, t, members, u)
         outputs = gathered(outputs, self.system.output_period)
         yhat = total(outputs) / self.members
         # v = Gw with G of R, for each member.

@@ -20,6 +20,7 @@ from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import Array, System
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.export.algorithm import Algorithm
@@ -180,7 +181,7 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
             before = None if state.u is None else state.u[rows]
             xhat = model_step(self.system, state.t, t, xhat, before, u[rows])
         y = y.copy()
-        y[rows] = np.where(missing[rows], self.system.h(t, xhat, u[rows]), y[rows])
+        y[rows] = np.where(missing[rows], outputs_at(self.system, t, xhat, u[rows]), y[rows])
         return y
 
 

@@ -28,6 +28,8 @@ from pinnobs_gym.simulation.matrices import cholesky, factor, moments, spread, t
 from pinnobs_gym.simulation.model import noisy_model_step
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.value_shape import outputs_at
+from pinnobs_gym.simulation.values import check_points
 
 _FEW = 10
 """The likelihood is tempered if it would reduce the effective number of particles to less than
@@ -95,7 +97,7 @@ class ParticleFilter(RecursiveEstimator):
     """
 
     particles: int = 500
-    """Number of particles."""
+    """Number of particles, from 2 to 1000000."""
     discount: float | None = None
     """Liu and West's δ; the Gaussians have 1 − ((3δ − 1)/2δ)² times the variance of the set. If
     None, their variance follows from the process noise."""
@@ -124,8 +126,7 @@ w_i := \frac1N \\
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.particles < 2:
-            raise ValueError(f"particles={self.particles}; expected at least 2")
+        check_points("particles", self.particles)
         if self.discount is not None and not 1 / 3 < self.discount <= 1:
             raise ValueError(f"discount={self.discount}; expected a number in (1/3, 1]")
 
@@ -186,7 +187,7 @@ w_i := \frac1N \\
         x, log_weights = memory.particles, memory.log_weights
         missing = np.isnan(y)
         # The predicted output and its covariance, from the particles before the update.
-        outputs = np.where(missing, 0.0, np.asarray(self.system.h(t, x, u)))
+        outputs = np.where(missing, 0.0, outputs_at(self.system, t, x, u))
         sample, weights = Sample.of(self.noise, state.t, t, y, u), np.exp(log_weights)
         if self.system.output_period is not None:
             _, P = moments(weights, x)
@@ -275,7 +276,7 @@ w_i := \frac1N \\
     def _log_likelihood(self, x: np.ndarray, sample: Sample) -> np.ndarray:
         """Return the log likelihood of the outputs up to a constant, (num_particles, batch)."""
         t, y, u = sample.t, sample.y, sample.u
-        errors = self.system.output_residual(y, np.asarray(self.system.h(t, x, u)))
+        errors = self.system.output_residual(y, outputs_at(self.system, t, x, u))
         errors = np.where(np.isnan(y), 0.0, errors)
         log_likelihood = -0.5 * _squared_sizes(errors, sample.R)
         box = self.system.state_box

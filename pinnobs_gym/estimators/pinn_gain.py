@@ -31,6 +31,7 @@ from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.residual import nearest
 from pinnobs_gym.simulation.system import System, output_scale, vector
+from pinnobs_gym.simulation.value_shape import outputs_at
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.export.algorithm import Algorithm
@@ -141,7 +142,7 @@ P_k = (I - K' H)\, P_k^- (I - K' H)^\top + K' R K'^\top
         scale, size, R = fixed
         std = np.sqrt(np.einsum("iib->ib", self.noise.R(t) if R is None else R))
         xhat = state.xhat
-        innovation = self.system.output_residual(y, self.system.h(t, xhat, u))
+        innovation = self.system.output_residual(y, outputs_at(self.system, t, xhat, u))
         innovation = np.where(np.isnan(y), 0.0, innovation)
         seen = nearest(xhat, 0.0, self.system.state_period)
         x, e = np.ascontiguousarray(seen.T), np.ascontiguousarray(innovation.T)

@@ -23,6 +23,8 @@ from pinnobs_gym.simulation.motion import inputs_at
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.runge_kutta import runge_kutta
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.value_shape import outputs_at
+from pinnobs_gym.simulation.values import shortly
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +210,7 @@ class PinnObsReplay(LearnedEstimator, Estimator):
                 stage: int, x: np.ndarray, t: np.ndarray = t, u: np.ndarray = u, L: np.ndarray = L
             ) -> np.ndarray:
                 k = (0, 1, 1, 2)[stage]  # index of the stage's time: start, midpoint or end
-                outputs = self.system.h(t[k], x, u[k])
+                outputs = outputs_at(self.system, t[k], x, u[k])
                 given = y0 + (t[k] - start) * slope
                 innovation = self.system.output_residual(given, outputs)
                 innovation = np.where(missing, 0.0, innovation)
@@ -314,6 +316,15 @@ class PinnObs(OfflineEstimator):
     knows = ("model", "prior")
     trains_on_record = "pinn_obs"
     variants = (MappingProxyType({}), MappingProxyType({"preset": "plain"}))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expected = type(self.trainer_config({}))
+        if not isinstance(self.config, expected):
+            raise ValueError(
+                f"config={shortly(self.config)}; expected a {expected.__name__} of "
+                f"{expected.__module__}"
+            )
 
     @property
     def training(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@
 - What cannot be written raises `CannotWrite`. `noticing_full_disks` raises it in place of what
   other libraries raise on a full disk.
 - `check_writable` checks before a long computation that its results can be written.
+- `check_ends` refuses devices, which could be read for ever.
 - `locked` opens a file for appending by one process and thread at a time; `write_whole` then
   appends all of the data or nothing, and a full disk leaves the file unchanged. `append_lines` does
   both for JSON lines.
@@ -32,6 +33,7 @@ from pinnobs_gym.files.appending import (
     write_whole,
 )
 from pinnobs_gym.files.names import file_name
+from pinnobs_gym.files.reading import check_ends
 from pinnobs_gym.files.writing import (
     CannotWrite,
     cannot_write,
@@ -45,6 +47,7 @@ __all__ = [
     "CannotWrite",
     "append_lines",
     "cannot_write",
+    "check_ends",
     "check_writable",
     "file_name",
     "holding",

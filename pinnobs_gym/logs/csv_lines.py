@@ -11,6 +11,8 @@ import csv
 from collections.abc import Iterator
 from pathlib import Path
 
+from pinnobs_gym.files import check_ends
+
 _SHOWN = 60
 """Number of characters of a text that a message shows."""
 _SEPARATORS = ",;\t"
@@ -32,6 +34,7 @@ def split_lines(path: Path, kind: str) -> Iterator[tuple[int, str, list[str]]]:
     """
     separator = ""
     try:
+        check_ends(path)
         with path.open(newline="", encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
                 place = f"{kind} {path}, line {number}"

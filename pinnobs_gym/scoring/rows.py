@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pinnobs_gym.envs.game import GameName
-from pinnobs_gym.files import CannotWrite, json_line, locked, replacing, write_whole
+from pinnobs_gym.files import CannotWrite, check_ends, json_line, locked, replacing, write_whole
 from pinnobs_gym.scoring.failures import Failures
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
 from pinnobs_gym.scoring.present import Present, present_in
@@ -174,6 +174,7 @@ def load(path: Path) -> Stored:
     if not path.exists():
         return Stored([], [])
     try:
+        check_ends(path)
         *lines, tail = path.read_bytes().split(b"\n")
     except OSError as error:
         raise ValueError(f"cannot read rows from {path}: {error}") from None

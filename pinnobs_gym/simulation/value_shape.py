@@ -9,6 +9,15 @@ from pinnobs_gym.simulation.probe import ModelError
 from pinnobs_gym.simulation.system import System
 
 
+def outputs_at(system: System, t: Any, x: Any, u: Any) -> Any:
+    """Return the outputs h(t, x, u), shape (..., ny), of states x, shape (..., nx).
+
+    Raises:
+        ModelError: in one line, if they are no array of this shape.
+    """
+    return of_shape(system, "h", system.h(t, x, u), (*x.shape[:-1], system.ny))
+
+
 def of_shape(system: System, name: str, value: Any, shape: tuple[int, ...]) -> Any:
     """Return the value of a function of a system.
 

@@ -13,6 +13,8 @@ import numpy as np
 LARGEST = 1e30
 """Largest number that is taken for a state, a level of noise or a setting, the powers of which do
 not overflow."""
+MOST_POINTS = 10**6
+"""Largest number of particles or members of an ensemble, whose states are all in memory."""
 _LARGEST_DOUBLE = int(sys.float_info.max)
 _SHOWN = 60
 """Largest number of characters that a message shows of a value."""
@@ -46,6 +48,16 @@ def check_seed(seed: Any) -> int:
     if not is_whole(seed):
         raise ValueError(f"seed={shortly(seed)}; expected a whole number of at least 0")
     return int(seed)
+
+
+def check_points(name: str, number: int) -> None:
+    """Check the number of points by which an estimator represents a distribution.
+
+    Raises:
+        ValueError: in one line, unless it is from 2 to `MOST_POINTS`.
+    """
+    if not 2 <= number <= MOST_POINTS:
+        raise ValueError(f"{name}={shortly(number)}; expected from 2 to {MOST_POINTS}")
 
 
 def real_array(name: str, value: Any, *, truths: bool = False) -> np.ndarray:

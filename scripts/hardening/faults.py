@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -25,6 +26,8 @@ Injected = Callable[[str, str], None]
 """Called with an event and a path."""
 _injected: list[Injected] = []
 """What is called at each change of a file system, in a list since an audit hook stays."""
+_unremovable: set[str] = set()
+"""The names of the files of which a removal failed, which may thus be left."""
 
 
 def _hook(event: str, arguments: tuple[object, ...]) -> None:
@@ -59,9 +62,12 @@ def injected(folder: str, at: int, act: Injected, lasting: bool) -> Iterator[lis
         if path.startswith(folder):
             seen.append(len(seen))
             if seen[-1] == at or (lasting and seen[-1] > at):
+                if event == "os.remove":
+                    _unremovable.add(os.path.basename(path))
                 act(event, path)
 
     _injected[:] = [called]
+    _unremovable.clear()
     try:
         yield seen
     finally:
@@ -84,6 +90,7 @@ def small_files(size: int) -> Iterator[None]:
 def trials(material: Material, rng: Random) -> Iterator[Trial]:
     """Yield faults."""
     numbers = count()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # nohup has it ignored
     expected = undisturbed(material, next(numbers))
     run = Run(material, next(numbers))
     with injected(str(run.out), -1, lambda event, path: None, False) as seen:
@@ -109,7 +116,7 @@ def trials(material: Material, rng: Random) -> Iterator[Trial]:
 def _stop(event: str, path: str) -> None:
     """Interrupt as Ctrl-C does: in the main thread, and not in the place of a removal."""
     if event != "os.remove" and threading.current_thread() is threading.main_thread():
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
 
 
 def _failing(error: int) -> Injected:
@@ -145,7 +152,7 @@ def _disturbed(
         except Hung:
             return Outcome("hung", "the run that was started again did not end")
         wrong = difference(tried.facts(), expected)
-        left = leftovers(tried.out)
+        left = set(leftovers(tried.out)) - _unremovable
         tried.removed()
         if "Traceback" in first.err:
             return Outcome("traceback", first.err.strip().split("\n")[-1])
@@ -154,7 +161,7 @@ def _disturbed(
         if again.status or wrong:
             said = (first.err.strip() or first.out.strip()).split("\n")[-1]
             return Outcome("wrong", f"then status {again.status}, {wrong}; it said: {said}")
-        return Outcome("wrong", f"left: {left}") if left else Outcome("accepted")
+        return Outcome("wrong", f"left: {sorted(left)}") if left else Outcome("accepted")
 
     return Trial(what, run)
 

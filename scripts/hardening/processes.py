@@ -33,8 +33,21 @@ def started(run: Run, *more: str) -> Iterator[subprocess.Popen[str]]:
 def _started(folder: Path, *command: str) -> subprocess.Popen[str]:
     pipe, kept = subprocess.PIPE, {**os.environ, "PYTHONUNBUFFERED": "1"}
     return subprocess.Popen(
-        command, cwd=folder, env=kept, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        command,
+        cwd=folder,
+        env=kept,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        start_new_session=True,
+        preexec_fn=_take_ctrl_c,
     )
+
+
+def _take_ctrl_c() -> None:
+    """Let Ctrl-C interrupt this process, even if it is ignored by the one that starts it, as it is
+    under nohup."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _end(process: subprocess.Popen[str]) -> None:

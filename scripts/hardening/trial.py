@@ -63,7 +63,10 @@ def time_limit(seconds: float) -> Iterator[None]:
         yield
         return
 
+    fired: list[int] = []
+
     def end(number: int, frame: FrameType | None) -> None:
+        fired.append(number)
         raise Hung
 
     before = signal.signal(signal.SIGALRM, end)
@@ -73,6 +76,8 @@ def time_limit(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+    if fired:  # what ran has caught it
+        raise Hung
 
 
 def ended(run: Callable[[], int]) -> Ended:

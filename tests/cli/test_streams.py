@@ -6,6 +6,7 @@ import sys
 from contextlib import contextmanager, redirect_stdout
 
 import pytest
+import torch
 
 from pinnobs_gym.cli import guarded, main
 from pinnobs_gym.cli.console import console
@@ -92,9 +93,31 @@ def test_messages_of_any_length_are_one_short_line(capsys):
     assert len(message) < 2000
 
 
+class Unreadable(BaseException):
+    """An error that only a plug-in could raise."""
+
+    def __str__(self):
+        raise SystemExit(3)
+
+
+def test_an_error_that_cannot_be_read_is_one_line(capsys):
+    def failed():
+        raise Unreadable
+
+    assert guarded(failed) == 1
+    line = "pinnobs: error: Unreadable: an error without a readable text"
+    assert capsys.readouterr().err.startswith(line)
+
+
 def test_too_little_memory_is_told(capsys):
     def failed():
         raise MemoryError("Unable to allocate 364. TiB")
 
     assert guarded(failed) == 2
     assert "not enough memory: Unable to allocate 364. TiB" in capsys.readouterr().err
+
+    def of_torch():
+        torch.empty(2**50)
+
+    assert guarded(of_torch) == 2
+    assert "not enough memory: [enforce fail" in capsys.readouterr().err

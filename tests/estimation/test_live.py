@@ -150,6 +150,7 @@ def test_an_estimate_goes_to_other_processes(name):
         assert (copied.std is None) == (name == "open_loop")
 
 
+FINITE = r"expected a finite number up to 1e\+30"
 WRONG = (
     ({"t": "0.5"}, "t='0.5'; expected a finite number of s"),
     ({"t": np.nan}, "t=nan; expected a finite number of s"),
@@ -163,11 +164,15 @@ WRONG = (
     ({"y": [0.1, "1"]}, r"y=\[0.1, '1'\]; expected 2 number\(s\), NaN if it is missing"),
     ({"y": [1j, 0.1]}, r"y=\[1j, 0.1\]; expected 2 number\(s\), NaN if it is missing"),
     ({"y": [[0.1], [0.1, 0.2]]}, r"y=\[.*\]; expected 2 number\(s\), NaN if it is missing"),
-    ({"y": [0.1, np.inf]}, "y2=inf; expected a finite number, or NaN if it is missing"),
-    ({"y": [np.nan, -np.inf]}, "y2=-inf; expected a finite number, or NaN if it is missing"),
+    ({"y": [0.1, np.inf]}, f"y2=inf; {FINITE}, or NaN if it is missing"),
+    ({"y": [np.nan, -np.inf]}, f"y2=-inf; {FINITE}, or NaN if it is missing"),
+    ({"y": [np.inf, -np.inf]}, f"y1=inf; {FINITE}, or NaN if it is missing"),
+    ({"y": [1e308, -1e308]}, f"y1=1e[+]308; {FINITE}, or NaN if it is missing"),
+    ({"y": np.array([np.nan, 1e31])}, f"y2=1e[+]31; {FINITE}, or NaN if it is missing"),
     ({"u": [0.1]}, r"u has shape \(1,\); InductionMotor has nu=2, expected \(2,\)"),
-    ({"u": [np.nan, 0.1]}, "u1=nan; expected a finite number"),
-    ({"u": [0.1, np.inf]}, "u2=inf; expected a finite number"),
+    ({"u": [np.nan, 0.1]}, f"u1=nan; {FINITE}"),
+    ({"u": [0.1, np.inf]}, f"u2=inf; {FINITE}"),
+    ({"u": [-1e308, 0.1]}, f"u1=-1e[+]308; {FINITE}"),
     ({"u": ["a", "b"]}, r"u=\['a', 'b'\]; expected 2 number\(s\)"),
     ({"u": [1.0, 2.0]}, "input u1=1 at t=.* is not that of InductionMotor.input, .*"),
     ({"t": 0.0}, "t=0 s is not after the last sample, t=0.002 s; expected a later one, .*"),
@@ -207,8 +212,8 @@ def test_a_number_is_one_output_and_what_is_like_an_array_is_taken():
     masked = np.ma.masked_array([1.0], mask=[True])
     missing = begun(estimator, record).update(0.0, np.nan).xhat
     np.testing.assert_array_equal(begun(estimator, record).update(0.0, masked).xhat, missing)
-    huge = begun(estimator, record).update(0.0, [1e308])
-    assert huge.t == 0.0
+    largest = begun(estimator, record).update(0.0, [1e30])
+    assert largest.t == 0.0
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf", "particle"])

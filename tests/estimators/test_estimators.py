@@ -151,7 +151,8 @@ def test_hubers_weight_enlarges_the_variance_of_an_outlier_alone():
     [
         ({"gate": 1.0}, "gate=1.0; expected a probability"),
         ({"gate": 0.99, "patience": 0}, "patience=0; expected at least 1"),
-        ({"huber": 0.0}, "huber=0.0; expected a positive number"),
+        ({"huber": 0.0}, "huber=0.0; expected a number of at least 1e-30"),
+        ({"huber": 1e-300}, "huber=1e-300; expected a number of at least 1e-30"),
         ({"assumed_noise": -1.0}, "assumed_noise=-1.0; expected a number of at least 0"),
         ({"process_noise": -1.0}, "process_noise=-1.0 of Linear; expected numbers of at least 0"),
         ({"noise_std": -0.1}, "noise_std=-0.1 of Linear; expected numbers of at least 0"),

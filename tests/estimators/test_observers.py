@@ -313,9 +313,11 @@ def test_an_lmi_without_a_solution_is_said_to_have_none(name):
     ("kind", "options", "message"),
     [
         (StrongTrackingEKF, {"gamma": -1.0}, "gamma=-1"),
-        (EnKF, {"members": 1}, "members=1; expected at least 2"),
+        (EnKF, {"members": 1}, "members=1; expected from 2 to 1000000"),
         (EnKF, {"inflation": 0.9}, "inflation=0.9; expected"),
-        (ParticleFilter, {"particles": 1}, "particles=1; expected at least 2"),
+        (EnKF, {"members": 10**9}, "members=1000000000; expected from 2 to 1000000"),
+        (ParticleFilter, {"particles": 1}, "particles=1; expected from 2 to 1000000"),
+        (ParticleFilter, {"particles": 10**9}, "particles=1000000000; expected from 2 to 1000000"),
         (ParticleFilter, {"discount": 0.3}, "discount=0.3; expected"),
         (Luenberger, {"design": "magic"}, "design='magic'; expected 'poles' or 'lmi'"),
         (Luenberger, {"gain": [[1.0, 2.0]]}, "gain has shape"),
@@ -327,6 +329,13 @@ def test_an_lmi_without_a_solution_is_said_to_have_none(name):
 def test_settings_out_of_range_are_refused(kind, options, message):
     with pytest.raises(ValueError, match=message):
         kind(Linear(), **options)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of the solver
+def test_a_rate_without_a_gain_is_named():
+    observer = Luenberger(Linear(), rate=1e30)
+    with pytest.raises(ValueError, match=r"^rate=1e\+30; Linear has no gain with such poles: "):
+        observer.designed()
 
 
 def test_without_cvxpy_the_lmi_says_how_to_get_it(monkeypatch):

@@ -103,7 +103,7 @@ def test_a_file_is_read_and_options_change_it(write):
         ),
         (
             'estimators = [{name = "ekf", settings = {huber = -1}}]',
-            "estimators: settings of 'ekf': huber=-1; expected a positive number",
+            "estimators: settings of 'ekf': huber=-1; expected a number of at least 1e-30",
         ),
         (
             'estimators = [{name = "pinn_gain", settings = {depth = 1.5, streams = -1}}]',

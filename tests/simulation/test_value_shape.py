@@ -64,7 +64,7 @@ def test_an_episode_is_refused(cls, line):
 @pytest.mark.parametrize(
     ("cls", "name"),
     [(LateF, name) for name in ("ekf", "ukf", "enkf", "luenberger", "particle")]
-    + [(LateH, name) for name in ("ekf", "ukf")],
+    + [(LateH, name) for name in ("ekf", "ukf", "enkf", "luenberger", "particle", "sliding_mode")],
 )
 def test_an_estimator_refuses_such_a_model(cls, name):
     estimator = ESTIMATORS.resolve(name).for_setup(cls(), cls.setups["benchmark"])

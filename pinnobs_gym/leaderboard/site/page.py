@@ -142,8 +142,8 @@ def _marked(text: str) -> Markup:
 
 
 def _anchor(title: str) -> str:
-    """Return the id of the section with that title."""
-    return re.sub(r"\W+", "-", title)
+    """Return the id of the section with that title, of no other title."""
+    return re.sub(r"[^\w-]", lambda found: f".{ord(found[0]):x}.", title)
 
 
 def _bundle() -> str:

@@ -25,6 +25,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pinnobs_gym.files import check_ends
 from pinnobs_gym.scoring.row_format import LAST_SEED, MOST_EPISODES
 from pinnobs_gym.scoring.tuned import SUFFIX
 from pinnobs_gym.simulation.values import shortly
@@ -115,6 +116,7 @@ def load(spec: str) -> Suite:
         )
     file = f"suite {spec}"
     try:
+        check_ends(path)
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"cannot read {file}: {error.strerror or error}") from None

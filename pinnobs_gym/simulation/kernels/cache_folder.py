@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from pinnobs_gym.files.writing import CannotWrite, replacing
 from pinnobs_gym.simulation.notices import say_once
 
 MOST_BYTES, MOST_FILES = 200 * 2**20, 500
@@ -122,15 +123,9 @@ def distrusted(path: Path) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a file whole or, if the folder does not allow it, not at all."""
-    temporary = path.with_name(f"{path.name}.{uuid4().hex}")
-    try:
-        # Created for this user alone, whatever is usual for new files
-        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
-            json.dump(content, out)
-        os.replace(temporary, path)
-    except OSError:
-        with suppress(OSError):
-            temporary.unlink()
+    with suppress(CannotWrite), replacing(path, create_folder=False) as temporary:
+        temporary.chmod(0o600)  # for this user alone, whatever is usual for new files
+        temporary.write_text(json.dumps(content), encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:

@@ -126,6 +126,14 @@ def tables_of(text):
     return re.findall(r"<table.*?</table>", markup, re.DOTALL)
 
 
+def test_sections_whose_titles_differ_in_signs_have_links_of_their_own():
+    names = ("X-v0.", "X-v0,", "X--v0")
+    text = drawn(*(row for name in names for row in rows_of("ekf", [0.1], env_id=name, **COMMON)))
+    links = re.findall('<a href="#([^"]*)"', text)
+    assert links == re.findall('<section id="([^"]*)"', text)
+    assert len(set(links)) == len(links) > 5
+
+
 def test_those_trained_on_each_record_have_a_section_if_there_are_any():
     own = {"training": {"per_record": True, "seconds": 1.0}, "track": "offline"}
     text = drawn(*rows_of("pinn (guided)", [0.1] * 4, **own, **COMMON))

@@ -580,6 +580,11 @@ def test_a_config_out_of_range_names_the_value(change):
         PinnObsConfig(**change)
 
 
+def test_what_is_no_config_is_refused():
+    with pytest.raises(ValueError, match=r"^config=\{'width': 4\}; expected a PinnObsConfig of "):
+        PinnObs(Spring(), config={"width": 4})
+
+
 # TrainedNetwork on every record it is given
 
 
