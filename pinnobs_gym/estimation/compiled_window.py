@@ -171,10 +171,8 @@ class CompiledMovingWindow(CompiledWindow):
 
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State | None:
         window: MovingWindow = state.memory.whole
-        wide, batch = (
-            state.memory.rows,
-            len(window.mean),
-        )  # such rows lose digits in any other order
+        # Rows with very wide priors lose digits in any other order of operations.
+        wide, batch = state.memory.rows, len(window.mean)
         if not self.fits(batch) or (batch and len(wide) == batch):
             return None
         before = window.mean.T, window.root.transpose(1, 2, 0), window.x.transpose(0, 2, 1)

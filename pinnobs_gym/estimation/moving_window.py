@@ -71,7 +71,7 @@ class MovingWindow:
         F = np.ascontiguousarray(F.transpose(2, 0, 1))
         G = np.broadcast_to(root_of(Q.transpose(2, 0, 1)), F.shape)
         mean = end + (F @ (deviation + step)[..., None])[..., 0]
-        L = compressed(F @ L, G)
+        L = np.ascontiguousarray(compressed(F @ L, G))  # sums in one order, as in `rows`
         return MovingWindow(mean, L, self.x[1:], self.exact, self.samples.without_first())
 
     def improved(self, system: System, noise: Noise) -> tuple[MovingWindow, Smoothed]:

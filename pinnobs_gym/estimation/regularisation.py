@@ -94,7 +94,8 @@ def _renewed(system: System, sample: Sample, mean: np.ndarray, P: np.ndarray) ->
     """Return the q of `shrinkages`, zero where it is not finite."""
     if not sample.Q.any():
         return np.zeros(len(P))
-    L = cholesky(P.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1)
+    # Contiguous, so that sums are formed in one order in any batch.
+    L = np.ascontiguousarray(cholesky(P.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1))
     H = np.where(np.isnan(sample.y)[..., None], 0.0, system.h_jacobian(sample.t, mean, sample.u))
     R, Q = (part.transpose(2, 0, 1) for part in (sample.R, sample.Q))
     noise = root_of(np.broadcast_to(R, (len(P), *R.shape[1:])))

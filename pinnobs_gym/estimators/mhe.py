@@ -100,10 +100,13 @@ P_k &= \Phi \Bigl( \bar P^{-1} + \sum_j G_j^\top R^{-1} G_j \Bigr)^{-1} \Phi^\to
         stochastic, R = self.noise.told.stochastic, self.noise.R(0.0)
         roots, wide = prior_root(self.system, prior, R), None
         rows = np.arange(0) if roots is None else carried(roots)
+        if len(rows):  # they enlarge rounding, and are to be the same in any process
+            super().ask_model()
         # A noise of one's own that differs between rows is that of all rows, not of some.
         by_row = self.noise.samples is None and R.shape[-1] > 1
         if stochastic or (roots is not None and by_row):
-            roots = root(P0.transpose(1, 2, 0)).transpose(2, 0, 1)
+            # Contiguous, so that sums are formed in one order in any batch.
+            roots = np.ascontiguousarray(root(P0.transpose(1, 2, 0)).transpose(2, 0, 1))
             window = MovingWindow(mean, roots, start[None], not stochastic, samples)
             return State(mean, P=P0, memory=MHEMemory(None, window, rows))
         exact = ExactWindow(mean, P0.transpose(1, 2, 0), start, samples)

@@ -15,6 +15,7 @@ from pinnobs_gym.estimation.compiled_window import compiled_window
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.estimators.mhe import MHE
 from pinnobs_gym.simulation.noise import SampledLevel
+from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.induction_motor import InductionMotor
 
@@ -67,6 +68,18 @@ def test_a_row_is_the_same_alone_and_in_any_batch(plant, noise):
         found = made(system, part, noise, window=5).run(part)
         for name in ("xhat", "P", "innovation", "S"):
             np.testing.assert_array_equal(getattr(found, name), getattr(whole, name)[rows])
+
+
+def test_a_row_with_a_very_wide_prior_is_the_same_alone_and_in_any_batch():
+    """It is processed in NumPy, alone from the first sample on, in a batch from a part of it."""
+    system, record = many_plants.bounded_reactor(3)
+    cov = record.prior.cov * np.array([1.0, 1e10, 1.0])[:, None, None]
+    record = replace(record, prior=Prior(record.prior.mean, cov))
+    whole = made(system, record, 0.05, window=3).run(record)
+    part = record.rows(np.array([1]))
+    found = made(system, part, 0.05, window=3).run(part)
+    for name in ("xhat", "P", "innovation", "S"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name)[1:2])
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])

@@ -9,7 +9,7 @@ from typing import Any
 
 import sympy
 
-from pinnobs_gym.simulation.kernels.step_code import LARGEST, step_functions
+from pinnobs_gym.simulation.kernels.step_code import is_straight, step_functions
 from pinnobs_gym.simulation.plant_form import PlantForm
 from pinnobs_gym.simulation.printer import Printer
 from pinnobs_gym.simulation.system import System
@@ -109,7 +109,7 @@ def plant_code(form: PlantForm) -> PlantCode:
     ]
     once = "\n".join([*parts, _input_function(traces["input"])])
     steps = []
-    if system.nx <= LARGEST:
+    if is_straight(system.nx, system.ny):
         once += "\n#define STRAIGHT"
         steps = step_functions(traces["f"], traces["h"], CPrinter)
     return PlantCode(once, "\n\n".join(functions), "\n\n".join(steps), numbers)

@@ -26,6 +26,9 @@ from pinnobs_gym.simulation.system import System
 
 LARGEST = 12
 """Largest number of states of a plant that is compiled; beyond it BLAS takes less time."""
+MOST_OUTPUTS = 32
+"""Largest number of its outputs. Matrices of all outputs and lanes are on the stack, of which a
+thread may have half a megabyte."""
 MOST_FORMS = 8
 """Number of forms of a class that a process compiles. Systems that differ in more than numbers, or
 whose equations branch on numbers, each need code of their own."""
@@ -82,6 +85,8 @@ def _excluded(system: System) -> str:
         return "it is stiff"
     if system.nx > LARGEST:
         return f"it has {system.nx} states, more than {LARGEST}"
+    if system.ny > MOST_OUTPUTS:
+        return f"it has {system.ny} outputs, more than {MOST_OUTPUTS}"
     for name in ("output_residual", "state_residual"):
         if getattr(type(system), name) is not getattr(System, name):
             return f"it defines {name}"

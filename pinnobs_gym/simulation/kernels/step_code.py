@@ -1,7 +1,7 @@
 """The steps of filters as straight-line C on lanes, from the structure of a plant's Jacobians.
 
-They are written for plants with at most `LARGEST` states; beyond it, ``templates/motion.h`` has the
-same in loops, and shorter code.
+They are written for plants with few states and outputs; beyond these, ``templates/loops.h`` and
+``templates/motion.h`` have the same in loops, and shorter code.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from pinnobs_gym.simulation.kernels.straight import (
 from pinnobs_gym.simulation.printer import Printer
 from pinnobs_gym.simulation.traced_code import Trace
 
-LARGEST = 6
-"""Largest number of states for which straight-line code is written."""
+_STATES, _OUTPUTS = 6, 12
+"""Largest numbers of states and outputs for which straight-line code is written: its length grows
+with the squares of both, and 25 outputs would take a compiler 20 s."""
 _NAME = re.compile(r"[A-Za-z_]\w*")
 _LINE = re.compile(r"const double (\w+) = (.*);")
 _STAGES = ((0, ""), (1, "half"), (1, "half"), (2, "h"))
@@ -38,6 +39,11 @@ stage before is multiplied by."""
 
 
 PrinterOf = Callable[[set[Any], str], Printer]
+
+
+def is_straight(nx: int, ny: int) -> bool:
+    """Return whether straight-line code is written for plants of so many states and outputs."""
+    return nx <= _STATES and ny <= _OUTPUTS
 
 
 def step_functions(f: Trace, h: Trace, printer: PrinterOf) -> list[str]:

@@ -14,8 +14,10 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.kernels import plant_library as module
 from pinnobs_gym.simulation.kernels.agreement import agrees, evaluated
+from pinnobs_gym.simulation.kernels.plant_code import plant_code
 from pinnobs_gym.simulation.kernels.plant_library import PlantLibrary, plant_library, why_not
 from pinnobs_gym.simulation.notices import say_once
+from pinnobs_gym.simulation.plant_form import plant_form
 from pinnobs_gym.simulation.system import matrix
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.induction_motor import InductionMotor
@@ -382,3 +384,33 @@ def test_a_plant_is_found_again_without_sympy_unless_it_was_edited(own_folder, t
     assert printed(gain="5.0") == "-15.0 True"
     assert printed(sign="+") == "6.0 True"
     assert len(list(own_folder.glob("*.plant"))) == 3
+
+
+def many_outputs(ny):
+    """A plant whose outputs are sums of its states."""
+
+    @dataclass(frozen=True)
+    class Seen(Base):
+        output_names = tuple(f"y{i}" for i in range(ny))
+
+        def force(self, t, a):
+            return -self.k * a
+
+        def h(self, t, x, u):
+            return stack(x, *(x[..., 0] + i * x[..., 1] for i in range(ny)))
+
+    return Seen()
+
+
+def test_code_of_many_outputs_is_short():
+    """Straight-line code grows with the square of their number, for minutes of a compiler."""
+    few, many = (plant_code(plant_form(many_outputs(ny))) for ny in (12, 25))
+    assert "STRAIGHT" in few.once
+    assert not many.steps
+
+
+def test_plants_of_too_many_outputs_stay_in_numpy():
+    assert why_not(many_outputs(33), "ekf") == "it has 33 outputs, more than 32"
+    estimator = EKF(many_outputs(33))
+    assert estimator.compiled is None
+    assert why_not(many_outputs(32), "ekf") == ""

@@ -33,8 +33,9 @@ static int64_t group(const int64_t *reached, int64_t row, int64_t batch, int64_t
     return count ? count : -1;
 }
 
-/* Filter the rows in groups of WIDE lanes, or a row that is left over alone. ``reached`` (batch,) is set to the number of the sample
-   that NumPy has to do in each row, or the number of samples. Returns 0 if there is none to do.
+/* Filter the rows in groups of WIDE lanes, or a row that is left over alone. ``reached`` (batch,) is
+   set to the number of the sample that NumPy has to do in each row, or the number of samples. Returns
+   0 if there is none to do.
 
    All rows are filtered through some samples, whose results stay in the cache while they are
    written, before the next samples. */

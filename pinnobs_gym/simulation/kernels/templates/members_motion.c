@@ -14,7 +14,7 @@ static inline void forces(const struct plan *plan, double h, const double *drawn
                           int64_t at, int count, lanes (*restrict force)[NX])
 {
     const double root = sqrt(h);
-    for (int i = 0; i < 3 * NX; i++) EACH_LANE force[0][i][l] = 0;
+    memset(force, 0, 3 * sizeof *force);
     for (int64_t j = 0; j < plan->m; j++) {
         lanes even, odd, w[3];
         AT_WIDTH(load)(1, drawn + j * members, members, at, count, &even);

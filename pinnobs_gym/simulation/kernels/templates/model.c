@@ -125,7 +125,7 @@ static void AT_WIDTH(set_step)(struct group *g, const struct parts *parts, int64
 static void AT_WIDTH(forces)(const struct group *g, int64_t number, lanes (*restrict force)[NX])
 {
     const struct moved *c = g->c;
-    for (int i = 0; i < 3 * NX; i++) EACH_LANE force[0][i][l] = 0;
+    memset(force, 0, 3 * sizeof *force);
     for (int64_t j = 0; j < c->m; j++)
         EACH_LANE {
             const double *drawn = c->draws + number * c->draws_step
