@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.given import checked_reset, checked_run, checked_upd
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
 from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.simulation.declared import check_fields
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
@@ -144,6 +145,7 @@ class BaseEstimator(ABC):
         check_parameters(type(self.system), self.system.parameters)
         noise = self.system.noise(self.noise_std, self.process_noise)  # raises for a wrong level
         check_taken(type(self), self.system, noise)
+        check_fields(type(self))
         check_settings(self, self.setting_fields())
 
     def ask_model(self) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import chain
 from typing import Any
 
@@ -17,7 +17,7 @@ from pinnobs_gym.simulation.bounds import beyond, box
 from pinnobs_gym.simulation.residual import check_periods
 from pinnobs_gym.simulation.start_law import Box, Points
 from pinnobs_gym.simulation.system import Setup, System, initial_states, vector
-from pinnobs_gym.simulation.values import is_number
+from pinnobs_gym.simulation.values import is_number, shortly
 
 _NAMES = ("state_names", "output_names", "input_names", "uncertain")
 """Attributes that are several names."""
@@ -47,6 +47,7 @@ def check_declared(cls: type[System]) -> None:
         TypeError: in one line, naming the class, the attribute, its value and what was expected.
     """
     try:
+        check_fields(cls)
         _check_names(cls)
         _check_methods(cls)
         _check_numbers(cls)
@@ -55,6 +56,26 @@ def check_declared(cls: type[System]) -> None:
         _check_unknown(cls)
     except ValueError as error:
         raise TypeError(f"system {cls.__name__}: {error}") from None
+
+
+@cache
+def check_fields(cls: type) -> None:
+    """Check that no class gives a dataclass's field another default without being one itself, or
+    without an annotation: every instance would have the default of the field.
+
+    Raises:
+        ValueError: in one line, naming the attribute.
+    """
+    for field in fields(cls):
+        value = inspect.getattr_static(cls, field.name, MISSING)
+        if value is MISSING or value is field.default or hasattr(value, "__get__"):
+            continue
+        kind = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", "...")
+        raise ValueError(
+            f"{field.name} = {shortly(value)} has no effect, because {field.name} is a field; "
+            f"expected @dataclass(frozen=True) on the class and {field.name}: {kind} = "
+            f"{shortly(value)}"
+        )
 
 
 def _own(cls: type[System], name: str) -> Any:

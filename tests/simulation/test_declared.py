@@ -305,3 +305,21 @@ def test_noise_of_a_class_is_finite_and_of_the_right_shape(given, says):
 def test_noise_of_a_class_is_a_noise():
     with pytest.raises(TypeError, match=r"^Plant\.noise .* returns float ; expected a Noise$"):
         probe(declared(noise=lambda self, noise_std=None, process_noise=None: 0.1))
+
+
+def test_a_default_that_no_instance_would_have_is_refused():
+    class Told(declared()):
+        measured_input = True
+
+    class Trusting(EKF):
+        assumed_noise = 0.1
+
+    @dataclass(frozen=True)
+    class Right(EKF):
+        assumed_noise: float = 0.1
+
+    with pytest.raises(TypeError, match=r"^system Told: measured_input = True has no effect, .*"):
+        probe(Told)
+    with pytest.raises(ValueError, match=r"^assumed_noise = 0\.1 has no effect, .*: float = 0\.1$"):
+        Trusting(declared()())
+    assert Right(declared()()).assumed_noise == 0.1
