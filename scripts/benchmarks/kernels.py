@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from kernel_figures import env_speed
-from kernel_figures.timing import in_process, medians, pair, repeated
+from kernel_figures.timing import environment, in_process, medians, pair, repeated
 
 from benchmarks import Figure, at_least, at_most, cpu_seconds
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
@@ -88,9 +88,14 @@ def against_numpy(
     """Compare records in compiled code with NumPy."""
     slow, fast = pair(name, cls)
     asked = ASKED if shapes is SHAPES else {}
+
+    def in_numpy(record: Record) -> None:
+        with environment(PINNOBS_KERNELS="0"):  # nor are steps of the model compiled
+            slow.run(record)
+
     for batch, samples in shapes:
         record = repeated(name, batch, samples)
-        times = medians([lambda r=record: slow.run(r), lambda r=record: fast.run(r)], repeats)
+        times = medians([lambda r=record: in_numpy(r), lambda r=record: fast.run(r)], repeats)
         yield from compared("NumPy", f"{fast.label}, {name}", record, times, asked.get(batch))
 
 

@@ -26,7 +26,6 @@ WRITERS = {
     ("writing.py", "os.replace("),
     ("video.py", "os.replace("),  # to a temporary file of `replacing`
     ("build.py", "os.replace("),  # in a folder to which nobody else can write
-    ("cache_folder.py", "os.replace("),
 }
 
 

@@ -76,8 +76,8 @@ class Drawn(System):
     t: float = 0.7
     x0: float = -0.4
 
-    rates: Any = None
-    outputs: Any = None
+    rates: ClassVar[Any] = None
+    outputs: ClassVar[Any] = None
     input_names = ()
     jumps: ClassVar[tuple[float, ...]] = ()
     begin: ClassVar[float] = 0.0
