@@ -40,6 +40,8 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
     for option, values in by_option(arguments):
         if option in lists and not values:
             raise ValueError(f"{option} without a value; expected one or several")
+        if "" in values:  # as of a variable of the shell that is not set
+            raise ValueError(f"{option or 'the first argument'} '' is empty; expected a value")
     arguments = _joined(arguments, lists)
     errors = io.StringIO()
     try:

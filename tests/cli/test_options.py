@@ -192,6 +192,8 @@ class Numbers:
         (["--number", "1_0"], "--number: '1_0'; expected a number"),
         (["--number", "1e400"], "--number: '1e400'; expected a number below 1e308"),
         (["--several"], "--several without a value; expected one or several"),
+        (["--number", ""], "--number '' is empty; expected a value"),
+        (["--number="], "--number '' is empty; expected a value"),
     ],
 )
 def test_numbers_are_in_plain_digits(arguments, says):
