@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, ClassVar, Self, TypeVar
 
 from pinnobs_gym.estimation.hints import as_tuple, check_settings, field_hints, fits
@@ -71,11 +71,15 @@ class TrainingConfig:
         Raises:
             ValueError: in one line, naming the setting, its value and what was expected.
         """
+        # Of a number that is out of range, the range is told rather than the type.
+        expected = f"a whole number from 0 to {SEEDS - 1}"
+        check_setting(
+            self, "seed", expected, lambda v: not isinstance(v, Real) or v in range(SEEDS)
+        )
+        expected = "None or positive seconds"
+        check_setting(self, "budget", expected, lambda v: not isinstance(v, Real) or float(v) > 0)
         check_settings(self, fields(self))
         check_whole(self, ("checkpoint_every", "log_every"))
-        expected = f"a whole number from 0 to {SEEDS - 1}"
-        check_setting(self, "seed", expected, lambda v: v in range(SEEDS))
-        check_setting(self, "budget", "None or positive seconds", lambda v: v is None or v > 0)
 
 
 ALWAYS_MAY_CHANGE = ("budget", "checkpoint_every", "log_every")

@@ -243,7 +243,7 @@ def test_the_page_of_results_gets_a_section(short, tmp_path):
             "preset='slow'; expected one of guided, plain, transfer, paper",
         ),
         (["depth", "--budget", "long"], "budget='long'; expected CPU seconds or none"),
-        (["depth", "--budget", "nan"], "budget=nan; expected None or a number"),
+        (["depth", "--budget", "nan"], "budget=nan; expected None or positive seconds"),
         (["depth", "--budget", "-1"], "budget=-1.0; expected None or positive seconds"),
         (["depth", "--seed", "-1"], "seed=-1; expected a whole number from 0 to"),
         (["depth", "--jobs", "0"], "jobs=0; expected at least 1"),
