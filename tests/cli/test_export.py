@@ -25,7 +25,7 @@ def folder(tmp_path, monkeypatch):
 @needs_c
 def test_its_files_compile_and_replay_a_log(folder, capsys):
     given = ("--system", "ReverseDuffing", "--noise-std", 0.2, "--xhat0", 0.5, -0.5)
-    assert run("export", "ekf", *given, "--out", "duffing.c", "--set", "assumed_noise=0.01") == 0
+    assert run("export", "ekf", *given, "-o", "duffing.c", "--set", "assumed_noise=0.01") == 0
     said = capsys.readouterr().out
     command = [COMPILER, *FLAGS, "duffing.c", "duffing_replay.c", "-lm", "-o", "replay"]
     subprocess.run(command, check=True)

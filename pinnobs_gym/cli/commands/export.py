@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse, settings_of
@@ -24,7 +27,7 @@ class Export:
 
     system: str
     """Name or module:Class of the model."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The C file, NAME.c; NAME begins the names of its functions. NAME.h and NAME_replay.c are
     written beside it."""
     trained: Path | None = None
