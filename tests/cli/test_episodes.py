@@ -497,9 +497,11 @@ def test_records_of_other_code_are_refused(folder, submitted, capsys):
 
 def test_names_of_estimators_here_are_not_given_away(folder, submitted, capsys):
     arguments = ("--track", "online", "--records", submitted)
-    for name in ("ekf", "ekf (mine)", " mine", ""):
+    for name in ("ekf", "ekf (mine)", " mine"):
         assert run("score", submitted / "estimates.csv", "--name", name, *arguments) == 2
         assert error(capsys).startswith(f"name={name!r}")
+    assert run("score", submitted / "estimates.csv", "--name", "", *arguments) == 2
+    assert error(capsys).startswith("--name '' is empty; expected")
 
 
 def test_records_and_estimates_in_parquet(folder, capsys):
