@@ -12,6 +12,7 @@ import numpy as np
 from pinnobs_gym.estimation.estimator import State
 from pinnobs_gym.estimation.gaussian import GaussianEstimator, checked, covariances
 from pinnobs_gym.estimation.kalman import gain_of_deviations
+from pinnobs_gym.estimation.outliers import OutlierLaw
 from pinnobs_gym.estimation.point_images import SigmaPoints
 from pinnobs_gym.estimation.recursive import RecursiveEstimator
 from pinnobs_gym.estimation.square_root import (
@@ -59,6 +60,14 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
     a turn of that at x̂, so that their mean and deviations are those of numbers.
     """
 
+    outliers: float | None = None
+    """Probability that an output is an outlier, in which case its noise is `outlier_size` times as
+    large; the gain is then the mean of the gains of both cases, weighted by their posterior
+    probabilities (`pinnobs_gym.estimation.outliers.OutlierLaw`). No output counts as one if None.
+    """
+    outlier_size: float = 30.0
+    """Standard deviation of outliers, in those of the output noise."""
+
     template = "sigma_points"
     exempt_from = {
         "model_alone": "its mean is that of points that the model has moved apart",
@@ -70,10 +79,19 @@ class SigmaPointFilter(RecursiveEstimator, GaussianEstimator):
 P_k^- &= \sum_i v_i (\chi_i^- - \hat x_k^-)(\chi_i^- - \hat x_k^-)^\top + Q \\
 \chi_i &= \hat x_k^- + \sqrt{P_k^-}\, \xi_i, \qquad \hat y = \sum_i w_i h(t_k, \chi_i, u_k) \\
 X_i &= \sqrt{v_i} (\chi_i - \hat x_k^-), \qquad Y_i = \sqrt{v_i} (h(t_k, \chi_i, u_k) - \hat y) \\
+\text{outliers: } & R_{jj} := R_{jj}\, r_j, \quad
+\frac{1}{(Y Y^\top)_{jj} + r_j R_{jj}} = \frac{1 - \pi_j}{(Y Y^\top)_{jj} + R_{jj}}
++ \frac{\pi_j}{(Y Y^\top)_{jj} + \mathrm{size}^2 R_{jj}}, \quad
+\pi_j = \text{P}(\text{outlier} \mid e_j) \\
 K &= X Y^\top (Y Y^\top + R)^{-1} \\
 \hat x_k &= \hat x_k^- + K\, (y_k - \hat y) \\
 P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
 """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.outliers is not None:
+            OutlierLaw(self.outliers, self.outlier_size)  # raises for values out of range
 
     @abstractmethod
     def points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -87,6 +105,7 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
     def plan_settings(self) -> dict[str, Any]:
         points, mean_weights, cov_weights = self.points()
         settings = {"points": points, "weights": mean_weights, "roots": np.sqrt(cov_weights)}
+        settings |= {"outlier_rate": self.outliers or 0.0, "outlier_size": self.outlier_size}
         return settings | {"num_points": len(points)}
 
     def memory_rows(self, memory: SigmaPointMemory, rows: np.ndarray) -> SigmaPointMemory:
@@ -154,7 +173,12 @@ P_k &= (X - K Y)(X - K Y)^\top + K R K^\top
         if np.count_nonzero(missing):
             innovation = np.where(missing, 0.0, innovation)
             Y = np.where(missing.T[:, None], 0.0, Y)
-        K, S = gain_of_deviations(X, Y, R)
+        if self.outliers is None:
+            K, S = gain_of_deviations(X, Y, R)
+        else:  # the sample is used with a larger R, and S is that of a usual one
+            law, S = OutlierLaw(self.outliers, self.outlier_size), outer(Y, Y) + R
+            R = law.inflated(innovation.T, S, R)
+            K, _ = gain_of_deviations(X, Y, R)
         if state.root is not None:
             rows, noise = carried(state.root), np.broadcast_to(R, (*R.shape[:2], len(y)))
             parts = (part.transpose(2, 0, 1)[rows] for part in (X, Y, noise))

@@ -35,7 +35,7 @@ class PlanStructure(ctypes.Structure):
         *(("theta", _DOUBLE), ("per_scale", _POINTER)),
         *(("switching", _DOUBLE), ("layer", _DOUBLE), ("carried", _INT)),
         *((name, _POINTER) for name in ("points", "weights", "roots")),
-        ("num_points", _INT),
+        *(("num_points", _INT), ("outlier_rate", _DOUBLE), ("outlier_size", _DOUBLE)),
     ]
 
 

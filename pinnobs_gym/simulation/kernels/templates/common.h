@@ -82,4 +82,6 @@ struct plan {
     const double *weights;    /* (num_points,) in means */
     const double *roots;      /* (num_points,) square roots of the weights in covariances */
     int64_t num_points;
+    double outlier_rate;      /* probability of an outlier, 0 for none */
+    double outlier_size;      /* its standard deviation in those of R */
 };

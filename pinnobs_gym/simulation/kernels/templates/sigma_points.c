@@ -108,6 +108,27 @@ static inline void AT_WIDTH(predict)(const struct interval *over, lanes *restric
     for (int i = 0; i < NX * NX; i++) EACH_LANE P[i][l] += Q[i][l];
 }
 
+/* Enlarge R for the gain to be the mean of those with and without an outlier in each output, as
+   pinnobs_gym/estimation/outliers.py says. */
+SEPARATE void AT_WIDTH(inflate)(const struct plan *plan, struct sample *restrict s)
+{
+    const double rate = plan->outlier_rate, size = plan->outlier_size * plan->outlier_size;
+    lanes factor[NY];
+    for (int i = 0; i < NY; i++)
+        EACH_LANE {
+            const double own = s->S[i * NY + i][l], noise = s->R[i * NY + i][l];
+            const double wide = own + (size - 1) * noise, e = s->e[i][l];
+            const double odds =
+                log(1 / rate - 1) + log(wide / own) / 2 - e * e * (1 / own - 1 / wide) / 2;
+            const double outlier = 1 / (1 + exp(odds));
+            const double mean = (1 - outlier) / own + outlier / wide;
+            factor[i][l] = maximum((1 / mean - own) / noise + 1, 1.0);
+        }
+    for (int i = 0; i < NY; i++)
+        for (int j = 0; j < NY; j++)
+            EACH_LANE s->R[i * NY + j][l] *= sqrt(factor[i][l] * factor[j][l]);
+}
+
 /* Correct x and P by the outputs of a sample. Lanes that NumPy has to correct are marked. */
 SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p,
                                 struct sample *restrict s, lanes *restrict x,
@@ -143,7 +164,13 @@ SEPARATE void AT_WIDTH(correct)(const struct plan *plan, const lanes *restrict p
     for (int i = 0; i < NY * NY; i++) EACH_LANE S[i][l] += R[i][l];
     AT_WIDTH(mark_wide)(plan, P, S, bad);
     AT_WIDTH(outer)(NX, num_points, NY, X, Y, K);
-    AT_WIDTH(divide)(NX, S, K, bad);
+    if (plan->outlier_rate) { /* K with a larger R, and S of a usual sample */
+        lanes used[NY * NY];
+        for (int i = 0; i < NY * NY; i++) EACH_LANE used[i][l] = S[i][l] - R[i][l];
+        AT_WIDTH(inflate)(plan, s);
+        for (int i = 0; i < NY * NY; i++) EACH_LANE used[i][l] += R[i][l];
+        AT_WIDTH(divide)(NX, used, K, bad);
+    } else AT_WIDTH(divide)(NX, S, K, bad);
     /* x = x + K e, and P = (X - K Y) (X - K Y)^T + K R K^T */
     lanes KR[NX * NY], own[NX * NX];
     for (int i = 0; i < NX; i++) {
