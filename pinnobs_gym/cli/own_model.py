@@ -37,7 +37,8 @@ class ModelOptions:
     """Its standard deviations; the benchmark's if not given."""
     also: tuple[str, ...] = ()
     """Unknown constants as further states: a parameter (its value in the model, with a tenth of it
-    as standard deviation), or NAME=mean,std of a parameter, bias_OUTPUT or disturbance_STATE."""
+    as standard deviation), or NAME=mean,std of a parameter, bias_OUTPUT, disturbance_STATE or
+    rate_STATE."""
 
     def told(self, name: str) -> tuple[System, Setup]:
         """Return the system of a name or ``module:Class``, which is registered, and its benchmark
@@ -64,7 +65,7 @@ class ModelOptions:
             setup = replace(setup, P0=independent(*self.P0_std))
         if not self.also:
             return system, setup
-        larger: Any = augmented(system, **_unknowns(system, self.also))
+        larger = augmented(system, **_unknowns(system, self.also))
         return larger, with_constants(larger, setup)
 
 
@@ -79,6 +80,7 @@ def _unknowns(system: System, also: Sequence[str]) -> dict[str, dict[str, Unknow
     for kind, prefix, names in (
         ("output_bias", "bias_", system.output_names),
         ("disturbance", "disturbance_", system.state_names),
+        ("rates", "rate_", system.state_names),
     ):
         for name in names:
             known.setdefault(prefix + name, (kind, name))

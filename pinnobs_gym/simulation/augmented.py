@@ -1,4 +1,5 @@
-"""A system whose unknown parameters, sensor biases and disturbances are further states."""
+"""A system whose unknown parameters, biases, disturbances and deviations of rates are further
+states."""
 
 from __future__ import annotations
 
@@ -23,15 +24,18 @@ def augmented(
     parameters: Mapping[str, Unknown] | None = None,
     output_bias: Mapping[str, Unknown] | None = None,
     disturbance: Mapping[str, Unknown] | None = None,
-) -> System:
+    rates: Mapping[str, Unknown] | None = None,
+) -> Augmented:
     """Return a system with unknown constants as further states, which do not change, so
     that every estimator estimates them (Jazwinski 1970, section 8.4).
 
     The further states are, in this order: the parameters by their names, ``bias_<output>``, which
-    is added to an output, and ``disturbance_<state>``, which is added to the rate of change of a
-    state, in state units per second (to the next state of a map). A disturbed plant moves by its f
-    even if it has a flow of its own. Their scale is the standard deviation, so that an error of 1
-    in the scores is no better than the prior.
+    is added to an output, ``disturbance_<state>``, which is added to the rate of change of a state,
+    in state units per second (to the next state of a map), and ``rate_<state>``, the relative
+    deviation r of the plant's own rate: ẋᵢ = (1 + r)·fᵢ or, of a map, xᵢ⁺ − xᵢ = (1 + r)·(fᵢ − xᵢ),
+    without unit, before a disturbance is added. A disturbed plant moves by its f even if it has a
+    flow of its own. Their scale is the standard deviation, so that an error of 1 in the scores is
+    no better than the prior.
 
     In each setup, initial states are those of the given system, and each constant is uniform within
     √3 standard deviations of its mean and within its bounds. The prior consists of the system's own
@@ -47,19 +51,33 @@ def augmented(
         parameters: the unknown parameters by name.
         output_bias: the unknown constant errors of outputs, by the output's name.
         disturbance: the unknown constants added to rates of change, by the state's name.
+        rates: the unknown relative deviations of rates of change, by the state's name, such as
+            ``Unknown(0.0, 0.1)`` for a rate that is known to 10 %.
 
     Raises:
         ValueError: in one line, if nothing is unknown, a name is unknown or taken, a parameter is
-            no number, acts on the input or the breakpoints, or cannot differ between rows.
+            no number, acts on the input or the breakpoints, or cannot differ between rows, or if
+            rates of a plant with a flow of its own are unknown.
     """
-    given = {"parameters": parameters, "output_bias": output_bias, "disturbance": disturbance}
+    given = {
+        "parameters": parameters,
+        "output_bias": output_bias,
+        "disturbance": disturbance,
+        "rates": rates,
+    }
     known = {
         "parameters": tuple(system.parameters),
         "output_bias": system.output_names,
         "disturbance": system.state_names,
+        "rates": system.state_names,
     }
     for what, constants in given.items():
         _check_constants(type(system).__name__, what, constants or {}, known[what])
+    if rates and system.own_flow:
+        kind, named = type(system).__name__, ", ".join(rates)
+        raise ValueError(
+            f"rates of {named}: {kind} moves by a flow of its own; expected a plant that moves by f"
+        )
     for name in parameters or {}:
         value = getattr(system, name)
         if not is_number(value):
@@ -85,7 +103,7 @@ def _check_constants(
     system: str, what: str, constants: Mapping[str, Unknown], known: tuple[str, ...]
 ) -> None:
     """Raise ValueError if a name is not known or a value is no `Unknown`."""
-    kind = {"parameters": "parameter", "output_bias": "output", "disturbance": "state"}[what]
+    kind = {"parameters": "parameter", "output_bias": "output"}.get(what, "state")
     for name, value in constants.items():
         if name not in known:
             listed = ", ".join(known) or "none"
@@ -96,7 +114,11 @@ def _check_constants(
 
 @cached_by_plant
 def _class(
-    plant: System, parameters: Constants, biases: Constants, disturbances: Constants
+    plant: System,
+    parameters: Constants,
+    biases: Constants,
+    disturbances: Constants,
+    rates: Constants,
 ) -> type[Augmented]:
     """Return the class of `augmented`, given the plant at the mean of the parameters. The same
     arguments give the same class."""
@@ -106,6 +128,7 @@ def _class(
         *parameters,
         *((f"bias_{name}", value) for name, value in biases),
         *((f"disturbance_{name}", value) for name, value in disturbances),
+        *((f"rate_{name}", value) for name, value in rates),
     ]
     kept = [f for f in fields(plant) if not f.kw_only and f.name not in constants]
     taken = [*plant.state_names, *plant.output_names, *plant.input_names, *(f.name for f in kept)]
@@ -120,7 +143,7 @@ def _class(
         "__doc__": f"{cls.__name__} with unknown constants as states: {', '.join(extras)}.",
         "__module__": cls.__module__,  # where its equations are
         "__reduce__": _reduced,
-        "constants": (parameters, biases, disturbances),
+        "constants": (parameters, biases, disturbances, rates),
     }
     own: list[Any] = [(f.name, f.type, _default(getattr(plant, f.name))) for f in kept]
     own += [
@@ -142,7 +165,7 @@ def _reduced(system: Augmented) -> tuple[Any, ...]:
     return _again, (system.plant, system.constants, values)
 
 
-def _again(plant: System, constants: tuple[Any, Any, Any], values: dict[str, Any]) -> System:
+def _again(plant: System, constants: tuple[Any, Any, Any, Any], values: dict[str, Any]) -> System:
     return _class(plant, *constants)(**values)
 
 
@@ -276,7 +299,7 @@ def _check_names(system: str, names: list[str], taken: list[str]) -> None:
     """Raise ValueError if there are no constants, or if one has the name of something else."""
     if not names:
         raise ValueError(
-            f"nothing of {system} is unknown; give parameters, output_bias or disturbance"
+            f"nothing of {system} is unknown; give parameters, output_bias, disturbance or rates"
         )
     for i, name in enumerate(names):
         if name in taken or name in names[:i]:

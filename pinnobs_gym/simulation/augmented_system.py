@@ -43,7 +43,7 @@ class Unknown:
 
 Constants: TypeAlias = tuple[tuple[str, Unknown], ...]
 """Unknown constants with the name of the parameter, output or state that each belongs to."""
-_PARAMETER, _BIAS, _DISTURBANCE = range(3)
+_PARAMETER, _BIAS, _DISTURBANCE, _RATE = range(4)
 """Kinds of constants, in their order in the state."""
 
 
@@ -55,7 +55,7 @@ class Augmented(System):
     plant: System = field(kw_only=True)
     """The system without further states."""
 
-    constants: ClassVar[tuple[Constants, Constants, Constants]]
+    constants: ClassVar[tuple[Constants, Constants, Constants, Constants]]
     """The constants of each kind, in the order of their columns."""
 
     def _parts(self, x: Array) -> tuple[System, Array]:
@@ -70,23 +70,29 @@ class Augmented(System):
         """The plant at the mean of the unknown parameters."""
         return replace(self.plant, **{name: getattr(self, name) for name in self.parameters})
 
+    @property
+    def _other_rates(self) -> bool:
+        """Whether a constant acts on the plant's rates of change."""
+        return bool(self.constants[_DISTURBANCE] or self.constants[_RATE])
+
     def _columns(self, kind: int, names: tuple[str, ...]) -> dict[int, int]:
-        """Return the column in the state of each constant of a kind (`_BIAS` or `_DISTURBANCE`),
-        by the number of the output or state that it is added to."""
+        """Return the column in the state of each constant of a kind other than `_PARAMETER`, by the
+        number of the output or state that it acts on."""
         first = self.plant.nx + sum(map(len, self.constants[:kind]))
         return {names.index(name): first + i for i, (name, _) in enumerate(self.constants[kind])}
 
     def _plus(self, y: Array, x: Array, columns: dict[int, int]) -> Array:
         """Return y (..., m) with the constants of these columns of x (..., nx) added."""
-        if not columns:
-            return y
-        rows = range(y.shape[-1])
-        return y + stack(x, *(x[..., columns[i]] if i in columns else 0.0 for i in rows))
+        return y + _spread(x, columns, y.shape[-1]) if columns else y
 
     def f(self, t: Array, x: Array, u: Array) -> Array:
         plant, state = self._parts(x)
-        columns = self._columns(_DISTURBANCE, plant.state_names)
-        own = self._plus(plant.f(t, state, u), x, columns)
+        own = plant.f(t, state, u)
+        columns = self._columns(_RATE, plant.state_names)
+        if columns:
+            change = own - state if self.discrete else own
+            own = own + _spread(x, columns, plant.nx) * change
+        own = self._plus(own, x, self._columns(_DISTURBANCE, plant.state_names))
         return _followed(own, x) if self.discrete else _joined(x, own, 0.0)
 
     def flow(self, t0: Array, t1: Array, x: Array, u: Array) -> Array:
@@ -108,6 +114,17 @@ class Augmented(System):
         plant, state = self._parts(x)
         above = self._jacobian(self.f, None, plant.f_jacobian(t, state, u), t, x, u)
         _set_ones(above, self._columns(_DISTURBANCE, plant.state_names))
+        columns = self._columns(_RATE, plant.state_names)
+        if columns:
+            rate = plant.f(t, state, u)
+            change = rate - state if self.discrete else rate
+            for row, column in columns.items():
+                r = x[..., column]
+                # Differences by the parameters are of the whole rate, with its factor.
+                above[..., row, : plant.nx] *= 1.0 + r[..., None]
+                if self.discrete:  # (1 + r)A - rI
+                    above[..., row, row] -= r
+                above[..., row, column] = change[..., row]
         F = np.zeros_like(above, shape=(*x.shape, self.nx))
         F[..., : plant.nx, :] = above
         if self.discrete:  # the constants of a map remain what they are
@@ -168,13 +185,13 @@ class Augmented(System):
         return _joined(x, plant.observable(state), True)
 
     def invariants(self, x: Array) -> Array | None:
-        """Those of the plant, if nothing disturbs it."""
+        """Those of the plant, if its rates are its own."""
         plant, state = self._parts(x)
-        return None if self.constants[_DISTURBANCE] else plant.invariants(state)
+        return None if self._other_rates else plant.invariants(state)
 
     def indistinguishable(self, x: Array) -> tuple[Array, ...]:
-        """Those of the plant with the same constants, if nothing disturbs it."""
-        if self.constants[_DISTURBANCE]:
+        """Those of the plant with the same constants, if its rates are its own."""
+        if self._other_rates:
             return ()
         plant, state = self._parts(x)
         xp = array_namespace(x)
@@ -203,6 +220,12 @@ def _followed(first: Array, x: Array) -> Array:
         out[..., : first.shape[-1]] = first
         return out
     return array_namespace(first).concat([first, x[..., first.shape[-1] :]], axis=-1)
+
+
+def _spread(x: Array, columns: dict[int, int], size: int) -> Array:
+    """Return the array (..., size) of these columns of x at the numbers that they belong to, and of
+    zeros."""
+    return stack(x, *(x[..., columns[i]] if i in columns else 0.0 for i in range(size)))
 
 
 def _set_ones(matrix: np.ndarray, columns: dict[int, int]) -> None:

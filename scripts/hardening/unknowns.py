@@ -14,7 +14,18 @@ from pinnobs_gym.systems import SYSTEMS
 
 MOST = 200
 NAMES = ("a1", "a2", "a9", "", " a1", "x1", "y1", "bias_y1", "bias_", "disturbance_x1", "A1", "ａ1")
-NAMES += ("__class__", "a1.x", "\x1b[2J", "a1\n", "\u202ea1", "nx", "scale", "x" * 3000, "a1=a1")
+NAMES += (
+    "rate_x1",
+    "__class__",
+    "a1.x",
+    "\x1b[2J",
+    "a1\n",
+    "\u202ea1",
+    "nx",
+    "scale",
+    "x" * 3000,
+    "a1=a1",
+)
 
 
 def trials(material: Material, rng: Random) -> Iterator[Trial]:

@@ -153,7 +153,10 @@ def test_several_logs_are_estimated_each_by_itself(folder, capsys):
         (["--log", "ms.csv"], 'give --columns "t=t*1e-3", or t=t if it is right'),
         (["--log", "jump.csv"], "log jump.csv, line 3: from t=0 s to t=1700000000 s, Swing would"),
         (["--log", "a.csv", "--also", "kk"], "also='kk'; expected NAME or NAME=mean,std with a n"),
-        (["--log", "a.csv", "--also", "kk"], "of k, d, bias_place, disturbance_p, disturbance_v;"),
+        (
+            ["--log", "a.csv", "--also", "kk"],
+            "bias_place, disturbance_p, disturbance_v, rate_p, rate_v;",
+        ),
         (["--log", "a.csv", "--also", "k", "k=1,2"], "also='k=1,2': k is given twice"),
         (["--log", "a.csv", "--also", "d"], "also='d'; expected d=mean,std, as it is 0.0 in the"),
         (["--log", "a.csv", "--also", "bias_place"], "expected bias_place=mean,std, as the model"),

@@ -374,7 +374,7 @@ ONE = Unknown(1.0, 0.1)
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({}, "nothing of Odd is unknown; give parameters, output_bias or disturbance"),
+        ({}, "nothing of Odd is unknown; give parameters, output_bias, disturbance or rates"),
         (
             {"parameters": {"m": ONE}},
             "parameters: unknown parameter 'm' of Odd; it has k, damping, gain, amplitude, jump, ",

@@ -15,6 +15,15 @@ from pinnobs_gym.simulation.runge_kutta import longest_step
 from pinnobs_gym.simulation.system import Array, Setup, System, vector
 
 
+def uncertain_parameters(system: System) -> tuple[str, ...]:
+    """Return the names of the parameters that `Mismatch` changes: those of `System.uncertain`, or
+    all but switches. If there are none, it changes the rates of change instead."""
+    if system.uncertain is not None:
+        return tuple(system.uncertain)
+    own = system.parameters.items()
+    return tuple(name for name, value in own if not isinstance(value, bool | np.bool_))
+
+
 @dataclass(frozen=True)
 class Mismatch(Condition):
     """A plant whose parameters each differ from the model's by the same fraction, with a random
@@ -47,11 +56,8 @@ class Mismatch(Condition):
         return (self._off(system),)
 
     def _off(self, system: System) -> _RelativeDeviations:
-        names = system.uncertain
-        if names is None:
-            own = system.parameters.items()
-            names = tuple(n for n, v in own if not isinstance(v, bool | np.bool_))
-        return _RelativeDeviations((self.part,) * (len(names) or system.nx), tuple(names))
+        names = uncertain_parameters(system)
+        return _RelativeDeviations((self.part,) * (len(names) or system.nx), names)
 
 
 @dataclass(frozen=True)
