@@ -90,7 +90,7 @@ class EpisodeSource:
     Args:
         system: name, ``module:Class`` or class of the system.
         setup: the setup's name.
-        condition: change of the episodes relative to the setup; see
+        condition: change of the episodes relative to the setup, or its name; see
             `pinnobs_gym.simulation.conditions`.
         changes: values that replace the setup's.
     """
@@ -99,7 +99,7 @@ class EpisodeSource:
         self,
         system: str | type[System],
         setup: str = "benchmark",
-        condition: str = "nominal",
+        condition: str | Condition = "nominal",
         **changes: Unpack[Changes],
     ) -> None:
         for name in changes:
@@ -111,7 +111,8 @@ class EpisodeSource:
         self.system, chosen = cls.configured(setup, **changes)
         if self.system.draws_input:
             self.system = replace(self.system, measured_input=True)
-        self.condition = parse_condition(condition)
+        known = isinstance(condition, Condition)
+        self.condition = condition if known else parse_condition(condition)
         self.condition.plant(self.system, ())  # raises if the condition does not apply
         self.setup = self.condition.setup(self.system, chosen)
         self.fixed_x0 = self.setup.fixed_x0

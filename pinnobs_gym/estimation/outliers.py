@@ -47,45 +47,51 @@ class OutlierLaw:
         factor = np.maximum((1 / mean_inverse - own) / noise + 1, 1)
         return R * np.sqrt(factor[:, None] * factor)
 
-    def log_density(
-        self, innovation: np.ndarray, S: np.ndarray, R: np.ndarray, missing: np.ndarray
-    ) -> np.ndarray:
-        """Return the logarithm of the density of the innovations, shape (batch,); 0 without any.
-
-        Each output has the density of the mixture. Correlations between outputs count as far as
-        neither is an outlier.
-
-        Args:
-            innovation: y − ŷ, shape (ny, batch); zero where y is missing.
-            S: covariances of the innovations, shape (ny, ny, batch).
-            R: covariance of the output noise, shape (ny, ny, batch or 1).
-            missing: which outputs are missing, bool, shape (ny, batch).
-        """
-        own = _variances(S)
-        wide = own + (self.size**2 - 1) * _variances(R)
-        usual = math.log1p(-self.rate) + _log_normal(innovation, own)
-        large = math.log(self.rate) + _log_normal(innovation, wide)
-        density = np.where(missing, 0.0, np.logaddexp(usual, large)).sum(axis=0)
-        if len(innovation) == 1:
-            return density
-        # What correlations add to the sum of the outputs' own, from the matrix of correlations
-        e = np.where(missing, 0.0, innovation / np.sqrt(own))
-        both = ~(missing[:, None] | missing)
-        C = np.where(both, S / np.sqrt(own[:, None] * own), 0.0)
-        C[range(len(e)), range(len(e))] = 1.0
-        pivots = _variances(cholesky(C))
-        joint = (total(e**2) - squared_size(e.T, C)) / 2 - total(np.log(pivots))
-        neither = np.where(missing, 1.0, 1 - self._probability(innovation, own, wide)).prod(axis=0)
-        return density + neither * joint
-
-    def _probability(
-        self, innovation: np.ndarray, own: np.ndarray, wide: np.ndarray
-    ) -> np.ndarray:
+    def _probability(self, innovation: np.ndarray, own: np.ndarray, wide: np.ndarray) -> np.ndarray:
         """Return the posterior probabilities of outliers, given the variances of the innovations
         without and with one, all of shape (ny, batch)."""
         odds = math.log(1 / self.rate - 1) + np.log(wide / own) / 2
         odds = odds - innovation**2 * (1 / own - 1 / wide) / 2
         return 1 / (1 + np.exp(odds))
+
+
+def log_density(
+    innovation: np.ndarray,
+    S: np.ndarray,
+    R: np.ndarray,
+    missing: np.ndarray,
+    rate: np.ndarray | float,
+    size: float,
+) -> np.ndarray:
+    """Return the logarithm of the density of innovations, shape (batch,); 0 without any output.
+
+    Each output has the density of the mixture of `OutlierLaw`. Correlations between outputs count
+    as far as neither is an outlier.
+
+    Args:
+        innovation: y − ŷ, shape (ny, batch); zero where y is missing.
+        S: covariances of the innovations, shape (ny, ny, batch).
+        R: covariance of the output noise, shape (ny, ny, batch or 1).
+        missing: which outputs are missing, bool, shape (ny, batch).
+        rate: probability of an outlier, a number or shape (batch,); 0 for none.
+        size: standard deviation of an outlier, in those of the output noise.
+    """
+    own = _variances(S)
+    wide = own + (size**2 - 1) * _variances(R)
+    usual = np.log1p(-rate) + _log_normal(innovation, own)
+    large = np.log(rate) + _log_normal(innovation, wide)
+    density = np.where(missing, 0.0, np.logaddexp(usual, large)).sum(axis=0)
+    if len(innovation) == 1:
+        return density
+    # What correlations add to the sum of the outputs' own, from the matrix of correlations
+    e = np.where(missing, 0.0, innovation / np.sqrt(own))
+    both = ~(missing[:, None] | missing)
+    C = np.where(both, S / np.sqrt(own[:, None] * own), 0.0)
+    C[range(len(e)), range(len(e))] = 1.0
+    pivots = _variances(cholesky(C))
+    joint = (total(e**2) - squared_size(e.T, C)) / 2 - total(np.log(pivots))
+    usually = np.exp(usual - np.logaddexp(usual, large))
+    return density + np.where(missing, 1.0, usually).prod(axis=0) * joint
 
 
 def _variances(S: np.ndarray) -> np.ndarray:

@@ -482,5 +482,7 @@ def rows_of(system: System, rows: np.ndarray) -> System:
     values = {f.name: getattr(system, f.name) for f in fields(system)}
     arrays = {name: value for name, value in values.items() if getattr(value, "ndim", 0)}
     changes = {name: value[rows] for name, value in arrays.items() if len(value) > 1}
-    changes |= {n: rows_of(value, rows) for n, value in values.items() if isinstance(value, System)}
+    for name, value in values.items():
+        if isinstance(value, System) and (part := rows_of(value, rows)) is not value:
+            changes[name] = part
     return replace(system, **changes) if changes else system

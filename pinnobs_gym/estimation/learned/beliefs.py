@@ -1,0 +1,233 @@
+"""Beliefs about a plant, each with several hypotheses about its initial state, and the filters that
+run under them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pinnobs_gym.estimation.outliers import log_density
+from pinnobs_gym.estimators.ukf import UKF
+from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.matrices import cholesky
+from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
+from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
+
+OUTLIER_SIZE = 30.0
+"""Standard deviation of outliers, in those of the output noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """What may be true of a plant, with probabilities, and hypotheses about the initial state.
+
+    A belief says how large the process noise is, whether parameters or rates of the plant deviate
+    from those of the model, and whether outputs have outliers. Each of its hypotheses is a Gaussian
+    law of the initial state, given for a prior of mean 0 and covariance I.
+    """
+
+    assumed_noise: np.ndarray
+    """Process noise of each belief as in `GaussianEstimator.assumed_noise`, shape (beliefs,)."""
+    deviation: np.ndarray
+    """Standard deviation of relative deviations of the plant, see `with_uncertain_plant`, shape
+    (beliefs,); 0 for none."""
+    outliers: np.ndarray
+    """Probability that an output is an outlier, shape (beliefs,); 0 for none."""
+    weight: np.ndarray
+    """Probability of each belief before the first sample, shape (beliefs,)."""
+    belief: np.ndarray
+    """The belief of each hypothesis, ascending, shape (hypotheses,)."""
+    share: np.ndarray
+    """Probability of each hypothesis given its belief, shape (hypotheses,)."""
+    mean: np.ndarray
+    """Mean of the initial state of each hypothesis, shape (hypotheses, nx)."""
+    cov: np.ndarray
+    """Its covariance, shape (hypotheses, nx, nx)."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The beliefs in a few words."""
+        return tuple(self._name(i) for i in range(len(self.weight)))
+
+    def _name(self, i: int) -> str:
+        wide = np.einsum("kii->ki", self.cov[self.belief == i]).max(initial=0.0) > 1
+        parts = []
+        if self.deviation[i]:
+            parts.append(f"plant off by {100 * self.deviation[i]:.3g} %")
+        elif self.assumed_noise[i] > SMALL_NOISE:
+            parts.append(f"process noise {self.assumed_noise[i]:.2g}")
+        elif wide:
+            parts.append("wider start")
+        else:
+            parts.append("model right")
+        if self.outliers[i]:
+            parts.append("outliers")
+        return ", ".join(parts)
+
+    @cached_property
+    def log_prior(self) -> np.ndarray:
+        """Logarithms of the probabilities of the hypotheses before the first sample, shape
+        (hypotheses,)."""
+        probability = self.weight[self.belief] * self.share
+        return np.log(probability / probability.sum())
+
+    def kept(self, beliefs: np.ndarray, weight: np.ndarray) -> Beliefs:
+        """Return some of the beliefs (their numbers, ascending), with other probabilities."""
+        rows = np.flatnonzero(np.isin(self.belief, beliefs))
+        return Beliefs(
+            self.assumed_noise[beliefs],
+            self.deviation[beliefs],
+            self.outliers[beliefs],
+            weight,
+            np.searchsorted(beliefs, self.belief[rows]),
+            self.share[rows],
+            self.mean[rows],
+            self.cov[rows],
+        )
+
+    def densities(
+        self, innovation: np.ndarray, S: np.ndarray, R: np.ndarray, missing: np.ndarray
+    ) -> np.ndarray:
+        """Return the logarithms of the densities of the hypotheses' innovations, shape (batch,
+        hypotheses, n); −∞ where they are not finite.
+
+        Args:
+            innovation: y − ŷ, shape (batch, hypotheses, n, ny); zero where y is missing.
+            S: their covariances, shape (batch, hypotheses, n, ny, ny).
+            R: covariance of the output noise, shape (n or 1, ny, ny, batch or 1).
+            missing: which outputs are missing, bool, shape (batch, n, ny).
+        """
+        shape, ny = innovation.shape[:3], innovation.shape[3]
+        rates = np.broadcast_to(self.outliers[self.belief][:, None], shape)
+        absent = np.broadcast_to(missing[:, None], innovation.shape)
+        noise = R[0, :, :, :1]
+        if R.shape[0] > 1 or R.shape[3] > 1:
+            by_row = np.broadcast_to(R.transpose(3, 0, 1, 2)[:, None], (*shape, ny, ny))
+            noise = by_row.reshape(-1, ny, ny).transpose(1, 2, 0)
+        with np.errstate(all="ignore"):
+            found = log_density(
+                innovation.reshape(-1, ny).T,
+                S.reshape(-1, ny, ny).transpose(1, 2, 0),
+                noise,
+                absent.reshape(-1, ny).T,
+                rates.reshape(-1),
+                OUTLIER_SIZE,
+            )
+        return np.where(np.isfinite(found), found, -np.inf).reshape(shape)
+
+
+SMALL_NOISE = 1e-4
+"""Process noise, as in `GaussianEstimator.assumed_noise`, up to which a model counts as right."""
+
+
+@dataclass(frozen=True)
+class BeliefFilter(UKF):
+    """The unscented Kalman filter under one belief. Its settings are not the user's, who is not
+    told of them."""
+
+    template = "sigma_points"
+
+    def _say_if_too_large(self, noise: AssumedNoise) -> None:
+        pass
+
+
+def filters_of(
+    beliefs: Beliefs, system: System, noise_std: Level | SampledLevel | None, process_noise: Any
+) -> tuple[BeliefFilter, ...]:
+    """Return the filter of each belief: on the model or, where the plant may deviate from it, on
+    the model with these deviations as further states.
+
+    Args:
+        beliefs: the beliefs.
+        system: the model.
+        noise_std: the known output noise, as `BaseEstimator.noise_std`.
+        process_noise: the known process noise, as `BaseEstimator.process_noise`.
+
+    Raises:
+        ValueError: in one line, if the plant has nothing that may deviate.
+    """
+    filters = []
+    known = system.noise(noise_std, process_noise)
+    for noise, deviation, outliers in zip(
+        beliefs.assumed_noise.tolist(),
+        beliefs.deviation.tolist(),
+        beliefs.outliers.tolist(),
+        strict=True,
+    ):
+        plant: System | None = system
+        level = process_noise
+        if deviation:
+            plant = with_uncertain_plant(system, deviation)
+            if plant is None:
+                raise ValueError(f"{type(system).__name__} has nothing that may deviate")
+            level = np.zeros((plant.nx, known.L(0.0).shape[1]))
+            level[: system.nx] = known.L(0.0)[..., 0]
+        law = {"outliers": outliers, "outlier_size": OUTLIER_SIZE} if outliers else {}
+        filters.append(BeliefFilter(plant, noise_std, level, assumed_noise=noise, **law))
+    return tuple(filters)
+
+
+def starts(beliefs: Beliefs, filters: tuple[BeliefFilter, ...], prior: Prior) -> list[Prior]:
+    """Return the prior of the hypotheses of each belief, of batch × hypotheses rows, those of an
+    episode one after the other.
+
+    Args:
+        beliefs: the beliefs.
+        filters: their filters.
+        prior: the prior of the episodes.
+    """
+    L = cholesky(prior.cov.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1)
+    mean = prior.mean[:, None] + np.einsum("bij,kj->bki", L, beliefs.mean)
+    cov = np.einsum("bij,kjl,bml->bkim", L, beliefs.cov, L)
+    found, nx = [], prior.mean.shape[1]
+    for i, each in enumerate(filters):
+        rows = beliefs.belief == i
+        own, P = mean[:, rows].reshape(-1, nx), cov[:, rows].reshape(-1, nx, nx)
+        if each.system.nx > nx:
+            more, spread = prior_moments(each.system, each.system.setups["benchmark"])
+            own = np.concatenate([own, np.tile(more[nx:], (len(own), 1))], axis=1)
+            larger = np.zeros((len(P), each.system.nx, each.system.nx))
+            larger[:, :nx, :nx], larger[:, nx:, nx:] = P, spread[nx:, nx:]
+            P = larger
+        found.append(Prior(own, (P + P.swapaxes(1, 2)) / 2))
+    return found
+
+
+class Layout(NamedTuple):
+    """Hypotheses about initial states, for a prior of mean 0 and covariance I."""
+
+    share: np.ndarray
+    """Their probabilities, shape (hypotheses,)."""
+    mean: np.ndarray
+    """Shape (hypotheses, nx)."""
+    cov: np.ndarray
+    """Shape (hypotheses, nx, nx)."""
+
+
+def divided(draws: np.ndarray, number: int, seed: int) -> Layout:
+    """Divide a law of initial states into parts, of each of which the mean and the covariance
+    become a hypothesis: the clusters of `scipy.cluster.vq.kmeans2` (Lloyd 1982; the start of Arthur
+    & Vassilvitskii 2007).
+
+    Args:
+        draws: states drawn from the law, shape (draws, nx).
+        number: number of parts; the result may have fewer.
+        seed: seed of the clusters' start.
+    """
+    from scipy.cluster.vq import kmeans2
+
+    if number == 1:
+        labels = np.zeros(len(draws), dtype=int)
+    else:
+        _, labels = kmeans2(draws, number, seed=seed, minit="++", missing="warn")
+    nx = draws.shape[1]
+    parts = [part for i in range(number) if len(part := draws[labels == i]) > nx]
+    share = np.array([len(part) for part in parts], dtype=float)
+    mean = np.stack([part.mean(axis=0) for part in parts])
+    cov = np.stack([np.atleast_2d(np.cov(part.T, bias=True)) for part in parts])
+    return Layout(share / share.sum(), mean, cov)
