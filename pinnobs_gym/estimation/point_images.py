@@ -63,7 +63,7 @@ class SigmaPoints:
             function: takes states (any number, batch, nx), and returns values (any number, batch,
                 m).
             jacobian: returns the Jacobians of the function at the estimates, shape (m, nx, batch).
-            notice: returns the line for the log.
+            notice: returns the line for the log, empty for none.
         """
         used, points = self.used, self.original
         if not math.isfinite(values.sum()):
@@ -72,7 +72,8 @@ class SigmaPoints:
             bad = np.logical_and(defined, ~np.isfinite(values).all(axis=(0, 2)))
             if bad.any():
                 used, values = _closer(function, self.centre, used, values, bad)
-                say_once(notice())
+                if line := notice():
+                    say_once(line)
         if used is points:
             return values
         moved = np.flatnonzero((used != points).any(axis=(0, 2)))

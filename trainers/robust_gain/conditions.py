@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pinnobs_gym.estimators.robust_gain import NOISE
 from pinnobs_gym.simulation.conditions import Combined
 from pinnobs_gym.simulation.conditions.base import Condition
 from pinnobs_gym.simulation.conditions.measurement import Dropouts, Noise, Outliers
@@ -28,7 +29,7 @@ def draw_condition(rng: np.random.Generator, system: System) -> Condition:
     if rng.random() < NOMINAL:
         return Condition()
     changes: dict[str, tuple[float, Condition]] = {
-        "noise": (0.12, Noise(_log_uniform(rng, 0.1, 15.0))),
+        "noise": (0.12, Noise(_log_uniform(rng, *NOISE))),
         "guess": (0.07, FarGuess(rng.uniform(0.5, 2.5))),
         "start": (0.05, OutsideSet(rng.uniform(1.1, 1.6))),
         "plant": (0.2, Mismatch(rng.uniform(0.03, 0.35))),

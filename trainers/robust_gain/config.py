@@ -34,7 +34,7 @@ class RobustGainConfig(TrainingConfig):
     """Standard deviation of that law, in those of the prior."""
     process_noise: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)
     """Process noise of the beliefs, as `GaussianEstimator.assumed_noise`."""
-    deviation: tuple[float, ...] = (0.1, 0.3)
+    deviation: tuple[float, ...] = (0.1, 0.2)
     """Standard deviations of relative deviations of the plant from the model."""
     outliers: float = 0.02
     """Probability of outliers under the beliefs that there are some."""

@@ -127,13 +127,16 @@ SMALL_NOISE = 1e-4
 
 @dataclass(frozen=True)
 class BeliefFilter(UKF):
-    """The unscented Kalman filter under one belief. Its settings are not the user's, who is not
-    told of them."""
+    """The unscented Kalman filter under one belief. What it cannot do is not told: a belief may be
+    far from what is true, and then has no part in the estimate."""
 
     template = "sigma_points"
 
     def _say_if_too_large(self, noise: AssumedNoise) -> None:
         pass
+
+    def _notice(self, function: str) -> str:
+        return ""
 
 
 def filters_of(
@@ -165,8 +168,9 @@ def filters_of(
             plant = with_uncertain_plant(system, deviation)
             if plant is None:
                 raise ValueError(f"{type(system).__name__} has nothing that may deviate")
-            level = np.zeros((plant.nx, known.L(0.0).shape[1]))
-            level[: system.nx] = known.L(0.0)[..., 0]
+            L = np.zeros((plant.nx, known.L(0.0).shape[1]))
+            L[: system.nx] = known.L(0.0)[..., 0]
+            level = L.tolist()
         law = {"outliers": outliers, "outlier_size": OUTLIER_SIZE} if outliers else {}
         filters.append(BeliefFilter(plant, noise_std, level, assumed_noise=noise, **law))
     return tuple(filters)
@@ -224,7 +228,7 @@ def divided(draws: np.ndarray, number: int, seed: int) -> Layout:
     if number == 1:
         labels = np.zeros(len(draws), dtype=int)
     else:
-        _, labels = kmeans2(draws, number, seed=seed, minit="++", missing="warn")
+        _, labels = kmeans2(draws, number, rng=seed, minit="++", missing="warn")
     nx = draws.shape[1]
     parts = [part for i in range(number) if len(part := draws[labels == i]) > nx]
     share = np.array([len(part) for part in parts], dtype=float)
