@@ -37,9 +37,9 @@ NOISE = (0.1, 15.0)
 """Range of the output noise of training episodes, over that of the setup."""
 _NUMBERS = 2 * 10**7
 """Approximate number of values of all hypotheses that are held at a time."""
-_UNLIKELY = 1e-4
-"""Probability below which a hypothesis has no part in estimates: a filter that has long been lost
-may be arbitrarily far away."""
+_UNLIKELY = 0.02
+"""Probability, over that of the likeliest hypothesis, below which one has no part in estimates: a
+filter that has long been lost may be arbitrarily far away."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

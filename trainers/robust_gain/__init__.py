@@ -5,7 +5,7 @@ A dictionary of beliefs is run on the simulated episodes (`dictionary`), each wi
 the filters say at some samples, of the outputs so far and of the true state, is all that the fit
 needs (`fitting`): the probabilities of the beliefs before the first sample are those that give the
 true states the highest density, a proper score, so that the covariance is learned with the
-estimate. Beliefs that hardly matter are dropped. With ``supervision="outputs"`` the density is that
+estimate. With ``supervision="outputs"`` the density is that
 of the outputs, and no true state is used.
 """
 
@@ -26,8 +26,8 @@ from pinnobs_gym.simulation.system import vector
 from pinnobs_gym.training.trainer import Trainer
 from trainers.robust_gain.conditions import draw_condition, model_is_right
 from trainers.robust_gain.config import RobustGainConfig
-from trainers.robust_gain.dictionary import dictionary
-from trainers.robust_gain.fitting import Evidence, chosen
+from trainers.robust_gain.dictionary import RIGHT, dictionary, right
+from trainers.robust_gain.fitting import Evidence, fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -182,7 +182,14 @@ class RobustGainTrainer(Trainer[RobustGainConfig, TrainedBeliefs]):
                 f"(budget={self.config.budget}); expected at least {HELD_OUT}, one of them held out"
             )
         learned = self._gathered([i for i in range(number) if i not in held])
-        beliefs, hypotheses = chosen(self.whole, learned)
+        # One of the levels of process noise with which the model counts as right is kept.
+        weight = fit(self.whole, learned)
+        near = [weight[right(self.whole, level)].sum() for level in RIGHT]
+        least = [level for level in RIGHT if level != RIGHT[int(np.argmax(near))]]
+        kept = np.flatnonzero(~np.any([right(self.whole, level) for level in least], axis=0))
+        hypotheses = np.flatnonzero(np.isin(self.whole.belief, kept))
+        beliefs = self.whole.kept(kept, np.full(len(kept), 1 / len(kept)))
+        beliefs = self.whole.kept(kept, fit(beliefs, learned.of(hypotheses)))
         loss, _ = self._gathered(held).of(hypotheses).loss(beliefs.log_prior)
         return self._trained(beliefs, loss)
 

@@ -32,13 +32,13 @@ def draw_condition(rng: np.random.Generator, system: System) -> Condition:
         "noise": (0.12, Noise(_log_uniform(rng, *NOISE))),
         "guess": (0.07, FarGuess(rng.uniform(0.5, 2.5))),
         "start": (0.05, OutsideSet(rng.uniform(1.1, 1.6))),
-        "plant": (0.2, Mismatch(rng.uniform(0.03, 0.35))),
+        "plant": (0.1, Mismatch(rng.uniform(0.03, 0.35))),
         "process": (0.2, ProcessNoise(_log_uniform(rng, 3e-4, 2e-2))),
         "outliers": (0.15, Outliers(rng.uniform(0.01, 0.1), _log_uniform(rng, 8.0, 100.0))),
         "missing": (0.1, Dropouts(rng.uniform(0.1, 0.5))),
     }
     if hasattr(system, "load_step_torque"):
-        changes["plant"] = (0.4, LoadStep(rng.uniform(0.2, 0.8)))
+        changes["load"] = (0.2, LoadStep(rng.uniform(0.2, 0.8)))
     names = list(changes)
     odds = np.array([changes[name][0] for name in names])
     number = 2 if rng.random() < SECOND else 1

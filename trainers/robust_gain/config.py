@@ -24,12 +24,12 @@ class RobustGainConfig(TrainingConfig):
     """Number of random conditions, of `per_condition` episodes each; every fourth is held out."""
     per_condition: int = 6
     """Episodes under each condition."""
-    trust: float = 0.97
+    trust: float = 0.93
     """Probability that the model is right, but for noise and missing outputs of any amount."""
     near: int = 16
     """Parts into which the initial set is divided."""
     wide: int = 8
-    """Parts into which a Gaussian law about it is divided, for initial states outside the set."""
+    """Parts into which a Gaussian law about x̂₀ is divided, for initial states outside the set."""
     spread: float = 1.7
     """Standard deviation of that law, in those of the prior."""
     process_noise: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)

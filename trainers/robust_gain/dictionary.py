@@ -1,8 +1,9 @@
-"""All beliefs from which the trainer chooses."""
+"""The beliefs whose probabilities the trainer learns."""
 
 from __future__ import annotations
 
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,20 +14,32 @@ from pinnobs_gym.simulation.matrices import cholesky
 from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
 from trainers.robust_gain.config import RobustGainConfig
 
-RIGHT = 1e-5
-"""Process noise of the belief that the model is right."""
+RIGHT = (1e-5, 1e-4)
+"""Process noise of the beliefs that the model is right, of which one is kept: with the smaller one,
+a plant that contracts may have a covariance below the error of the model's steps."""
 DEVIATING = 1e-4
-"""Process noise of the beliefs that the plant deviates from the model."""
+"""Process noise of the beliefs that the plant deviates from the model, or starts further away."""
 FEW = 5
 """Parts of the initial law under beliefs with process noise."""
-LARGE = 0.2
-"""Process noise from which on the initial law is wider, too."""
-WIDER = 1.5
+WIDER = 1.3
 """Its standard deviations, in those of the prior."""
 MOST_STATES = 12
 """Largest number of states, with further ones, of a plant that deviates from its model."""
 _DRAWS = 20_000
 """Number of draws that are divided."""
+
+
+class Kind(NamedTuple):
+    """A belief, but for outliers."""
+
+    layout: Layout
+    """Its hypotheses about the initial state."""
+    noise: float
+    """Its process noise."""
+    deviation: float = 0.0
+    """The standard deviation of what the plant deviates by."""
+    absolute: bool = False
+    """Whether the hypotheses are in state units."""
 
 
 def dictionary(source: EpisodeSource, config: RobustGainConfig) -> Beliefs:
@@ -41,30 +54,39 @@ def dictionary(source: EpisodeSource, config: RobustGainConfig) -> Beliefs:
     normal = rng.standard_normal((_DRAWS, system.nx))
     inside = _standard(source, rng)
     near = divided(inside, config.near, config.seed)
-    few = divided(normal, FEW, config.seed)
-    kinds = [
-        (RIGHT, 0.0, near),
-        (RIGHT, 0.0, _scaled(divided(normal, config.wide, config.seed), config.spread)),
-    ]
-    for noise in config.process_noise:
-        kinds.append((noise, 0.0, _scaled(few, WIDER) if noise > LARGE else few))
     half = divided(inside, max(1, config.near // 2), config.seed)
+    few = _scaled(divided(normal, FEW, config.seed), WIDER)
+    wide = _scaled(divided(normal, config.wide, config.seed), config.spread)
+    mean, cov = prior_moments(system, source.setup)
+    L = cholesky(cov[..., None], semidefinite=True)[..., 0]
+    set_itself = Layout(near.share, mean + near.mean @ L.T, L @ near.cov @ L.T)
+    kinds = [Kind(near, noise) for noise in RIGHT]
+    kinds += [Kind(set_itself, DEVIATING, absolute=True), Kind(wide, DEVIATING)]
+    kinds += [Kind(few, noise) for noise in config.process_noise]
     for deviation in config.deviation:
         larger = with_uncertain_plant(system, deviation)
         if larger is not None and larger.nx <= MOST_STATES:
-            kinds.append((DEVIATING, deviation, half))
-    kinds = list(product(kinds, (0.0, config.outliers)))
-    layouts = [layout for (_, _, layout), _ in kinds]
+            kinds.append(Kind(half, DEVIATING, deviation))
+    pairs = list(product(kinds, (0.0, config.outliers)))
+    layouts = [kind.layout for kind, _ in pairs]
     return Beliefs(
-        assumed_noise=np.array([noise for (noise, _, _), _ in kinds]),
-        deviation=np.array([deviation for (_, deviation, _), _ in kinds]),
-        outliers=np.array([rate for _, rate in kinds]),
-        weight=np.full(len(kinds), 1 / len(kinds)),
-        belief=np.repeat(np.arange(len(kinds)), [len(each.share) for each in layouts]),
+        assumed_noise=np.array([kind.noise for kind, _ in pairs]),
+        deviation=np.array([kind.deviation for kind, _ in pairs]),
+        outliers=np.array([rate for _, rate in pairs]),
+        absolute=np.array([kind.absolute for kind, _ in pairs]),
+        weight=np.full(len(pairs), 1 / len(pairs)),
+        belief=np.repeat(np.arange(len(pairs)), [len(each.share) for each in layouts]),
         share=np.concatenate([each.share for each in layouts]),
         mean=np.concatenate([each.mean for each in layouts]),
         cov=np.concatenate([each.cov for each in layouts]),
     )
+
+
+def right(beliefs: Beliefs, noise: float) -> np.ndarray:
+    """Return which beliefs are that the model is right, with this process noise and an initial
+    state of the set, bool (beliefs,)."""
+    near = ~(beliefs.wide | beliefs.absolute)
+    return (beliefs.assumed_noise == noise) & (beliefs.deviation == 0) & near
 
 
 def _standard(source: EpisodeSource, rng: np.random.Generator) -> np.ndarray:

@@ -13,8 +13,14 @@ FLOOR = -40.0
 RIDGE = 1e-4
 """Weight of the squares of the logarithms of probabilities in the loss, which thus has one
 minimum."""
-TOLERANCE = 2e-3
-"""Largest increase of the loss, in nats, for which a belief is dropped."""
+CAUTION = 0.02
+"""Part of the probability that all kinds of beliefs share equally, whatever the episodes say: one
+that explained none of them may be needed."""
+SCARCE = 0.1
+"""Factor of the probabilities that the plant deviates from the model. Where outputs tell such a
+deviation, a thousand samples outweigh any probability beforehand; where they cannot tell it from
+an error of the state, its filters stay in the mixture for good, with errors many times as large."""
+_TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,46 +70,36 @@ def _log_sum(values: np.ndarray) -> np.ndarray:
     return np.log(np.exp(values - largest).sum(axis=1)) + largest[:, 0]
 
 
-def fit(beliefs: Beliefs, evidence: Evidence) -> tuple[np.ndarray, float]:
-    """Return the probabilities of the beliefs with the least loss, and the loss."""
+def fit(beliefs: Beliefs, evidence: Evidence) -> np.ndarray:
+    """Return the probabilities of the beliefs with the least loss.
+
+    Outliers are independent of all else: beliefs come in pairs of a kind, without and with them.
+    """
     from scipy.optimize import minimize
 
-    count = len(beliefs.weight)
+    kinds = len(beliefs.weight) // 2
+
+    def probabilities(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        kind = np.exp(theta[:-1] - theta[:-1].max())
+        outliers = 1 / (1 + np.exp(-theta[-1]))
+        return kind / kind.sum(), np.array([1 - outliers, outliers])
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        log_weight = theta - np.log(np.exp(theta - theta.max()).sum()) - theta.max()
-        log_prior = log_weight[beliefs.belief] + np.log(beliefs.share)
-        loss, slope = evidence.loss(log_prior, gradient=True)
+        kind, outliers = probabilities(theta)
+        log_weight = np.log(kind[:, None] * outliers + _TINY).ravel()
+        loss, slope = evidence.loss(log_weight[beliefs.belief] + np.log(beliefs.share), True)
         assert slope is not None
-        by_belief = np.bincount(beliefs.belief, slope, minlength=count)
-        by_belief = by_belief - np.exp(log_weight) * by_belief.sum()
-        return loss + RIDGE * float(theta @ theta), by_belief + 2 * RIDGE * theta
+        by_belief = np.bincount(beliefs.belief, slope, minlength=2 * kinds).reshape(kinds, 2)
+        by_kind = by_belief.sum(axis=1) - kind * by_belief.sum()
+        by_outliers = by_belief.sum(axis=0) @ (np.array([0.0, 1.0]) - outliers[1])
+        gradient = np.append(by_kind, by_outliers)
+        return loss + RIDGE * float(theta @ theta), gradient + 2 * RIDGE * theta
 
-    found = minimize(objective, np.zeros(count), jac=True, method="L-BFGS-B")
-    weight = np.exp(found.x - found.x.max())
-    return weight / weight.sum(), float(found.fun)
-
-
-def chosen(beliefs: Beliefs, evidence: Evidence) -> tuple[Beliefs, np.ndarray]:
-    """Return the beliefs without those that hardly change the loss, with their probabilities, and
-    the numbers of their hypotheses.
-
-    One after the other is dropped, the least probable first, while the loss increases by less than
-    `TOLERANCE` over the least so far.
-    """
-    weight, loss = fit(beliefs, evidence)
-    best, kept = loss, np.arange(len(weight))
-    present = beliefs.kept(kept, weight)
-    dropped = True
-    while dropped and len(kept) > 1:
-        dropped = False
-        for i in np.argsort(present.weight, kind="stable")[:4]:
-            fewer = np.delete(kept, i)
-            part = evidence.of(np.flatnonzero(np.isin(beliefs.belief, fewer)))
-            tried = beliefs.kept(fewer, np.full(len(fewer), 1 / len(fewer)))
-            weight, loss = fit(tried, part)
-            if loss < best + TOLERANCE:
-                present, kept = beliefs.kept(fewer, weight), fewer
-                best, dropped = min(best, loss), True
-                break
-    return present, np.flatnonzero(np.isin(beliefs.belief, kept))
+    found = minimize(objective, np.zeros(kinds + 1), jac=True, method="L-BFGS-B").x
+    kind, outliers = probabilities(found)
+    # No probability is nearly zero, whatever the episodes say.
+    kind = (1 - CAUTION) * kind + CAUTION / kinds
+    kind = np.where(beliefs.deviation[::2] > 0, SCARCE * kind, kind)
+    kind = kind / kind.sum()
+    outliers = (1 - CAUTION) * outliers + CAUTION / 2
+    return (kind[:, None] * outliers).ravel()

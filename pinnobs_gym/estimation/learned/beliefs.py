@@ -28,7 +28,8 @@ class Beliefs:
 
     A belief says how large the process noise is, whether parameters or rates of the plant deviate
     from those of the model, and whether outputs have outliers. Each of its hypotheses is a Gaussian
-    law of the initial state, given for a prior of mean 0 and covariance I.
+    law of the initial state, given for a prior of mean 0 and covariance I or, where a belief is
+    that the initial set is that of the training whatever the prior, in state units.
     """
 
     assumed_noise: np.ndarray
@@ -38,6 +39,8 @@ class Beliefs:
     (beliefs,); 0 for none."""
     outliers: np.ndarray
     """Probability that an output is an outlier, shape (beliefs,); 0 for none."""
+    absolute: np.ndarray
+    """Whether the initial laws of a belief are given in state units, bool, shape (beliefs,)."""
     weight: np.ndarray
     """Probability of each belief before the first sample, shape (beliefs,)."""
     belief: np.ndarray
@@ -49,25 +52,28 @@ class Beliefs:
     cov: np.ndarray
     """Its covariance, shape (hypotheses, nx, nx)."""
 
+    @cached_property
+    def wide(self) -> np.ndarray:
+        """Whether the initial law of a belief is wider than the prior, bool (beliefs,)."""
+        square = np.einsum("kii->ki", self.cov) + self.mean**2
+        parts = [self.belief == i for i in range(len(self.weight))]
+        found = np.array([(self.share[p] @ square[p]).max(initial=0.0) > WIDE**2 for p in parts])
+        return found & ~self.absolute
+
     @property
     def names(self) -> tuple[str, ...]:
         """The beliefs in a few words."""
         return tuple(self._name(i) for i in range(len(self.weight)))
 
     def _name(self, i: int) -> str:
-        wide = np.einsum("kii->ki", self.cov[self.belief == i]).max(initial=0.0) > 1
-        parts = []
         if self.deviation[i]:
-            parts.append(f"plant off by {100 * self.deviation[i]:.3g} %")
+            name = f"plant off by {100 * self.deviation[i]:.3g} %"
         elif self.assumed_noise[i] > SMALL_NOISE:
-            parts.append(f"process noise {self.assumed_noise[i]:.2g}")
-        elif wide:
-            parts.append("wider start")
+            name = f"process noise {self.assumed_noise[i]:.2g}"
         else:
-            parts.append("model right")
-        if self.outliers[i]:
-            parts.append("outliers")
-        return ", ".join(parts)
+            name = "wider start" if self.wide[i] else "model right"
+            name = "start of the training" if self.absolute[i] else name
+        return name + (", outliers" if self.outliers[i] else "")
 
     @cached_property
     def log_prior(self) -> np.ndarray:
@@ -83,6 +89,7 @@ class Beliefs:
             self.assumed_noise[beliefs],
             self.deviation[beliefs],
             self.outliers[beliefs],
+            self.absolute[beliefs],
             weight,
             np.searchsorted(beliefs, self.belief[rows]),
             self.share[rows],
@@ -121,6 +128,8 @@ class Beliefs:
         return np.where(np.isfinite(found), found, -np.inf).reshape(shape)
 
 
+WIDE = 1.2
+"""Standard deviation of an initial law, in those of the prior, above which it counts as wider."""
 SMALL_NOISE = 1e-4
 """Process noise, as in `GaussianEstimator.assumed_noise`, up to which a model counts as right."""
 
@@ -186,8 +195,11 @@ def starts(beliefs: Beliefs, filters: tuple[BeliefFilter, ...], prior: Prior) ->
         prior: the prior of the episodes.
     """
     L = cholesky(prior.cov.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1)
-    mean = prior.mean[:, None] + np.einsum("bij,kj->bki", L, beliefs.mean)
-    cov = np.einsum("bij,kjl,bml->bkim", L, beliefs.cov, L)
+    told = ~beliefs.absolute[beliefs.belief]
+    relative = prior.mean[:, None] + np.einsum("bij,kj->bki", L, beliefs.mean)
+    mean = np.where(told[:, None], relative, beliefs.mean)
+    relative = np.einsum("bij,kjl,bml->bkim", L, beliefs.cov, L)
+    cov = np.where(told[:, None, None], relative, beliefs.cov)
     found, nx = [], prior.mean.shape[1]
     for i, each in enumerate(filters):
         rows = beliefs.belief == i
