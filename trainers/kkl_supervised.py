@@ -45,7 +45,7 @@ class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
         labels = samples.labels
 
         def draw(generator: torch.Generator) -> Sequence[Equations]:
-            k, i = samples.draw(generator, samples.dynamics.size)
+            k, i = samples.draw(generator, samples.dynamics.size, known=True)
             return [Equations([Term(samples.encoded(k, i))], labels[k, i])]
 
         return draw

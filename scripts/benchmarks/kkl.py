@@ -44,11 +44,15 @@ STATES_SEED = 20_261_122
 """Seed of these states, which were not used for tuning."""
 BUDGET = 40.0
 """CPU seconds of each training for these episodes."""
-SETTINGS: dict[str, Any] = {"start": "zero", "transient": False, "budget": BUDGET}
+SETTINGS: dict[str, Any] = {
+    **{"start": "zero", "transient": False, "budget": BUDGET},
+    "fallback": False,  # T* alone is measured
+}
 ACCURACY = {"kkl_supervised": 2e-6, "kkl_pinn": 1e-5, "kkl_autoencoder": 2e-5}
 """Bounds of the mean squared error without noise."""
-AUTHORS = {"kkl_supervised": 3.8e-4, "kkl_pinn": 3.5e-4, "kkl_autoencoder": 4.7e-4}
-"""Mean squared errors of the code published by Niazi et al., after 77 to 205 CPU s."""
+AUTHORS = {"kkl_supervised": 2.06e-4, "kkl_pinn": 2.59e-4, "kkl_autoencoder": 3.81e-4}
+"""Mean squared errors of the networks that Niazi et al. publish with their code, on the test set of
+50 trajectories that they publish with them, from `FROM` on."""
 FAITHFUL_BUDGET = 200.0
 """CPU seconds of each training by a preset ``faithful``."""
 TAIL = {
@@ -58,6 +62,8 @@ TAIL = {
 """Bounds of the median tail NRMSE of the best of the three on the benchmark."""
 EPISODES = 100
 """Number of benchmark episodes, with seeds 0, 1, ..."""
+OUTSIDE = "x0_outside"
+"""The condition under which no episode may diverge, since a fallback takes over."""
 BENCHMARK_BUDGET = 45.0
 """CPU seconds of each training on the benchmark, as on the leaderboard."""
 COST_BATCH = 256
@@ -196,45 +202,60 @@ def mse(trained: TrainedKKL, x0: np.ndarray, noise_std: float) -> float:
 
 
 def cost(trained: TrainedKKL, repeats: int) -> Iterator[Figure]:
-    """Measure the CPU time of an update, per step and episode."""
+    """Measure the CPU time of an update, per step and episode, without and with a fallback."""
     record = played(inside(1.0)[:COST_BATCH], 0.0)
-    observer = KKL(ReverseDuffing(), trained=trained)
-    taken = []
-    for _ in range(repeats):
-        start = time.process_time()
-        observer.run(record)
-        taken.append(time.process_time() - start)
-    each = 1e6 * float(np.median(taken)) / (record.batch * record.num_samples)
-    title = f"online cost per step and episode, batch {COST_BATCH}"
-    yield at_most(title, each, "µs", 5.0)
+    guarded = fitted("kkl_supervised", 0.0, iterations=1, trajectories=100)
+    for what, each in (("", trained), (", with the fallback", guarded)):
+        observer = KKL(ReverseDuffing(), trained=each)
+        observer.run(record)  # the first run compiles the filter
+        taken = []
+        for _ in range(repeats):
+            start = time.process_time()
+            observer.run(record)
+            taken.append(time.process_time() - start)
+        cost = 1e6 * float(np.median(taken)) / (record.batch * record.num_samples)
+        title = f"online cost per step and episode, batch {COST_BATCH}{what}"
+        yield at_most(title, cost, "µs", 5.0)
 
 
 def benchmark() -> Iterator[Figure]:
-    """Score the default presets on the benchmark's episodes."""
+    """Score the default presets on the benchmark's episodes, and from states outside of its set."""
     for name in SYSTEMS.classes():
-        tails, diverged = {}, {}
+        tails, diverged, outside = {}, {}, {}
         for trainer in TRAINERS:
-            rows = _scored(name, trainer)
+            observer = _trained(name, trainer)
+            rows = evaluate(observer, env_id(name), episodes=EPISODES)
             tails[trainer] = float(np.median([row["nrmse_tail"] for row in rows]))
-            diverged[trainer] = 100 * float(np.mean([row["diverged"] for row in rows]))
+            diverged[trainer] = _diverged(rows)
             whole = float(np.median([row["nrmse"] for row in rows]))
             yield Figure(f"{trainer} on {name}, NRMSE", whole, "", "", None)
             yield Figure(f"{trainer} on {name}, tail NRMSE", tails[trainer], "", "", None)
             yield Figure(f"{trainer} on {name}, diverged", diverged[trainer], "%", "", None)
+            rows = evaluate(observer, env_id(name), condition=OUTSIDE, episodes=EPISODES)
+            outside[trainer] = _diverged(rows)
+            tail = float(np.median([row["nrmse_tail"] for row in rows]))
+            title = f"{trainer} on {name}, {OUTSIDE}"
+            yield Figure(f"{title}, diverged", outside[trainer], "%", "", None)
+            yield Figure(f"{title}, tail NRMSE", tail, "", "", None)
+        title = f"worst of three on {name}, {OUTSIDE}, diverged"
+        yield at_most(title, max(outside.values()), "%", 0.0)
         best = min(tails, key=lambda trainer: (diverged[trainer], tails[trainer]))
         if name in TAIL:
             yield at_most(f"best of three on {name}, diverged", diverged[best], "%", 0.0)
             yield at_most(f"best of three on {name}, tail NRMSE", tails[best], "", TAIL[name])
 
 
-def _scored(name: str, trainer: str) -> list[dict[str, Any]]:
-    """Train on a system, and return the rows of its benchmark episodes."""
+def _diverged(rows: Sequence[dict[str, Any]]) -> float:
+    """Return the percentage of episodes that diverged."""
+    return 100 * float(np.mean([row["diverged"] for row in rows]))
+
+
+def _trained(name: str, trainer: str) -> Any:
+    """Train on a benchmark, and return the observer."""
     torch.set_num_threads(1)
     game = Game.of(name)
     system, setup = game.source.system, game.source.setup
     config = TRAINERS[trainer].configured({"budget": BENCHMARK_BUDGET})
     trained = train_by_name(trainer, config, game)
     observer: Any = ESTIMATORS.resolve(trainer)
-    return evaluate(
-        observer(system, setup.noise_std, trained=trained), env_id(name), episodes=EPISODES
-    )
+    return observer(system, setup.noise_std, trained=trained)

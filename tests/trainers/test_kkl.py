@@ -281,9 +281,53 @@ def test_escaping_samples_are_dropped_counted_and_refused_if_many():
         trained = trained_by("kkl_supervised", Cubic(), short, record=record)
     assert 0 < trained.facts["dropped"] <= 10
     assert trained.facts["drawn"] == 100
+
+
+class Explosive(Cubic):
+    """ẋ = x³ − x runs to infinity forward from abs x > 1, and comes from there backward."""
+
+    def f(self, t, x, u):
+        return stack(x, x[..., 0] ** 3 - x[..., 0] - (x[..., 0] < -1) * 4 * x[..., 0] ** 3)
+
+
+@pytest.mark.parametrize("mode", ["continuous", "discrete"])
+def test_T_is_found_forward_if_many_states_escape_backward(mode):
+    """At states that all reach; of its own equation Φ T(x_k) + Γ₀y_k + Γ₁y_{k+1} is T(x_{k+1})."""
+    dynamics, t = realised((-1.0, -2.0), 1, mode), 0.05 * np.arange(50)
+    x0 = np.linspace(-2, 2, 20)[:, None]  # 10 of them escape
+    found = simulated(Cubic(), dynamics, t, x0, np.arange(50), "output")
+    assert (found.dropped, found.drawn, found.reached) == (0, 20, 20)
+    assert np.isnan(found.T[:, :20]).all()
+    np.testing.assert_array_equal(found.x0[:20], x0)
+    np.testing.assert_allclose(abs(found.x0[20:]), 1.0, atol=1e-6)  # the attractors
+    # There z is at rest.
+    rest = found.x0[20:] @ at_rest(dynamics, "output").T
+    np.testing.assert_allclose(found.T[0, 20:], rest, atol=1e-5)
+    np.testing.assert_allclose(found.T[-1, 20:], rest, atol=1e-5)
+    late = {**SMALL, "iterations": 3, "cutoff": 0.5, "low": (-2.0,), "high": (2.0,), "mode": mode}
+    prior = Prior(np.zeros((1, 1)), np.eye(1)[None])
+    record = Record(t, np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), prior)
+    with pytest.warns(UserWarning, match=r"^over 10% of 100 initial states of Cubic escape .*"):
+        trained = trained_by("kkl_supervised", Cubic(), late, record=record)
+    assert math.isfinite(trained.facts["loss_of_T"])
+
+
+def test_states_that_escape_backward_and_forward_are_refused():
     x0 = np.linspace(-2, 2, 20)[:, None]
-    with pytest.raises(ValueError, match=r"10 of 20 initial states of Cubic escape .* at most 10%"):
-        simulated(Cubic(), dynamics, t, x0, np.arange(50))
+    with pytest.raises(
+        ValueError, match=r"^5 of 20 .* Explosive escape .* s, and 5 forward; .* 10%"
+    ):
+        simulated(Explosive(), realised((-1.0, -2.0), 1), 0.05 * np.arange(50), x0, np.arange(50))
+    with pytest.raises(ValueError, match=r"^start='prior', but x̂₀ of Cubic escapes"):
+        simulated(
+            Cubic(),
+            realised((-1.0, -2.0), 1),
+            0.05 * np.arange(50),
+            x0,
+            np.arange(50),
+            "prior",
+            np.array([[2.0]]),
+        )
 
 
 def test_initial_states_fill_the_set():

@@ -85,6 +85,9 @@ class KKLConfig(TrainingConfig):
     """Fraction of a network's steps without a lower validation error after which it stops."""
     noise: bool = True
     """Whether the known output noise is added to z in training."""
+    fallback: bool = True
+    """Whether estimates are those of an unscented Kalman filter where z is outside of the region of
+    the training; see `pinnobs_gym.estimators.kkl.KKL`."""
     dtype: Precision = "float64"
     """Precision of the networks; labels are always in double precision."""
     device: Device = "auto"
@@ -152,7 +155,7 @@ def as_published(config: KKLConfigT, **changes: Any) -> KKLConfigT:
     """Return a config with the settings common to the papers of the three methods, and further
     changes.
 
-    The common settings are: z from 0, no noise, Adam.
+    The common settings are: z from 0, no noise, Adam, no fallback.
     """
     common: dict[str, Any] = {
         "start": "zero",
@@ -163,6 +166,7 @@ def as_published(config: KKLConfigT, **changes: Any) -> KKLConfigT:
         "batch": 256,
         "iterations": 12_000,
         "noise": False,
+        "fallback": False,
         "dtype": "float32",
     }
     return replace(config, **{**common, **changes})

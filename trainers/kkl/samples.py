@@ -13,7 +13,14 @@ from pinnobs_gym.estimation.learned.kkl_maps import Scaling
 from pinnobs_gym.estimators.kkl import Clock
 from pinnobs_gym.simulation.system import System, vector
 from trainers.kkl.config import KKLConfig
-from trainers.kkl.labels import driven, initial_states, noise_in_z, simulated
+from trainers.kkl.labels import (
+    MOST_ESCAPED,
+    SETTLED,
+    driven,
+    initial_states,
+    noise_in_z,
+    simulated,
+)
 
 _PARTS = 12
 """Number of parts of the episode whose errors have the same weight."""
@@ -82,12 +89,7 @@ class Samples:
         self.data = simulated(
             system, self.dynamics, self.t, x0, self.kept, config.start, self.prior
         )
-        if self.data.dropped:
-            warnings.warn(
-                f"{self.data.dropped} of {self.data.drawn} initial states of "
-                f"{type(system).__name__} escape when integrated backward, and are left out",
-                stacklevel=2,
-            )
+        self._warn()
         # The first episodes are held out for validation.
         batch = self.data.x.shape[1]
         self.held = slice(0, min(held, batch // 2))
@@ -95,6 +97,23 @@ class Samples:
         rest = at_rest(self.dynamics, config.start)
         rows = batch if std.any() else 1
         self.noise = noise_in_z(self.dynamics, self.t, std, self.kept, rows, rng, rest)
+
+    def _warn(self) -> None:
+        """Warn of initial states that escape."""
+        data = self.data
+        of = f"of {data.drawn} initial states of {type(self.system).__name__}"
+        if data.reached:
+            warnings.warn(
+                f"over {MOST_ESCAPED:.0%} {of} escape when integrated backward: T is fitted to "
+                f"states that they reach forward in {SETTLED / self.dynamics.slowest:.3g} s",
+                stacklevel=2,
+            )
+        if data.dropped:
+            where = "forward" if data.reached else "backward"
+            warnings.warn(
+                f"{data.dropped} {of} escape when integrated {where}, and are left out",
+                stacklevel=2,
+            )
 
     def _prepare(self, labelled: bool) -> None:
         """Compute the scalings, and the samples as scaled tensors."""
@@ -114,6 +133,14 @@ class Samples:
         self.whitening = Scaling.white(data.z, self.noise)
         self.times = self.tensor(self.clock_scaling.scaled(times))
         self.x = self.tensor(self.x_scaling.scaled(data.x))
+        # The training episodes, and those of them along which T(x) is known.
+        known = np.ones(len(data.x0), dtype=bool)
+        if labelled and data.T is not None:
+            known = np.isfinite(data.T[0]).all(axis=1)
+        self.episodes, self.known = (
+            torch.from_numpy(self.held.stop + np.flatnonzero(rows[self.held.stop :]))
+            for rows in (np.ones_like(known), known)
+        )
         self.labels = None
         if labelled:
             self.labels = self.tensor(self.z_scaling.scaled(data.z if data.T is None else data.T))
@@ -128,7 +155,11 @@ class Samples:
         return torch.tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
 
     def draw(
-        self, generator: torch.Generator, outputs: int, part: float = 1.0
+        self,
+        generator: torch.Generator,
+        outputs: int,
+        part: float = 1.0,
+        known: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Draw the indices of kept samples and of training episodes, (count,) each.
 
@@ -136,12 +167,12 @@ class Samples:
             generator: random generator.
             outputs: number of outputs of the network; ``config.batch`` counts equations.
             part: fraction of the batch to draw.
+            known: whether to draw from episodes with known T(x) only.
         """
         count = max(8, round(part * self.config.batch / outputs))
         k = torch.randint(len(self.data.t), (count,), generator=generator)
-        episodes = torch.randint(
-            self.held.stop, self.data.x.shape[1], (count,), generator=generator
-        )
+        among = self.known if known else self.episodes
+        episodes = among[torch.randint(len(among), (count,), generator=generator)]
         return k.to(self.device), episodes.to(self.device)
 
     def outputs(self) -> np.ndarray:

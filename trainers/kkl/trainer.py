@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from pinnobs_gym.estimation.learned.kkl_region import Region
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
 from pinnobs_gym.simulation.record import Record
@@ -197,7 +198,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         fit = self._present_fit
         samples, decoder = fit.samples, fit.decoder()
         facts = self.facts(loss=decoder.error, seed=self.config.seed)
-        return TrainedKKL(
+        trained = TrainedKKL(
             **{**facts, "config": plain(asdict(fit.config))},
             A=samples.dynamics.A,
             B=samples.dynamics.B,
@@ -216,9 +217,21 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
                 "sweep": self.sweep,
             },
         )
+        return (
+            replace(trained, region=_region(samples, trained)) if fit.config.fallback else trained
+        )
 
     def figures(self, trained: TrainedKKL) -> dict[str, Figure]:
         return pictures.figures(self.system, trained, self.record)
+
+
+def _region(samples: Samples, trained: TrainedKKL) -> Region:
+    """Return the region of the z with noise of all kept samples, and T* of them."""
+    data = samples.data
+    z = data.z + samples.noise
+    xhat = trained.inverse(z, data.t[:, None], data.u[:, None])
+    z, xhat = (each.reshape(-1, each.shape[-1]) for each in (z, xhat))
+    return Region.of(z, xhat, samples.config.seed)
 
 
 def _check(system: System, record: Record) -> None:
