@@ -35,6 +35,7 @@ class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
 
     name = "kkl_supervised"
     presets = {"default": KKLSupervisedConfig, "faithful": faithful}
+    takes_drawn_inputs = True
 
     def gap(self) -> int:
         return 0

@@ -17,7 +17,7 @@ from pinnobs_gym.estimation.learned.kkl_region import Region
 from pinnobs_gym.estimation.learned.perceptron import Layers, perceptron
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
-from pinnobs_gym.estimation.takes import EVERYTHING
+from pinnobs_gym.estimation.takes import EVERYTHING, NotTaken
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.notices import say_first
@@ -65,7 +65,7 @@ class TrainedKKL(Trained):
     A: np.ndarray
     """A_z, shape (nz, nz), in 1/s."""
     B: np.ndarray
-    """B_z, shape (nz, ny), in 1/s per output unit."""
+    """B_z, shape (nz, ny), in 1/s per output unit; or (nz, ny + nu) if inputs drive z, too."""
     mode: Mode
     start: Start
     clock: Clock
@@ -115,7 +115,9 @@ class TrainedKKL(Trained):
         return {name: self.facts[name] for name in ("dropped", "drawn")}
 
     def check_fits(self, path: str | Path, system: System) -> None:
-        sizes = {"nx": len(self.decoder[-1][1]), "ny": self.B.shape[1]}
+        drives = self.B.shape[1]
+        ny = system.ny if drives == system.ny + system.nu else drives
+        sizes = {"nx": len(self.decoder[-1][1]), "ny": ny}
         check_same(path, sizes, {"nx": system.nx, "ny": system.ny})
 
 
@@ -128,7 +130,8 @@ class KKLMemory:
     first: float | None = None
     """Time of the first sample in s."""
     y: np.ndarray | None = None
-    """Outputs at the last sample, predicted ones where they are missing; shape (batch, ny)."""
+    """Outputs at the last sample, predicted ones where they are missing, followed by the inputs if
+    these drive z; shape (batch, ny) or (batch, ny + nu)."""
     left: np.ndarray | None = None
     """Time in s at which z was last outside of its region, −∞ if it never was, shape (batch,); None
     without a fallback."""
@@ -149,6 +152,9 @@ class KKL(LearnedEstimator, Estimator):
     for three of its slowest time constants after, the estimate is that of the filter. ``outside``
     of the state says when. z goes on meanwhile, since it depends on the outputs alone. An observer
     trained with ``fallback=False`` gives T*(z) everywhere.
+
+    Of a plant whose inputs are drawn (`System.draw_input`), z is driven by outputs and inputs
+    alike, so that it knows the recent past of both.
     """
 
     trained: TrainedKKL = field(kw_only=True, repr=False)
@@ -159,8 +165,9 @@ class KKL(LearnedEstimator, Estimator):
         "model_alone": "its estimate is a function of z, which knows no prior",
         "blank_rows": "a missing output is replaced by that of its own prediction",
         "units": "its maps were learned in the units of its training",
+        "held_input": "T* is given the input at the sample, too, on which outputs may depend",
     }
-    takes = EVERYTHING - {"maps", "stiff", "output_period", "held_input"}
+    takes = EVERYTHING - {"maps", "stiff", "output_period"}
     equations = r"""
 \dot z &= A_z z + B_z y, \qquad z_{k+1} = \Phi z_k + \Gamma_0 y_k + \Gamma_1 y_{k+1} \\
 \hat x &= T^*(z), \qquad \tfrac{\partial T}{\partial t} + \tfrac{\partial T}{\partial x}\,
@@ -169,6 +176,23 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self._held and not self._takes_inputs:
+            raise NotTaken(
+                f"{self.label} was trained with the inputs that {type(self.system).__name__} "
+                "defines; for measured ones that are held it has to be trained on drawn ones "
+                "(System.draw_input)"
+            )
+
+    @property
+    def _takes_inputs(self) -> bool:
+        """Whether inputs drive z, too."""
+        return self.trained.B.shape[1] > self.system.ny
+
+    @property
+    def _held(self) -> bool:
+        """Whether there are measured inputs that are held between samples."""
+        system = self.system
+        return system.measured_input and system.nu > 0 and system.input_hold == "previous"
 
     @property
     def training(self) -> dict[str, Any]:
@@ -192,14 +216,19 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
     def update(self, state: State, t: float, y: np.ndarray, u: np.ndarray) -> State:
         trained, memory, given = self.trained, state.memory, y
         y = self._complete(state, t, y, u)
+        if self._takes_inputs:
+            y = np.concatenate([y, u], axis=1)
         if state.t is None:
             z, first = self._begin(state.xhat, y), t
         else:
-            first = memory.first
+            first, end = memory.first, y
+            if self._takes_inputs and self._held:  # until the sample they are those of the last one
+                ny = self.system.ny
+                end = np.concatenate([y[:, :ny], memory.y[:, ny:]], axis=1)
             flow, gamma0, gamma1 = trained.dynamics.step(t - state.t)
             z = memory.z @ flow.T
             z += memory.y @ gamma0.T
-            z += y @ gamma1.T
+            z += end @ gamma1.T
         xhat = trained.inverse(z, t - first, u)
         if trained.region is None:
             return State(xhat, t, u, memory=KKLMemory(z, first, y))
@@ -224,6 +253,8 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
     def exported(self, code: PlantCode, prior: Prior) -> Algorithm | None:
         from pinnobs_gym.estimation.export.kkl import kkl_code
 
+        if self._takes_inputs:
+            raise ValueError(f"{self.label} is driven by measured inputs, too: it is not exported")
         return kkl_code(self.trained, self.system, code)
 
     def _begin(self, xhat: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -16,7 +17,9 @@ from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
 from pinnobs_gym.leaderboard.grid import markdown_table
+from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.system import Array, Setup, System, stack
 from pinnobs_gym.simulation.truth import truth
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
@@ -75,6 +78,8 @@ def figures(repeats: int) -> Iterator[Figure]:
     yield from cost(trained, repeats)
     yield from noisy()
     yield from outside()
+    yield from attractor()
+    yield from measured_input()
     yield from faithful()
     yield from benchmark()
 
@@ -157,6 +162,82 @@ def outside() -> Iterator[Figure]:
         yield Figure(title, errors[-1], "", "", None)
     title = "kkl_supervised, MSE from 1.5 <= abs x0 <= 3, worst seed"
     yield at_most(title, max(errors), "", 5e-5)
+
+
+class Rossler(System):
+    """Rössler's system (1976) with a = b = 0.2 and c = 5.7, its first state measured.
+
+    States around its attractor come from infinity: backward, x₃ grows by e^((5.7 − x₁)t)."""
+
+    state_names = ("x1", "x2", "x3")
+    output_names = ("y",)
+    scale = (5.0, 5.0, 5.0)
+    setups = {
+        "benchmark": Setup(
+            (-5.0, -5.0, 0.0), (5.0, 5.0, 5.0), duration=60.0, dt=0.05, noise_std=0.05
+        )
+    }
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        x1, x2, x3 = x[..., 0], x[..., 1], x[..., 2]
+        return stack(x, -x2 - x3, x1 + 0.2 * x2, 0.2 + x3 * (x1 - 5.7))
+
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        return x[..., :1]
+
+
+class DrivenPendulum(System):
+    """A damped pendulum driven by a torque that is measured and held between samples.
+
+    The torque over the inertia, in rad/s², is drawn as a sum of four sines of random frequencies up
+    to 1 Hz."""
+
+    state_names = ("angle", "rate")
+    output_names = ("y",)
+    input_names = ("torque",)
+    scale = (1.0, 3.0)
+    setups = {"benchmark": Setup((-1.0, -1.0), (1.0, 1.0), duration=10.0, dt=0.02, noise_std=0.01)}
+
+    def f(self, t: Array, x: Array, u: Array) -> Array:
+        angle, rate = x[..., 0], x[..., 1]
+        return stack(x, rate, u[..., 0] - 9.81 * array_namespace(x).sin(angle) - 0.5 * rate)
+
+    def h(self, t: Array, x: Array, u: Array) -> Array:
+        return x[..., :1]
+
+    def draw_input(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+        sizes, phases = rng.normal(0.0, 1.5, 4), rng.uniform(0.0, 2 * np.pi, 4)
+        angles = 2 * np.pi * rng.uniform(0.0, 1.0, 4) * times[:, None] + phases
+        return (sizes * np.sin(angles)).sum(axis=1, keepdims=True)
+
+
+def attractor() -> Iterator[Figure]:
+    """Measure the errors on Rössler's attractor, from most states around which T is not defined."""
+    with SYSTEMS.isolated():
+        SYSTEMS.register(Rossler)
+        for trainer in TRAINERS:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # the states that escape backward
+                observer = _trained("Rossler", trainer)
+            rows = evaluate(observer, env_id("Rossler"), episodes=EPISODES)
+            tails = [row["nrmse_tail"] for row in rows]
+            yield at_most(f"{trainer} on Rössler's system, diverged", _diverged(rows), "%", 0.0)
+            title = f"{trainer} on Rössler's system, tail NRMSE"
+            yield Figure(title, float(np.median(tails)), "", "", None)
+
+
+def measured_input() -> Iterator[Figure]:
+    """Measure the errors on a pendulum whose torque is measured, beside those of the EKF."""
+    with SYSTEMS.isolated():
+        SYSTEMS.register(DrivenPendulum)
+        tails = []
+        for each in ("ekf", _trained("DrivenPendulum", "kkl_supervised")):
+            rows = evaluate(each, env_id("DrivenPendulum"), episodes=EPISODES)
+            tails.append(float(np.median([row["nrmse_tail"] for row in rows])))
+    yield Figure("ekf on the driven pendulum, tail NRMSE", tails[0], "", "", None)
+    yield Figure("kkl_supervised on the driven pendulum, tail NRMSE", tails[1], "", "", None)
+    title = "kkl_supervised on the driven pendulum, tail NRMSE over the EKF's"
+    yield at_most(title, tails[1] / tails[0], "x", 3.0)
 
 
 def inside(side: float) -> np.ndarray:

@@ -21,7 +21,7 @@ from pinnobs_gym.estimation.learned.kkl_maps import Activation
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 from trainers.kkl.fitting import FitMethod
-from trainers.kkl.labels import frequency
+from trainers.kkl.labels import drives, frequency
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 Precision: TypeAlias = Literal["float32", "float64"]
@@ -145,7 +145,7 @@ class KKLConfig(TrainingConfig):
         else:
             poles = self.poles
         enough(len(poles), system.nx, system.ny)
-        return realised(poles, system.ny, self.mode)
+        return realised(poles, drives(system), self.mode)
 
 
 KKLConfigT = TypeVar("KKLConfigT", bound=KKLConfig)

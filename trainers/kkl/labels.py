@@ -104,6 +104,19 @@ def driven(system: System) -> bool:
     )
 
 
+def drives(system: System) -> int:
+    """Return by how many signals z is driven: the outputs and, if they are drawn, the inputs."""
+    return system.ny + (system.nu if system.draws_input else 0)
+
+
+def inputs_of(system: System, t: np.ndarray, batch: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the inputs of episodes at sample times t (num_samples,) in s, shape (num_samples,
+    batch, nu) if they are drawn, else (num_samples, 1, nu)."""
+    if system.draws_input:
+        return np.stack([system.draw_input(rng, t) for _ in range(batch)], axis=1).astype(float)
+    return np.asarray(system.input(t))[:, None]
+
+
 def steady(
     system: System, dynamics: Dynamics, x: np.ndarray, h: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -248,7 +261,7 @@ class SampledEpisodes:
     t: np.ndarray
     """Time since the first sample, in s, shape (kept,)."""
     u: np.ndarray
-    """Inputs, shape (kept, nu)."""
+    """Inputs, shape (kept, batch, nu) if they are drawn, else (kept, 1, nu)."""
     x: np.ndarray
     """States, shape (kept, batch, nx)."""
     z: np.ndarray
@@ -277,6 +290,7 @@ def simulated(
     kept: np.ndarray,
     start: Start = "zero",
     xhat0: np.ndarray | None = None,
+    rng: np.random.Generator | None = None,
 ) -> SampledEpisodes:
     """Simulate episodes, and keep some of their samples.
 
@@ -291,13 +305,15 @@ def simulated(
         kept: indices of the samples to keep, shape (kept,).
         start: initial value of z.
         xhat0: prior mean, shape (1, nx); needed for ``start="prior"`` unless the plant is driven.
+        rng: random generator of inputs that are drawn; one of seed 0 if None.
 
     Raises:
         ValueError: in one line, if over `MOST_ESCAPED` of the initial states escape, or x̂₀ does and
             z begins at T(x̂₀).
     """
     varying, drawn = driven(system), len(x0)
-    T0, h, u, further = None, float(np.diff(t).mean()), np.asarray(system.input(t)), 0
+    T0, h, further = None, float(np.diff(t).mean()), 0
+    u = inputs_of(system, t, drawn, np.random.default_rng(0) if rng is None else rng)
     if not varying:  # labels T(x₀), without the states that escape backward
         T0, stays = steady(system, dynamics, x0, h)
         if (~stays).sum() > MOST_ESCAPED * drawn:
@@ -305,7 +321,8 @@ def simulated(
         else:
             x0, T0 = x0[stays], T0[stays]
     # Initial z of the online observer.
-    z0 = system.h(t[0], x0, u[0]) @ at_rest(dynamics, start).T
+    first = _driving(system, system.h(t[0], x0, u[0]), u[0])
+    z0 = first @ at_rest(dynamics, start).T
     if start == "prior" and not varying:
         assert xhat0 is not None
         at_prior, stays = steady(system, dynamics, xhat0, h)
@@ -321,14 +338,26 @@ def simulated(
     T = None if T0 is None else np.empty_like(z)
     for first in range(0, len(x0), _AT_ONCE):  # blocks, to limit memory
         rows = slice(first, first + _AT_ONCE)
-        path = truth(system, x0[rows], t, setup.truth_step)
-        y = system.h(t[:, None], path, u[:, None])
-        x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows])[kept]
+        own = u[:, rows] if system.draws_input else u
+        path = truth(
+            system, x0[rows], t, setup.truth_step, inputs=own if system.draws_input else None
+        )
+        y = _driving(system, system.h(t[:, None], path, own), own)
+        ends = y
+        if system.draws_input and system.input_hold == "previous":
+            ends = y.copy()
+            ends[1:, :, system.ny :] = own[:-1]
+        x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows], ends)[kept]
         if T is not None and T0 is not None:  # T(x) along a path is the z that begins at T(x₀)
             T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
     flow = dynamics.flows(t)[kept]
     dropped = drawn - (len(x0) - further)
     return SampledEpisodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, dropped, drawn, further)
+
+
+def _driving(system: System, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return what drives z: outputs (..., ny), followed by inputs (..., nu) that are drawn."""
+    return np.concatenate([y, u], axis=-1) if system.draws_input else y
 
 
 def _forward(

@@ -17,6 +17,7 @@ from trainers.kkl.labels import (
     MOST_ESCAPED,
     SETTLED,
     driven,
+    drives,
     initial_states,
     noise_in_z,
     simulated,
@@ -59,7 +60,9 @@ class Samples:
         self.driven = driven(system)
         self.t, self.prior = t, prior
         self.dynamics: Dynamics = (
-            config.dynamics(system) if poles is None else realised(poles, system.ny, config.mode)
+            config.dynamics(system)
+            if poles is None
+            else realised(poles, drives(system), config.mode)
         )
         self.dynamics.step(self.interval)  # raise an error before the simulation
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
@@ -87,7 +90,14 @@ class Samples:
             first = min(int(np.searchsorted(self.t, settled)), (len(self.t) - 1) // 2)
         self.kept = kept_samples(len(self.t), first, config.samples, self.gap, rng)
         self.data = simulated(
-            system, self.dynamics, self.t, x0, self.kept, config.start, self.prior
+            system,
+            self.dynamics,
+            self.t,
+            x0,
+            self.kept,
+            config.start,
+            self.prior,
+            np.random.default_rng([config.seed, 3]),
         )
         self._warn()
         # The first episodes are held out for validation.
@@ -96,6 +106,7 @@ class Samples:
         std = self.noise_std if config.noise else np.zeros(system.ny)
         rest = at_rest(self.dynamics, config.start)
         rows = batch if std.any() else 1
+        std = np.append(std, np.zeros(drives(system) - system.ny))  # inputs are known
         self.noise = noise_in_z(self.dynamics, self.t, std, self.kept, rows, rng, rest)
 
     def _warn(self) -> None:
@@ -122,9 +133,10 @@ class Samples:
         real = abs(np.linalg.eigvals(self.dynamics.A).real)
         clocked = config.transient or self.driven
         rates = tuple(dict.fromkeys((float(real.min()), float(real.max())))) if clocked else ()
-        sizes = abs(data.u).max(axis=0) if self.driven else np.empty(0)
+        sizes = abs(data.u).max(axis=(0, 1)) if self.driven else np.empty(0)
         self.clock = Clock(rates, tuple(float(size) or 1.0 for size in sizes))
-        times = self.clock(data.t, data.u) if self.clock.size else np.empty((len(data.t), 0))
+        t = np.broadcast_to(data.t[:, None], data.u.shape[:2])
+        times = self.clock(t, data.u) if self.clock.size else np.empty((*t.shape, 0))
         # States by their scale, labels to unit variances, and the inputs of T* whitened.
         scale = vector(self.system.scale, self.system.nx, "scale")
         self.x_scaling = Scaling(data.x.mean(axis=(0, 1)), np.diag(scale))
@@ -177,14 +189,17 @@ class Samples:
 
     def outputs(self) -> np.ndarray:
         """Return the noise-free outputs at the kept samples, (kept, batch, ny)."""
-        return np.asarray(
-            self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u[:, None])
-        )
+        return np.asarray(self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u))
 
     def encoded(self, k: Tensor, i: Tensor) -> Tensor:
         """Return the scaled inputs of T at samples k of episodes i."""
         x = self.x[k, i]
-        return torch.cat([x, self.times[k]], dim=-1) if self.driven else x
+        return torch.cat([x, self.clocked(k, i)], dim=-1) if self.driven else x
+
+    def clocked(self, k: Tensor, i: Tensor) -> Tensor:
+        """Return the scaled clock's inputs at samples k of episodes i, which are the same in all
+        episodes unless inputs are drawn."""
+        return self.times[k, i % self.times.shape[1]]
 
     def pairs(self) -> np.ndarray:
         """Return the pairs of kept samples that are ``gap`` samples apart, as indices
