@@ -165,6 +165,7 @@ class KKL(LearnedEstimator, Estimator):
         "model_alone": "its estimate is a function of z, which knows no prior",
         "blank_rows": "a missing output is replaced by that of its own prediction",
         "units": "its maps were learned in the units of its training",
+        "sampled_noise": "z takes every output as it is, however uncertain",
         "held_input": "T* is given the input at the sample, too, on which outputs may depend",
     }
     takes = EVERYTHING - {"maps", "stiff", "output_period"}
@@ -182,6 +183,11 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
                 "defines; for measured ones that are held it has to be trained on drawn ones "
                 "(System.draw_input)"
             )
+
+    @cached_property
+    def _hold(self) -> float:
+        """How long z has to be inside of its region before its estimates count again, in s."""
+        return _HOLD / self.trained.dynamics.slowest
 
     @property
     def _takes_inputs(self) -> bool:
@@ -234,7 +240,7 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
             return State(xhat, t, u, memory=KKLMemory(z, first, y))
         beside = self.fallback.update(memory.beside, t, given, u)
         left = np.where(trained.region.outside(z, xhat), t, memory.left)
-        outside = t - left <= _HOLD / trained.dynamics.slowest
+        outside = t - left <= self._hold
         if outside.any():
             self._say()
             xhat = np.where(outside[:, None], beside.xhat, xhat)
@@ -255,7 +261,7 @@ f(t, x, u) = A_z T + B_z h(t, x, u)
 
         if self._takes_inputs:
             raise ValueError(f"{self.label} is driven by measured inputs, too: it is not exported")
-        return kkl_code(self.trained, self.system, code)
+        return kkl_code(self.trained, self.system, code, self._hold)
 
     def _begin(self, xhat: np.ndarray, y: np.ndarray) -> np.ndarray:
         if self.trained.start == "prior":
