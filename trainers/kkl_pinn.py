@@ -64,7 +64,7 @@ class KKLPinnTrainer(KKLTrainer[KKLPinnConfig]):
         rate = samples.tensor(unit * samples.rates())
 
         def draw(generator: torch.Generator) -> Sequence[Equations]:
-            k, i = samples.draw(generator, dynamics.size, 0.5)
+            k, i = samples.draw(generator, dynamics.size, 0.5, known=True)
             equations = [Equations([Term(samples.encoded(k, i))], labels[k, i])]
             if weight:
                 k, i = samples.draw(generator, dynamics.size, 0.5)

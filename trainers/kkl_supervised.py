@@ -35,6 +35,7 @@ class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
 
     name = "kkl_supervised"
     presets = {"default": KKLSupervisedConfig, "faithful": faithful}
+    takes_drawn_inputs = True
 
     def gap(self) -> int:
         return 0
@@ -45,7 +46,7 @@ class KKLSupervisedTrainer(KKLTrainer[KKLSupervisedConfig]):
         labels = samples.labels
 
         def draw(generator: torch.Generator) -> Sequence[Equations]:
-            k, i = samples.draw(generator, samples.dynamics.size)
+            k, i = samples.draw(generator, samples.dynamics.size, known=True)
             return [Equations([Term(samples.encoded(k, i))], labels[k, i])]
 
         return draw

@@ -32,12 +32,16 @@ def write_estimates(path: Path, system: System, record: Record, estimates: Estim
     """Write the first episode's estimates as CSV: t, a column per state, and with covariances a
     column ``<state>_std`` of standard deviations per state. Innovations follow, with a column
     ``<output>_innovation`` per output, and their standard deviations, ``<output>_innovation_std``,
-    if the estimator has them; their cells are empty where the output is missing."""
+    if the estimator has them; their cells are empty where the output is missing. Before them stands
+    a column ``outside`` if the estimator tells it: 1 where the estimate is that of a fallback."""
     header = ["t", *system.state_names]
     columns = [record.t[:, None], estimates.xhat[0]]
     if estimates.P is not None:
         header += [f"{name}_std" for name in system.state_names]
         columns.append(_std(estimates.P[0]))
+    if estimates.outside is not None:
+        header.append("outside")
+        columns.append(estimates.outside[0, :, None])
     rows = np.concatenate(columns, axis=1).tolist()
     if estimates.innovation is not None:
         header += [f"{name}_innovation" for name in system.output_names]

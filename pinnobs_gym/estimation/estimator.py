@@ -49,6 +49,9 @@ class State:
     root: np.ndarray | None = None
     """Roots L of P = LLᵀ, shape (batch, nx, nx), of the episodes that need them, see
     `pinnobs_gym.estimation.square_root`; NaN in other rows, and None if there are no such rows."""
+    outside: np.ndarray | None = None
+    """Of estimators that were trained: 1 where the estimate is that of a fallback, since the sample
+    is outside of what they were trained on, else 0; shape (batch,)."""
     packed: Any = field(default=None, init=False, repr=False, compare=False)
     """The buffer of which the arrays are views, if compiled code computed them. A state with a
     value replaced has none, nor has one that is copied or comes from another process."""
@@ -56,8 +59,8 @@ class State:
 
 @dataclass(frozen=True)
 class Estimates:
-    """The estimates for a batch of records, with covariances and innovations if the estimator
-    computes them. The fields are those of `State`, at every sample."""
+    """The estimates for a batch of records, with what else the estimator computes. The fields are
+    those of `State`, at every sample."""
 
     xhat: np.ndarray
     """Estimates, shape (batch, num_samples, nx): x̂(k|k), or x̂(k|n) of an offline estimator."""
@@ -67,6 +70,9 @@ class Estimates:
     """Innovations, shape (batch, num_samples, ny)."""
     S: np.ndarray | None = None
     """Covariances of the innovations, shape (batch, num_samples, ny, ny)."""
+    outside: np.ndarray | None = None
+    """Of estimators that were trained: 1 where the estimate is that of a fallback, since the sample
+    is outside of what they were trained on, else 0; shape (batch, num_samples)."""
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,14 @@ class Estimate:
 
     Attributes:
         t: time of the estimate in s.
+        outside: whether the estimate is that of a fallback, since the sample is outside of what the
+            estimator was trained on; None if it does not tell.
     """
 
     def __init__(self, point: Point, y: list[float]) -> None:
         self.t: float | None = point.t
+        outside = None if isinstance(point, Packed) else point.outside
+        self.outside: bool | None = None if outside is None else bool(outside[0])
         self._y = y
         # A state may hold particles or windows, which would fill the memory of who keeps estimates.
         self._source = point if isinstance(point, Packed) else arrays_of(point)
@@ -62,10 +66,11 @@ class Estimate:
 
     def __getstate__(self) -> dict[str, Any]:
         # A buffer of compiled code holds in its own process only.
-        return {name: getattr(self, name) for name in ("t", "xhat", "std", "nis")}
+        return {name: getattr(self, name) for name in ("t", "xhat", "std", "nis", "outside")}
 
     def __repr__(self) -> str:
-        return f"Estimate(t={self.t}, xhat={self.xhat}, std={self.std}, nis={self.nis})"
+        known = "" if self.outside is None else f", outside={self.outside}"
+        return f"Estimate(t={self.t}, xhat={self.xhat}, std={self.std}, nis={self.nis}{known})"
 
 
 def _squared_size(e: Sequence[float], S: Sequence[Sequence[float]]) -> float:

@@ -17,7 +17,7 @@ from pinnobs_gym.files import replacing
 from pinnobs_gym.files.archive import Damaged, arrays_of, json_in, read_parts
 
 FORMAT = "pinnobs-gym live filter"
-VERSION = 1
+VERSION = 2
 """Version of the format; files of another one are refused."""
 
 

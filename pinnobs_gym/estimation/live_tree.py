@@ -1,7 +1,8 @@
 """States of estimators as plain values and arrays, and back.
 
-Names of classes are looked up among the dataclasses that the modules of the estimator's class know:
-what is not imported there is never made, so that a file cannot say what code runs.
+Names of classes are looked up among the dataclasses that the modules of the estimator's class know,
+and those of the estimators that it imports, such as a fallback: what is not imported there is never
+made, so that a file cannot say what code runs.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -31,12 +33,11 @@ class Tree:
         self.arrays = list(arrays)
         self._places = {id(array): place for place, array in enumerate(self.arrays)}
         self._label = type(estimator).__name__
-        modules = [sys.modules.get(base.__module__) for base in type(estimator).__mro__]
         self._classes: dict[str, type] = {State.__qualname__: State}
-        for module in filter(None, modules):
-            for value in tuple(vars(module).values()):
-                if isinstance(value, type) and is_dataclass(value):
-                    self._classes.setdefault(value.__qualname__, value)
+        own = _known_to(type(estimator))
+        imported = [_known_to(cls) for cls in own if issubclass(cls, BaseEstimator)]
+        for cls in chain(own, *imported):
+            self._classes.setdefault(cls.__qualname__, cls)
 
     def plain(self, value: Any) -> Any:
         """Return a value as JSON values, with numbers that stand for places in `arrays`. Arrays
@@ -97,6 +98,13 @@ class Tree:
         if place == len(self.arrays):
             self.arrays.append(array)
         return {"array": place, "scalar": True} if scalar else {"array": place}
+
+
+def _known_to(cls: type) -> list[type]:
+    """Return the dataclasses that the modules of a class and of its bases know."""
+    modules = [sys.modules.get(base.__module__) for base in cls.__mro__]
+    values = [value for module in filter(None, modules) for value in tuple(vars(module).values())]
+    return [value for value in values if isinstance(value, type) and is_dataclass(value)]
 
 
 def in_memory_order(array: np.ndarray) -> tuple[np.ndarray, list[int]]:

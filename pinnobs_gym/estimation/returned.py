@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 
 _FLOAT = np.dtype(float)
-_FIELDS = ("xhat", "P", "innovation", "S")
-_AXES = {"xhat": ("nx",), "P": ("nx", "nx"), "innovation": ("ny",), "S": ("ny", "ny")}
+_FIELDS = ("xhat", "P", "innovation", "S", "outside")
+_AXES = {
+    **{"xhat": ("nx",), "P": ("nx", "nx")},
+    **{"innovation": ("ny",), "S": ("ny", "ny"), "outside": ()},
+}
 
 
 @lru_cache(maxsize=256)
@@ -42,6 +45,7 @@ def checked_state(
     """
     try:
         xhat, P, innovation, S = state.xhat, state.P, state.innovation, state.S
+        outside = state.outside
     except AttributeError:
         kind = type(state).__name__
         raise TypeError(
@@ -50,11 +54,12 @@ def checked_state(
     if before is not None and before.t is not None:
         same = (P is None) is (before.P is None)
         same = same and (innovation is None) is (before.innovation is None)
+        same = same and (outside is None) is (before.outside is None)
         if not (same and (S is None) is (before.S is None)):
             _refuse_some_samples(_at(estimator, method, t), state, before)
     system = estimator.system
     shapes = _shapes((batch,), system.nx, system.ny)
-    for value, shape in zip((xhat, P, innovation, S), shapes, strict=True):
+    for value, shape in zip((xhat, P, innovation, S, outside), shapes, strict=True):
         if value is None and shape is not shapes[0]:
             continue
         if not (type(value) is np.ndarray and value.shape == shape and value.dtype is _FLOAT):

@@ -47,7 +47,7 @@ def _moved(log: ReferencedLog, estimator: BaseEstimator, found: Estimates) -> Es
     others, those which the model makes of the sample before."""
     record, own, system = log.record, log.own, estimator.system
     sample = np.cumsum(own) - 1  # the sample of each row, or the one before it
-    names = ("xhat", "P", "innovation", "S")
+    names = ("xhat", "P", "innovation", "S", "outside")
     values = {name: getattr(found, name) for name in names}
     spread = {
         name: None if value is None else np.asarray(value, dtype=float)[:, sample]

@@ -3,7 +3,6 @@ sample."""
 
 import copy
 import pickle
-import re
 import threading
 from dataclasses import replace
 
@@ -243,21 +242,16 @@ def test_a_map_is_sampled_at_whole_steps():
 
 @pytest.mark.parametrize("name", ONLINE)
 def test_no_gap_takes_forever(name):
-    """Not even if it is allowed: the model would take too many steps, or an observer needs none."""
+    """Not even if it is allowed: the model would take too many steps, or that of a fallback."""
     estimator, record = online(name)
     live = begun(estimator, record, longest_gap=1e9)
     for each in samples(record, slice(3)):
         live.update(*each)
-    line = ""
-    try:
+    with pytest.raises(
+        ValueError, match=r"^from t=0.04 s to t=100000000 s, ReverseDuffing would take .*"
+    ):
         live.update(1e8, record.y[0, 3])
-    except ValueError as error:
-        line = str(error)
-    if name.startswith("kkl"):  # z follows from the outputs alone
-        assert line == ""
-    else:
-        assert re.fullmatch(r"from t=0.04 s to t=100000000 s, ReverseDuffing would take .*", line)
-        assert live.t == record.t[2]
+    assert live.t == record.t[2]
 
 
 def test_milliseconds_taken_for_seconds_are_refused_by_default():

@@ -265,7 +265,7 @@ def test_a_changed_file_is_refused_in_one_line(change, tmp_path):
         live.update(0.1 * k, 0.1)
     live.save(path)
     _edited(path, CHANGES[change])
-    with pytest.raises(ValueError, match=r"is damaged|is of version 2 of the format") as caught:
+    with pytest.raises(ValueError, match=r"is damaged|is of version 3 of the format") as caught:
         Live.load(path, estimator)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)

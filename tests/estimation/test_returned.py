@@ -63,6 +63,7 @@ WRONG = [
         "innovation of shape (3, 1); expected (batch, n",
     ),
     ({"S": np.ones((3, 1, 1))}, ValueError, "S of shape (3, 1, 1); expected (batch, ny, ny)=(3, 2"),
+    ({"outside": np.ones(3)}, ValueError, "an array as outside, unlike at the sample before"),
 ]
 
 

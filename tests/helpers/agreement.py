@@ -1,12 +1,10 @@
 """Comparisons of estimates of the same records."""
 
-from dataclasses import fields
-
 import numpy as np
 
-from pinnobs_gym.estimation.estimator import Estimates
+from pinnobs_gym.estimation.recursive import RecursiveEstimator
 
-FIELDS = [f.name for f in fields(Estimates)]
+FIELDS = RecursiveEstimator.computes
 
 
 def assert_near(found, expected, rtol=1e-9):

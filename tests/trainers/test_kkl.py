@@ -15,6 +15,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov, solve_sylvester
 
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.checks import check_estimator
+from pinnobs_gym.estimation.export.c_files import c_files
 from pinnobs_gym.estimation.learned.kkl_dynamics import (
     Dynamics,
     at_rest,
@@ -25,8 +26,10 @@ from pinnobs_gym.estimation.learned.kkl_dynamics import (
 )
 from pinnobs_gym.estimation.learned.kkl_maps import Activation, Mlp, Scaling
 from pinnobs_gym.estimation.learned.perceptron import perceptron
+from pinnobs_gym.estimation.learned.trained import content_of, from_content
+from pinnobs_gym.estimation.takes import NotTaken
 from pinnobs_gym.estimators import ESTIMATORS
-from pinnobs_gym.estimators.kkl import KKLSupervised
+from pinnobs_gym.estimators.kkl import KKLSupervised, TrainedKKL
 from pinnobs_gym.registry import TRAINERS as REGISTRY
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import Setup, System, stack
@@ -281,9 +284,53 @@ def test_escaping_samples_are_dropped_counted_and_refused_if_many():
         trained = trained_by("kkl_supervised", Cubic(), short, record=record)
     assert 0 < trained.facts["dropped"] <= 10
     assert trained.facts["drawn"] == 100
+
+
+class Explosive(Cubic):
+    """ẋ = x³ − x runs to infinity forward from abs x > 1, and comes from there backward."""
+
+    def f(self, t, x, u):
+        return stack(x, x[..., 0] ** 3 - x[..., 0] - (x[..., 0] < -1) * 4 * x[..., 0] ** 3)
+
+
+@pytest.mark.parametrize("mode", ["continuous", "discrete"])
+def test_T_is_found_forward_if_many_states_escape_backward(mode):
+    """At states that all reach; of its own equation Φ T(x_k) + Γ₀y_k + Γ₁y_{k+1} is T(x_{k+1})."""
+    dynamics, t = realised((-1.0, -2.0), 1, mode), 0.05 * np.arange(50)
+    x0 = np.linspace(-2, 2, 20)[:, None]  # 10 of them escape
+    found = simulated(Cubic(), dynamics, t, x0, np.arange(50), "output")
+    assert (found.dropped, found.drawn, found.reached) == (0, 20, 20)
+    assert np.isnan(found.T[:, :20]).all()
+    np.testing.assert_array_equal(found.x0[:20], x0)
+    np.testing.assert_allclose(abs(found.x0[20:]), 1.0, atol=1e-6)  # the attractors
+    # There z is at rest.
+    rest = found.x0[20:] @ at_rest(dynamics, "output").T
+    np.testing.assert_allclose(found.T[0, 20:], rest, atol=1e-5)
+    np.testing.assert_allclose(found.T[-1, 20:], rest, atol=1e-5)
+    late = {**SMALL, "iterations": 3, "cutoff": 0.5, "low": (-2.0,), "high": (2.0,), "mode": mode}
+    prior = Prior(np.zeros((1, 1)), np.eye(1)[None])
+    record = Record(t, np.zeros((1, 50, 1)), np.zeros((1, 50, 0)), prior)
+    with pytest.warns(UserWarning, match=r"^over 10% of 100 initial states of Cubic escape .*"):
+        trained = trained_by("kkl_supervised", Cubic(), late, record=record)
+    assert math.isfinite(trained.facts["loss_of_T"])
+
+
+def test_states_that_escape_backward_and_forward_are_refused():
     x0 = np.linspace(-2, 2, 20)[:, None]
-    with pytest.raises(ValueError, match=r"10 of 20 initial states of Cubic escape .* at most 10%"):
-        simulated(Cubic(), dynamics, t, x0, np.arange(50))
+    with pytest.raises(
+        ValueError, match=r"^5 of 20 .* Explosive escape .* s, and 5 forward; .* 10%"
+    ):
+        simulated(Explosive(), realised((-1.0, -2.0), 1), 0.05 * np.arange(50), x0, np.arange(50))
+    with pytest.raises(ValueError, match=r"^start='prior', but x̂₀ of Cubic escapes"):
+        simulated(
+            Cubic(),
+            realised((-1.0, -2.0), 1),
+            0.05 * np.arange(50),
+            x0,
+            np.arange(50),
+            "prior",
+            np.array([[2.0]]),
+        )
 
 
 def test_initial_states_fill_the_set():
@@ -688,3 +735,177 @@ def test_a_sweep_that_is_interrupted_goes_on_to_the_same_result(stop, swept, tmp
     assert again.config == whole.config
     for layer, other in zip(whole.decoder, again.decoder, strict=True):
         np.testing.assert_array_equal(layer[0], other[0])
+
+
+# --- outside of the region of the training
+
+
+def guarded_and_plain(**settings):
+    """An observer with a fallback, trained in a moment, and the same without."""
+    trained, plant, setup, _ = trained_on("kkl_supervised", **settings)
+    return [
+        KKLSupervised(plant, setup.noise_std, trained=each)
+        for each in (trained, replace(trained, region=None))
+    ]
+
+
+def test_estimates_are_those_of_the_filter_outside_and_of_T_star_inside(caplog):
+    guarded, plain = guarded_and_plain()
+    game = Game.of("ReverseDuffing", condition="x0_outside")
+    record = game.record(range(20))
+    found, filtered, mapped = (each.run(record) for each in (guarded, guarded.fallback, plain))
+    outside = found.outside.astype(bool)
+    assert outside.any()
+    assert not outside.all()
+    np.testing.assert_allclose(found.xhat[outside], filtered.xhat[outside], atol=1e-12)
+    np.testing.assert_allclose(found.xhat[~outside], mapped.xhat[~outside], atol=1e-12)
+    assert mapped.outside is None
+    assert "prior" in guarded.training["knows"]
+    assert "knows" not in plain.training
+    with caplog.at_level("WARNING"):
+        guarded.run(record)
+    assert len([r for r in caplog.records if "left the region" in r.message]) <= 1
+
+
+def test_no_episode_from_outside_of_the_set_diverges_and_few_samples_inside_are_outside():
+    guarded, plain = guarded_and_plain(iterations=150, trajectories=300)
+    for condition, most in (("nominal", 0.05), ("x0_outside", 1.0)):
+        game = Game.of("ReverseDuffing", condition=condition)
+        x = game.episodes(range(40)).x.swapaxes(0, 1)
+        errors = []
+        for observer in (guarded, plain):
+            found = observer.run(game.record(range(40)))
+            late = slice(3 * found.xhat.shape[1] // 4, None)
+            error = (found.xhat - x[:, : found.xhat.shape[1]])[:, late]
+            errors.append(np.sqrt((error**2).mean(axis=(1, 2))))
+        assert guarded.run(game.record(range(40))).outside.mean() <= most
+        assert errors[0].max() < 0.2
+    assert (errors[1] > 0.2).mean() > 0.2  # T* alone
+
+
+def test_z_has_to_be_inside_for_some_time_before_T_star_counts_again():
+    """One sample far outside, of an output that jumps, and back."""
+    guarded, _ = guarded_and_plain(iterations=20)
+    slowest = guarded.trained.dynamics.slowest
+    game = Game.of("ReverseDuffing")
+    record = game.record([3])
+    y = record.y.copy()
+    y[:, 200] += 40.0
+    found = guarded.run(replace(record, y=y))
+    region, dynamics = guarded.trained.region, guarded.trained.dynamics
+    z = dynamics.filtered(record.t, y.swapaxes(0, 1), y[:, 0] @ guarded.trained.rest.T)[:, 0]
+    xhat = guarded.trained.inverse(z, record.t - record.t[0], record.u[0])
+    left = region.outside(z, xhat)
+    last = np.maximum.accumulate(np.where(left, record.t, -np.inf))
+    expected = record.t - last <= 3 / slowest
+    np.testing.assert_array_equal(found.outside[0].astype(bool), expected)
+    assert not expected[:200].any()
+    assert expected[200:210].any()
+    assert not expected[210:].all()
+
+
+def test_a_file_without_a_region_has_no_fallback(tmp_path):
+    guarded, _ = guarded_and_plain(iterations=5)
+    content = content_of(guarded.trained)
+    del content["region"]
+    assert from_content(TrainedKKL, content).region is None
+    path = tmp_path / "trained.pt"
+    guarded.save(path)
+    again = KKLSupervised.load(path, guarded.system).trained.region
+    np.testing.assert_array_equal(again.points, guarded.trained.region.points)
+    faithful, *_ = trained_on("kkl_supervised", preset="faithful", iterations=5, depth=2)
+    assert faithful.region is None
+
+
+# --- inputs that are drawn
+
+
+class Pushed(Linear):
+    """Pushed by an input that is drawn for each episode, and held between samples."""
+
+    input_names = ("push",)
+
+    def f(self, t, x, u):
+        return super().f(t, x, u) + stack(x, 0.0, u[..., 0])
+
+    def draw_input(self, rng, times):
+        return rng.normal(0.0, 1.0, (len(times), 1))
+
+
+class PushedOnLines(Pushed):
+    input_hold = "linear"
+
+
+class Held(FeedThrough):
+    input_hold = "previous"
+
+
+@pytest.mark.parametrize("cls", [Pushed, PushedOnLines])
+def test_z_is_driven_by_drawn_inputs_too(cls):
+    """By the exact response to inputs that are held, or on straight lines."""
+    system = cls()
+    dynamics, t = realised((-1.0, -2.0, -4.0), 3), 0.1 * np.arange(30)
+    x0 = np.random.default_rng(0).uniform(-1, 1, (2, 2))
+    kept, rng = np.arange(30), np.random.default_rng(5)
+    found = simulated(system, dynamics, t, x0, kept, "output", rng=rng)
+    rng = np.random.default_rng(5)
+    u = np.stack([system.draw_input(rng, t) for _ in range(2)], axis=1)
+    np.testing.assert_array_equal(found.u, u)
+
+    def rate(time, z, k, row):
+        part = (time - t[k]) / 0.1 if cls.input_hold == "linear" else 0.0
+        push = (1 - part) * u[k, row] + part * u[k + 1, row]
+        y = (1 - (time - t[k]) / 0.1) * found.x[k, row] + (time - t[k]) / 0.1 * found.x[k + 1, row]
+        return dynamics.A @ z + dynamics.B @ np.concatenate([y @ H.T, push])
+
+    for row in range(2):
+        z = found.z[0, row]
+        first = np.concatenate([found.x[0, row] @ H.T, u[0, row]])
+        np.testing.assert_allclose(z, at_rest(dynamics, "output") @ first, atol=1e-12)
+        for k in range(29):
+            z = solve_ivp(rate, t[k : k + 2], z, args=(k, row), rtol=1e-9, atol=1e-11).y[:, -1]
+            np.testing.assert_allclose(found.z[k + 1, row], z, atol=1e-7)
+
+
+@pytest.mark.parametrize("cls", [Pushed, PushedOnLines])
+def test_states_are_found_behind_drawn_inputs(cls, tmp_path):
+    system = replace(cls(), measured_input=True)
+    t, u = 0.1 * np.arange(80), np.zeros((1, 80, 1))
+    record = Record(t, np.zeros((1, 80, 2)), u, Prior(np.zeros((1, 2)), np.eye(2)[None]))
+    settings = {**SMALL, "cutoff": 1.0, "iterations": 150}
+    trained = trained_by("kkl_supervised", system, settings, record=record, noise_std=0.0)
+    rng = np.random.default_rng(1)
+    u = np.stack([system.draw_input(rng, t) for _ in range(20)])
+    x0 = rng.uniform(-1, 1, (20, 2))
+    x = truth(system, x0, t, inputs=u.swapaxes(0, 1)).swapaxes(0, 1)
+    prior = Prior(np.zeros((20, 2)), np.repeat(np.eye(2)[None], 20, axis=0))
+    observer = KKLSupervised(system, 0.1, trained=replace(trained, region=None))
+    xhat = observer.run(Record(t, system.h(t, x, u), u, prior)).xhat
+    late = slice(20, None)
+    assert np.sqrt(((xhat - x)[:, late] ** 2).mean()) < 0.1 * np.sqrt((x[:, late] ** 2).mean())
+    path = tmp_path / "trained.pt"
+    trained.save(path)
+    check_estimator(KKLSupervised.load(path, system))
+    assert figures(system, trained, record) == {}
+    with pytest.raises(ValueError, match=r"driven by measured inputs, too: it is not exported"):
+        c_files(observer, Prior.of(system, system.setups["benchmark"], 1), "plant")
+
+
+def test_measured_inputs_that_it_cannot_take_are_refused():
+    t = 0.1 * np.arange(80)
+    prior = Prior(np.zeros((1, 2)), np.eye(2)[None])
+    record = Record(t, np.zeros((1, 80, 2)), np.zeros((1, 80, 1)), prior)
+    system = replace(Pushed(), measured_input=True)
+    for name, settings, line in (
+        ("kkl_pinn", {}, "draws its inputs, on whose past T depends, which trainer 'kkl_pinn'"),
+        ("kkl_supervised", {"start": "prior"}, r"^start='prior', but Pushed draws its inputs"),
+    ):
+        with pytest.raises(ValueError, match=line) as told:
+            trained_by(name, system, {**SMALL, **settings}, record=record)
+        assert "\n" not in str(told.value)
+    trained = trained_on_linear("kkl_supervised", Held, iterations=3)
+    with pytest.raises(
+        NotTaken, match=r"was trained with the inputs that Held defines; for"
+    ) as told:
+        KKLSupervised(replace(Held(), measured_input=True), trained=trained)
+    assert "\n" not in str(told.value)

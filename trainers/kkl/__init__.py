@@ -5,6 +5,11 @@ episodes from the initial set, so that unbounded plants (Academic) are trained o
 reached within an episode, and plants with several classes of states (Satellite) on the declared
 class.
 
+States around an attractor (Rössler's) come from infinity in finite time, so that T is not defined
+there. If many initial states do, T is fitted along episodes that begin at states which the plant
+reaches from them, with the z that it reaches, and T* along episodes from the initial states, too,
+whose z begins as it does online.
+
 A plant with inputs (InductionMotor) is not autonomous. Its T depends also on u(t), whose values
 give the phase of a periodic input, and on the time since the first sample. Its z begins at the
 first sample, not in the infinite past. Such a plant is not integrated backward, because the states

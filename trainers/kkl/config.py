@@ -21,7 +21,7 @@ from pinnobs_gym.estimation.learned.kkl_maps import Activation
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 from trainers.kkl.fitting import FitMethod
-from trainers.kkl.labels import frequency
+from trainers.kkl.labels import drives, frequency
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 Precision: TypeAlias = Literal["float32", "float64"]
@@ -85,6 +85,9 @@ class KKLConfig(TrainingConfig):
     """Fraction of a network's steps without a lower validation error after which it stops."""
     noise: bool = True
     """Whether the known output noise is added to z in training."""
+    fallback: bool = True
+    """Whether estimates are those of an unscented Kalman filter where z is outside of the region of
+    the training; see `pinnobs_gym.estimators.kkl.KKL`."""
     dtype: Precision = "float64"
     """Precision of the networks; labels are always in double precision."""
     device: Device = "auto"
@@ -142,7 +145,7 @@ class KKLConfig(TrainingConfig):
         else:
             poles = self.poles
         enough(len(poles), system.nx, system.ny)
-        return realised(poles, system.ny, self.mode)
+        return realised(poles, drives(system), self.mode)
 
 
 KKLConfigT = TypeVar("KKLConfigT", bound=KKLConfig)
@@ -152,7 +155,7 @@ def as_published(config: KKLConfigT, **changes: Any) -> KKLConfigT:
     """Return a config with the settings common to the papers of the three methods, and further
     changes.
 
-    The common settings are: z from 0, no noise, Adam.
+    The common settings are: z from 0, no noise, Adam, no fallback.
     """
     common: dict[str, Any] = {
         "start": "zero",
@@ -163,6 +166,7 @@ def as_published(config: KKLConfigT, **changes: Any) -> KKLConfigT:
         "batch": 256,
         "iterations": 12_000,
         "noise": False,
+        "fallback": False,
         "dtype": "float32",
     }
     return replace(config, **{**common, **changes})

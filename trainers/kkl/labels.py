@@ -18,7 +18,8 @@ SETTLED = 16.0
 """Duration of the backward integration of x, over z's slowest time constant. It leaves e⁻¹⁶ of the
 initial error of z; the papers' 10 would leave the largest error of a good fit."""
 MOST_ESCAPED = 0.1
-"""Largest fraction of the initial states that may be dropped."""
+"""Largest fraction of the initial states that may be dropped. If more escape backward, T is fitted
+to states that all of them reach forward."""
 FAR = 1e3
 """Size of a state, over its scale, above which it counts as escaped."""
 _TIMES = 9
@@ -103,6 +104,19 @@ def driven(system: System) -> bool:
     )
 
 
+def drives(system: System) -> int:
+    """Return by how many signals z is driven: the outputs and, if they are drawn, the inputs."""
+    return system.ny + (system.nu if system.draws_input else 0)
+
+
+def inputs_of(system: System, t: np.ndarray, batch: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the inputs of episodes at sample times t (num_samples,) in s, shape (num_samples,
+    batch, nu) if they are drawn, else (num_samples, 1, nu)."""
+    if system.draws_input:
+        return np.stack([system.draw_input(rng, t) for _ in range(batch)], axis=1).astype(float)
+    return np.asarray(system.input(t))[:, None]
+
+
 def steady(
     system: System, dynamics: Dynamics, x: np.ndarray, h: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +136,7 @@ def steady(
     """
     # Drop the states that diverge when integrated backward.
     duration = float(np.ceil(SETTLED / dynamics.slowest / h) * h)
-    stays = ~_escapes(system, x, duration)
+    stays = ~_escapes(system, x, -duration)
     z = np.full((len(x), dynamics.size), np.nan)
     if not stays.any():
         return z, stays
@@ -142,11 +156,44 @@ def steady(
     return z, stays
 
 
+def reached(
+    system: System, dynamics: Dynamics, x: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return states (batch, nx) that an autonomous plant reaches from x (batch, nx), and T of them.
+
+    They are `SETTLED` of z's slowest time constants later, so that z, which is 0 at x, is T(x). On
+    an attractor, of which hardly any state comes from far away, these states have a past, while
+    those around it have none.
+
+    Args:
+        system: the plant.
+        dynamics: dynamics of z; in discrete time z is driven by samples of the output.
+        x: states that do not escape, shape (batch, nx).
+        h: time between samples in s.
+
+    Returns:
+        the states (batch, nx), and their z (batch, nz).
+    """
+    step = system.setups["benchmark"].truth_step
+    steps = int(np.ceil(SETTLED / dynamics.slowest / h))
+    if dynamics.mode == "discrete":
+        t = np.arange(steps + 1) * h
+        path = truth(system, x, t, step)
+        y = system.h(t[:, None], path, np.empty((len(t), 1, 0)))
+        return path[-1], dynamics.filtered(t, y)[-1]
+    begin = np.concatenate([x, np.zeros((len(x), dynamics.size))], axis=1)
+    joint = _Joint(plant=system, dynamics=dynamics)
+    end = truth(joint, begin, np.array([0.0, steps * h]), step)[-1]
+    return end[:, : system.nx], end[:, system.nx :]
+
+
 def _escapes(system: System, x: np.ndarray, duration: float) -> np.ndarray:
-    """Return which states (batch, nx) diverge when integrated backward, over twice the duration."""
-    step = system.setups["benchmark"].truth_step or duration / 100
-    steps = int(np.ceil(2 * duration / step))
-    h, u = -duration / steps, np.zeros(system.nu)
+    """Return which states (batch, nx) diverge over a duration in s, in the past if it is negative.
+    Steps are half as long as usual."""
+    setup = system.setups["benchmark"]
+    step = setup.truth_step or min(abs(duration) / 100, setup.dt)
+    steps = int(np.ceil(2 * abs(duration) / step))
+    h, u = duration / steps, np.zeros(system.nu)
     t, now = np.zeros(()), np.asarray(x, dtype=float)
     scale = vector(system.scale, system.nx, "scale")
     away = np.zeros(len(x), dtype=bool)
@@ -214,7 +261,7 @@ class SampledEpisodes:
     t: np.ndarray
     """Time since the first sample, in s, shape (kept,)."""
     u: np.ndarray
-    """Inputs, shape (kept, nu)."""
+    """Inputs, shape (kept, batch, nu) if they are drawn, else (kept, 1, nu)."""
     x: np.ndarray
     """States, shape (kept, batch, nx)."""
     z: np.ndarray
@@ -225,11 +272,14 @@ class SampledEpisodes:
     """Φ from the first sample to each, shape (kept, nz, nz)."""
     T: np.ndarray | None
     """T(x) along the episodes, the z that begins at T(x₀); shape (kept, batch, nz). None if T
-    depends on time."""
+    depends on time; NaN in episodes whose T is unknown, since states escape backward."""
     dropped: int
-    """Number of initial states that escaped backward."""
+    """Number of initial states that escaped backward, or forward with `reached` ones."""
     drawn: int
     """Number of initial states drawn."""
+    reached: int = 0
+    """Number of further episodes, at the end, from states that are `reached` forward, since too
+    many escape backward."""
 
 
 def simulated(
@@ -240,6 +290,7 @@ def simulated(
     kept: np.ndarray,
     start: Start = "zero",
     xhat0: np.ndarray | None = None,
+    rng: np.random.Generator | None = None,
 ) -> SampledEpisodes:
     """Simulate episodes, and keep some of their samples.
 
@@ -254,40 +305,93 @@ def simulated(
         kept: indices of the samples to keep, shape (kept,).
         start: initial value of z.
         xhat0: prior mean, shape (1, nx); needed for ``start="prior"`` unless the plant is driven.
+        rng: random generator of inputs that are drawn; one of seed 0 if None.
 
     Raises:
-        ValueError: in one line, if over `MOST_ESCAPED` of the initial states escape backward.
+        ValueError: in one line, if over `MOST_ESCAPED` of the initial states escape, or x̂₀ does and
+            z begins at T(x̂₀).
     """
     varying, drawn = driven(system), len(x0)
-    T0, h, u = None, float(np.diff(t).mean()), np.asarray(system.input(t))
+    T0, h, further = None, float(np.diff(t).mean()), 0
+    u = inputs_of(system, t, drawn, np.random.default_rng(0) if rng is None else rng)
     if not varying:  # labels T(x₀), without the states that escape backward
         T0, stays = steady(system, dynamics, x0, h)
-        escaped = drawn - int(stays.sum())
-        if escaped > MOST_ESCAPED * drawn:
-            raise ValueError(
-                f"{escaped} of {drawn} initial states of {type(system).__name__} escape when "
-                f"integrated backward for {SETTLED / dynamics.slowest:.3g} s; expected at most "
-                f"{MOST_ESCAPED:.0%}: take faster poles, or a smaller box"
-            )
-        x0, T0 = x0[stays], T0[stays]
+        if (~stays).sum() > MOST_ESCAPED * drawn:
+            x0, T0, further = _forward(system, dynamics, x0, t, int((~stays).sum()))
+        else:
+            x0, T0 = x0[stays], T0[stays]
     # Initial z of the online observer.
-    z0 = system.h(t[0], x0, u[0]) @ at_rest(dynamics, start).T
+    first = _driving(system, system.h(t[0], x0, u[0]), u[0])
+    z0 = first @ at_rest(dynamics, start).T
     if start == "prior" and not varying:
         assert xhat0 is not None
-        z0 = z0 + steady(system, dynamics, xhat0, h)[0]
+        at_prior, stays = steady(system, dynamics, xhat0, h)
+        if not stays.all():
+            raise ValueError(
+                f"start='prior', but x̂₀ of {type(system).__name__} escapes when integrated "
+                "backward; expected output or zero"
+            )
+        z0 = z0 + at_prior
     setup = system.setups["benchmark"]
     x = np.empty((len(kept), len(x0), system.nx))
     z = np.empty((len(kept), len(x0), dynamics.size))
     T = None if T0 is None else np.empty_like(z)
     for first in range(0, len(x0), _AT_ONCE):  # blocks, to limit memory
         rows = slice(first, first + _AT_ONCE)
-        path = truth(system, x0[rows], t, setup.truth_step)
-        y = system.h(t[:, None], path, u[:, None])
-        x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows])[kept]
+        own = u[:, rows] if system.draws_input else u
+        path = truth(
+            system, x0[rows], t, setup.truth_step, inputs=own if system.draws_input else None
+        )
+        y = _driving(system, system.h(t[:, None], path, own), own)
+        ends = y
+        if system.draws_input and system.input_hold == "previous":
+            ends = y.copy()
+            ends[1:, :, system.ny :] = own[:-1]
+        x[:, rows], z[:, rows] = path[kept], dynamics.filtered(t, y, z0[rows], ends)[kept]
         if T is not None and T0 is not None:  # T(x) along a path is the z that begins at T(x₀)
             T[:, rows] = dynamics.filtered(t, y, T0[rows])[kept]
     flow = dynamics.flows(t)[kept]
-    return SampledEpisodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, drawn - len(x0), drawn)
+    dropped = drawn - (len(x0) - further)
+    return SampledEpisodes(t[kept] - t[0], u[kept], x, z, x0, flow, T, dropped, drawn, further)
+
+
+def _driving(system: System, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return what drives z: outputs (..., ny), followed by inputs (..., nu) that are drawn."""
+    return np.concatenate([y, u], axis=-1) if system.draws_input else y
+
+
+def _forward(
+    system: System, dynamics: Dynamics, x0: np.ndarray, t: np.ndarray, escaped: int
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return initial states followed by states that are `reached` from them, and T of them.
+
+    Args:
+        system: the plant.
+        dynamics: dynamics of z.
+        x0: initial states, shape (drawn, nx).
+        t: sample times of an episode in s, shape (num_samples,).
+        escaped: number of initial states that escape backward.
+
+    Returns:
+        states (batch, nx); T of them (batch, nz), NaN for the initial states; and the number of
+        those at the end that are reached.
+
+    Raises:
+        ValueError: in one line, if over `MOST_ESCAPED` of them escape forward, too.
+    """
+    warm_up = SETTLED / dynamics.slowest
+    stays = ~_escapes(system, x0, warm_up + float(t[-1] - t[0]))
+    lost = int((~stays).sum())
+    if lost > MOST_ESCAPED * len(x0):
+        raise ValueError(
+            f"{escaped} of {len(x0)} initial states of {type(system).__name__} escape when "
+            f"integrated backward for {warm_up:.3g} s, and {lost} forward; expected at most "
+            f"{MOST_ESCAPED:.0%}: take faster poles, or a smaller box"
+        )
+    x0 = x0[stays]
+    x, z = reached(system, dynamics, x0, float(np.diff(t).mean()))
+    unknown = np.full((len(x0), dynamics.size), np.nan)
+    return np.concatenate([x0, x]), np.concatenate([unknown, z]), len(x)
 
 
 _AT_ONCE = 256

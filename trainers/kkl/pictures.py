@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,9 +34,11 @@ def figures(system: System, trained: TrainedKKL, record: Record) -> dict[str, Fi
 
     They are the ``error`` over the state space, the error against the initial ``radius``, the
     ``maps`` T and T*, and the ``sweep`` if there was one. If T depends on time, there are no
-    ``error`` and ``maps``.
+    ``error`` and ``maps``, and if inputs are drawn, no ``radius`` either.
     """
-    drawn = {"radius": radius_figure(system, trained, record)}
+    drawn = {}
+    if not system.draws_input:
+        drawn["radius"] = radius_figure(system, trained, record)
     if not driven(system):
         drawn["error"] = error_figure(system, trained, record)
         drawn["maps"] = maps_figure(system, trained)
@@ -111,7 +114,8 @@ def _starts(system: System, trained: TrainedKKL, count: int) -> np.ndarray:
 def radius_figure(system: System, trained: TrainedKKL, record: Record) -> Figure:
     """Plot the error over the last quarter of noise-free episodes against the initial radius.
 
-    The radius is the distance from the middle of the training set over that of its edge.
+    The radius is the distance from the middle of the training set over that of its edge. The error
+    is that of T*, also where an observer with a fallback would take that.
     """
     x0 = _starts(system, trained, 400)
     middle = (x0.min(axis=0) + x0.max(axis=0)) / 2
@@ -147,7 +151,7 @@ def _tails(system: System, trained: TrainedKKL, record: Record, x0: np.ndarray) 
     cov = np.broadcast_to(record.prior.cov[:1], (len(states), system.nx, system.nx))
     u = np.broadcast_to(system.input(record.t), (len(states), len(record.t), system.nu))
     episodes = Record(record.t, system.h(record.t, x, u), u, Prior(mean, cov))
-    xhat = KKL(system, trained=trained).run(episodes).xhat
+    xhat = KKL(system, trained=replace(trained, region=None)).run(episodes).xhat
     late = slice(3 * len(record.t) // 4, None)
     scale = vector(system.scale, system.nx, "scale")
     square = ((system.state_residual(xhat, x)[:, late] / scale) ** 2).mean(axis=(1, 2))

@@ -13,7 +13,15 @@ from pinnobs_gym.estimation.learned.kkl_maps import Scaling
 from pinnobs_gym.estimators.kkl import Clock
 from pinnobs_gym.simulation.system import System, vector
 from trainers.kkl.config import KKLConfig
-from trainers.kkl.labels import driven, initial_states, noise_in_z, simulated
+from trainers.kkl.labels import (
+    MOST_ESCAPED,
+    SETTLED,
+    driven,
+    drives,
+    initial_states,
+    noise_in_z,
+    simulated,
+)
 
 _PARTS = 12
 """Number of parts of the episode whose errors have the same weight."""
@@ -52,7 +60,9 @@ class Samples:
         self.driven = driven(system)
         self.t, self.prior = t, prior
         self.dynamics: Dynamics = (
-            config.dynamics(system) if poles is None else realised(poles, system.ny, config.mode)
+            config.dynamics(system)
+            if poles is None
+            else realised(poles, drives(system), config.mode)
         )
         self.dynamics.step(self.interval)  # raise an error before the simulation
         self.device, self.dtype = _device(config), getattr(torch, config.dtype)
@@ -80,21 +90,41 @@ class Samples:
             first = min(int(np.searchsorted(self.t, settled)), (len(self.t) - 1) // 2)
         self.kept = kept_samples(len(self.t), first, config.samples, self.gap, rng)
         self.data = simulated(
-            system, self.dynamics, self.t, x0, self.kept, config.start, self.prior
+            system,
+            self.dynamics,
+            self.t,
+            x0,
+            self.kept,
+            config.start,
+            self.prior,
+            np.random.default_rng([config.seed, 3]),
         )
-        if self.data.dropped:
-            warnings.warn(
-                f"{self.data.dropped} of {self.data.drawn} initial states of "
-                f"{type(system).__name__} escape when integrated backward, and are left out",
-                stacklevel=2,
-            )
+        self._warn()
         # The first episodes are held out for validation.
         batch = self.data.x.shape[1]
         self.held = slice(0, min(held, batch // 2))
         std = self.noise_std if config.noise else np.zeros(system.ny)
         rest = at_rest(self.dynamics, config.start)
         rows = batch if std.any() else 1
+        std = np.append(std, np.zeros(drives(system) - system.ny))  # inputs are known
         self.noise = noise_in_z(self.dynamics, self.t, std, self.kept, rows, rng, rest)
+
+    def _warn(self) -> None:
+        """Warn of initial states that escape."""
+        data = self.data
+        of = f"of {data.drawn} initial states of {type(self.system).__name__}"
+        if data.reached:
+            warnings.warn(
+                f"over {MOST_ESCAPED:.0%} {of} escape when integrated backward: T is fitted to "
+                f"states that they reach forward in {SETTLED / self.dynamics.slowest:.3g} s",
+                stacklevel=2,
+            )
+        if data.dropped:
+            where = "forward" if data.reached else "backward"
+            warnings.warn(
+                f"{data.dropped} {of} escape when integrated {where}, and are left out",
+                stacklevel=2,
+            )
 
     def _prepare(self, labelled: bool) -> None:
         """Compute the scalings, and the samples as scaled tensors."""
@@ -103,9 +133,10 @@ class Samples:
         real = abs(np.linalg.eigvals(self.dynamics.A).real)
         clocked = config.transient or self.driven
         rates = tuple(dict.fromkeys((float(real.min()), float(real.max())))) if clocked else ()
-        sizes = abs(data.u).max(axis=0) if self.driven else np.empty(0)
+        sizes = abs(data.u).max(axis=(0, 1)) if self.driven else np.empty(0)
         self.clock = Clock(rates, tuple(float(size) or 1.0 for size in sizes))
-        times = self.clock(data.t, data.u) if self.clock.size else np.empty((len(data.t), 0))
+        t = np.broadcast_to(data.t[:, None], data.u.shape[:2])
+        times = self.clock(t, data.u) if self.clock.size else np.empty((*t.shape, 0))
         # States by their scale, labels to unit variances, and the inputs of T* whitened.
         scale = vector(self.system.scale, self.system.nx, "scale")
         self.x_scaling = Scaling(data.x.mean(axis=(0, 1)), np.diag(scale))
@@ -114,6 +145,14 @@ class Samples:
         self.whitening = Scaling.white(data.z, self.noise)
         self.times = self.tensor(self.clock_scaling.scaled(times))
         self.x = self.tensor(self.x_scaling.scaled(data.x))
+        # The training episodes, and those of them along which T(x) is known.
+        known = np.ones(len(data.x0), dtype=bool)
+        if labelled and data.T is not None:
+            known = np.isfinite(data.T[0]).all(axis=1)
+        self.episodes, self.known = (
+            torch.from_numpy(self.held.stop + np.flatnonzero(rows[self.held.stop :]))
+            for rows in (np.ones_like(known), known)
+        )
         self.labels = None
         if labelled:
             self.labels = self.tensor(self.z_scaling.scaled(data.z if data.T is None else data.T))
@@ -128,7 +167,11 @@ class Samples:
         return torch.tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
 
     def draw(
-        self, generator: torch.Generator, outputs: int, part: float = 1.0
+        self,
+        generator: torch.Generator,
+        outputs: int,
+        part: float = 1.0,
+        known: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Draw the indices of kept samples and of training episodes, (count,) each.
 
@@ -136,24 +179,27 @@ class Samples:
             generator: random generator.
             outputs: number of outputs of the network; ``config.batch`` counts equations.
             part: fraction of the batch to draw.
+            known: whether to draw from episodes with known T(x) only.
         """
         count = max(8, round(part * self.config.batch / outputs))
         k = torch.randint(len(self.data.t), (count,), generator=generator)
-        episodes = torch.randint(
-            self.held.stop, self.data.x.shape[1], (count,), generator=generator
-        )
+        among = self.known if known else self.episodes
+        episodes = among[torch.randint(len(among), (count,), generator=generator)]
         return k.to(self.device), episodes.to(self.device)
 
     def outputs(self) -> np.ndarray:
         """Return the noise-free outputs at the kept samples, (kept, batch, ny)."""
-        return np.asarray(
-            self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u[:, None])
-        )
+        return np.asarray(self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u))
 
     def encoded(self, k: Tensor, i: Tensor) -> Tensor:
         """Return the scaled inputs of T at samples k of episodes i."""
         x = self.x[k, i]
-        return torch.cat([x, self.times[k]], dim=-1) if self.driven else x
+        return torch.cat([x, self.clocked(k, i)], dim=-1) if self.driven else x
+
+    def clocked(self, k: Tensor, i: Tensor) -> Tensor:
+        """Return the scaled clock's inputs at samples k of episodes i, which are the same in all
+        episodes unless inputs are drawn."""
+        return self.times[k, i % self.times.shape[1]]
 
     def pairs(self) -> np.ndarray:
         """Return the pairs of kept samples that are ``gap`` samples apart, as indices

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from pinnobs_gym.estimation.learned.kkl_region import Region
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.estimators.kkl import KKL, TrainedKKL
-from pinnobs_gym.simulation.record import Record
-from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.trainer import Trainer
 from trainers.kkl import pictures
 from trainers.kkl.config import KKLConfig
@@ -56,6 +55,9 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
     paced_by_budget = True
     labelled: ClassVar[bool] = True
     """Whether T* is fitted to simulated z, and not to T's own."""
+    takes_drawn_inputs: ClassVar[bool] = False
+    """Whether T need not fulfil an equation of its own, which a T that does not know the past of
+    drawn inputs cannot."""
 
     @abstractmethod
     def encoding(self, samples: Samples) -> Objective:
@@ -66,7 +68,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         """Return the number of samples between the two of each kept pair; 0 without pairs."""
 
     def start(self) -> None:
-        _check(self.system, self.record)
+        self._check()
         self.sweep: list[dict[str, float]] = []
         """The results at each cut-off so far."""
         self.search: PoleSearch | None = None
@@ -79,6 +81,30 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
             self.search = self._search()
         else:
             self.fit = self._next_fit()
+
+    def _check(self) -> None:
+        """Check that the system and the record can be trained on."""
+        system, name = self.system, type(self.system).__name__
+        if system.measured_input and not system.draws_input:
+            raise ValueError(
+                f"{name} has a measured input; a KKL observer is trained on simulated episodes and "
+                f"needs u(t) to be known beforehand, or to be drawn by {name}.draw_input"
+            )
+        if system.draws_input and not self.takes_drawn_inputs:
+            raise ValueError(
+                f"{name} draws its inputs, on whose past T depends, which trainer {self.name!r} "
+                "has no equation for; expected kkl_supervised"
+            )
+        if system.draws_input and self.config.start == "prior":
+            raise ValueError(
+                f"start='prior', but {name} draws its inputs, on whose past T(x̂₀) depends; "
+                "expected output or zero"
+            )
+        if self.record.num_samples < MIN_SAMPLES:
+            raise ValueError(
+                f"the record has {self.record.num_samples} samples; a KKL observer needs "
+                f"{MIN_SAMPLES}"
+            )
 
     def _search(self) -> PoleSearch:
         """Prepare the training of the poles."""
@@ -197,7 +223,7 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
         fit = self._present_fit
         samples, decoder = fit.samples, fit.decoder()
         facts = self.facts(loss=decoder.error, seed=self.config.seed)
-        return TrainedKKL(
+        trained = TrainedKKL(
             **{**facts, "config": plain(asdict(fit.config))},
             A=samples.dynamics.A,
             B=samples.dynamics.B,
@@ -216,19 +242,18 @@ class KKLTrainer(Trainer[KKLConfigT, TrainedKKL]):
                 "sweep": self.sweep,
             },
         )
+        return (
+            replace(trained, region=_region(samples, trained)) if fit.config.fallback else trained
+        )
 
     def figures(self, trained: TrainedKKL) -> dict[str, Figure]:
         return pictures.figures(self.system, trained, self.record)
 
 
-def _check(system: System, record: Record) -> None:
-    """Check that a system and a record can be trained on."""
-    if system.measured_input:
-        raise ValueError(
-            f"{type(system).__name__} has a measured input; a KKL observer is trained on simulated "
-            "episodes and needs u(t) to be known beforehand"
-        )
-    if record.num_samples < MIN_SAMPLES:
-        raise ValueError(
-            f"the record has {record.num_samples} samples; a KKL observer needs {MIN_SAMPLES}"
-        )
+def _region(samples: Samples, trained: TrainedKKL) -> Region:
+    """Return the region of the z with noise of all kept samples, and T* of them."""
+    data = samples.data
+    z = data.z + samples.noise
+    xhat = trained.inverse(z, data.t[:, None], data.u)
+    z, xhat = (each.reshape(-1, each.shape[-1]) for each in (z, xhat))
+    return Region.of(z, xhat, samples.config.seed)

@@ -141,7 +141,7 @@ class TwoStageFit:
         """
         data, map_of = self.samples.data, self.encoder
         if self.samples.driven:
-            clock = self.samples.clock(data.t, data.u)[:, None]
+            clock = self.samples.clock(data.t[:, None], data.u)
             x = np.concatenate(
                 [data.x, np.broadcast_to(clock, (*data.x.shape[:2], clock.shape[-1]))], axis=-1
             )
@@ -166,7 +166,7 @@ class TwoStageFit:
         # Inputs of T*: z with a random draw of the noise, and the clock.
         rows = samples.z_noise.shape[1]
         j = torch.randint(rows, (len(k),), generator=generator).to(samples.device)
-        a = torch.cat([samples.z[k, i] + samples.z_noise[k, j], samples.times[k]], dim=-1)
+        a = torch.cat([samples.z[k, i] + samples.z_noise[k, j], samples.clocked(k, i)], dim=-1)
         target, part = samples.x[k, i], samples.parts.to(samples.device)[k]
         with torch.no_grad():  # moving average of each part's error, and the weights from it
             square = (self.fit.net(a) - target).square().mean(dim=-1)
@@ -248,7 +248,7 @@ class TwoStageFit:
             z = self.samples.z[:, self.samples.held]
             if noise:
                 z = z + self.samples.z_noise[:, : self.samples.held.stop]
-            clock = self.samples.times[:, None].expand(-1, z.shape[1], -1)
+            clock = self.samples.times[:, self.samples.held].expand(-1, z.shape[1], -1)
             error = self.fit.net(torch.cat([z, clock], -1)) - self.samples.x[:, self.samples.held]
             return error.square().mean((1, 2))
 

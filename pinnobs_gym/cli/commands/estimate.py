@@ -137,6 +137,10 @@ def _estimate(log: Log, estimator: BaseEstimator, setup: Setup, out: Path) -> bo
     if isinstance(system, Augmented):
         for line in _found(system, log, estimates):
             console.print(line, soft_wrap=True)
+    if estimates.outside is not None and estimates.outside.any():
+        count = f"{int(estimates.outside.sum())} of {record.num_samples} samples"
+        what = f"{count} are outside of what {estimator.label} was trained on"
+        console.print(f"{what}: column outside", soft_wrap=True)
     console.print(f"estimates: {out}; picture: {picture}", soft_wrap=True)
     return bool(judgement.warnings)
 

@@ -34,6 +34,8 @@ class Algorithm:
     """Whole numbers that code has by name."""
     places: Mapping[str, str] = field(default_factory=dict)
     """Texts of further places."""
+    notes: Sequence[str] = ()
+    """What the code leaves out, a line each."""
     covariance: bool = False
     """Whether there is one, ``P``, and a P₀ to start from."""
 

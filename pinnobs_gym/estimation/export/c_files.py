@@ -77,7 +77,7 @@ def c_files(estimator: BaseEstimator, prior: Prior, name: str, *, float32: bool 
     head = own("head.c").replace("@math@", "tgmath" if float32 else "math")
     texts = [own("header.h"), f"{head}\n{source.lstrip()}", own("replay.c")]
     header, source, replay = (_filled(_filled(text, values), values) for text in texts)
-    notes = notes_of(code, float32, estimator.system.measured_input)
+    notes = (*found.notes, *notes_of(code, float32, estimator.system.measured_input))
     return CFiles(name, header, source, replay, checksum, notes)
 
 

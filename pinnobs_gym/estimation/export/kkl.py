@@ -19,9 +19,21 @@ _ACTIVATIONS = {
 }
 
 
-def kkl_code(trained: Any, system: System, code: PlantCode) -> Algorithm:
-    """Return the code of a trained observer, a `pinnobs_gym.estimators.kkl.TrainedKKL`, of a
-    system, whose equations are given in C."""
+_NOTE = (
+    "outside of the region of its training this code gives T*(z), where the observer in Python "
+    "takes the estimates of a filter that runs alongside; the field outside says when"
+)
+
+
+def kkl_code(trained: Any, system: System, code: PlantCode, hold: float) -> Algorithm:
+    """Return the code of a trained observer.
+
+    Args:
+        trained: a `pinnobs_gym.estimators.kkl.TrainedKKL`.
+        system: its system.
+        code: the system's equations in C.
+        hold: how long z has to be inside of its region before estimates count again, in s.
+    """
     nz, ny, nx = trained.dynamics.size, system.ny, system.nx
     clock = trained.clock
     step = system.setups["benchmark"].dt
@@ -64,9 +76,30 @@ def kkl_code(trained: Any, system: System, code: PlantCode) -> Algorithm:
         f"{{{', '.join(map(str, _widths(layers)))}}};"
         for name, layers in (("encoder", trained.encoder), ("decoder", trained.decoder))
     )
-    texts = widths, own("between.c"), own("kkl.c")
-    places = {"activation": _ACTIVATIONS[trained.activation]}
-    return Algorithm(model_parts(code), texts, numbers, fields, sizes=sizes, places=places)
+    texts = [widths, own("between.c"), own("kkl.c")]
+    places = {"activation": _ACTIVATIONS[trained.activation], "unmarked": "", "mark": ""}
+    region, notes = trained.region, []
+    if region is not None:
+        numbers |= {
+            "region_mean": region.mean,
+            "region_scale": region.scale,
+            "region_points": region.points,
+            "region_limits": np.array([region.radius, hold]),
+        }
+        sizes["POINTS"] = len(region.points)
+        fields += (
+            "double left; /* time when z was last outside of the region of its training */",
+            "int32_t outside; /* whether that was lately, so that x is not to be trusted */",
+        )
+        texts.insert(2, own("kkl_region.c"))
+        places |= {
+            "unmarked": "filter->left = -INFINITY;\n    ",
+            "mark": "mark_region(filter, a, t);\n    ",
+        }
+        notes.append(_NOTE)
+    return Algorithm(
+        model_parts(code), texts, numbers, fields, sizes=sizes, places=places, notes=notes
+    )
 
 
 def _widths(layers: Layers) -> list[int]:

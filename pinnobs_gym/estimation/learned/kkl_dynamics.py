@@ -32,7 +32,7 @@ class Dynamics:
     A: np.ndarray
     """Shape (nz, nz), in 1/s."""
     B: np.ndarray
-    """Shape (nz, ny), in 1/s per output unit."""
+    """Shape (nz, ny), in 1/s per output unit; measured inputs count as further outputs."""
     mode: Mode = "continuous"
 
     def __post_init__(self) -> None:
@@ -81,14 +81,22 @@ class Dynamics:
         h = round(h, max(12, 10 - math.floor(math.log10(h))))
         return _step(self.A.tobytes(), self.B.tobytes(), self.size, self.mode, h)
 
-    def filtered(self, t: np.ndarray, y: np.ndarray, z0: np.ndarray | float = 0.0) -> np.ndarray:
+    def filtered(
+        self,
+        t: np.ndarray,
+        y: np.ndarray,
+        z0: np.ndarray | float = 0.0,
+        ends: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Integrate z from z0 at the first of the times t (s), driven by outputs y
-        (num_samples, batch, ny); shape (num_samples, batch, nz)."""
+        (num_samples, batch, ny); shape (num_samples, batch, nz). At the end of an interval they are
+        those of ``ends``, of the same shape, if they jump at samples."""
         z = np.empty((*y.shape[:2], self.size))
         z[0] = z0
+        ends = y if ends is None else ends
         for k, h in enumerate(np.diff(t)):
             flow, before, after = self.step(float(h))
-            z[k + 1] = z[k] @ flow.T + y[k] @ before.T + y[k + 1] @ after.T
+            z[k + 1] = z[k] @ flow.T + y[k] @ before.T + ends[k + 1] @ after.T
         return z
 
     def flows(self, t: np.ndarray) -> np.ndarray:

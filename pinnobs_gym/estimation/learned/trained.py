@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_type_hints
 
@@ -118,7 +118,8 @@ def content_of(value: Any) -> Any:
 
 
 def from_content(kind: type, content: Mapping[str, Any]) -> Any:
-    """Create an object of a dataclass from its `content_of`.
+    """Create an object of a dataclass from its `content_of`. A field that has a default may be
+    missing.
 
     Raises:
         KeyError: if a field is missing.
@@ -127,6 +128,8 @@ def from_content(kind: type, content: Mapping[str, Any]) -> Any:
     hints = field_hints(kind)
     values = {}
     for field in fields(kind):
+        if field.name not in content and field.default is not MISSING:
+            continue
         value, hint = content[field.name], hints.get(field.name, Any)
         within = (hint, *get_args(hint))  # also within an optional type
         kinds = [each for each in within if isinstance(each, type) and is_dataclass(each)]

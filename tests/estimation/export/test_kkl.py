@@ -1,13 +1,18 @@
 """Exported KKL observers, with networks of random weights, against those in Python."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from export_figures.built import FLAGS, SANITIZERS, csv_of, replay
+from export_figures.built import build as build_files
 from exported import assert_replays, build, needs_c
 from linear import Linear
 
+from pinnobs_gym.estimation.export.c_files import c_files
 from pinnobs_gym.estimation.learned.kkl_dynamics import realised
+from pinnobs_gym.estimation.learned.kkl_region import Region
 from pinnobs_gym.estimation.learned.trained_file import identity
 from pinnobs_gym.estimators.kkl import Clock, KKLSupervised, TrainedKKL
 from pinnobs_gym.simulation.arrays import array_namespace
@@ -76,6 +81,31 @@ def observer(system, mode, start, activation, timed):
         ending="finished",
     )
     return KKLSupervised(system, trained=trained)
+
+
+def test_an_exported_observer_tells_what_is_outside_of_its_region(tmp_path):
+    """Its estimates there are T*(z), and the export says so in a line."""
+    system, record = Pushed(), irregular_record()
+    # Missing outputs would be predicted from other estimates.
+    record = replace(record, y=np.nan_to_num(record.y))
+    plain = observer(system, "continuous", "output", "tanh", False)
+    trained = plain.trained
+    z0 = record.y[:, 0] @ trained.rest.T
+    z = trained.dynamics.filtered(record.t, record.y.swapaxes(0, 1), z0)[:20, 0]
+    region = replace(Region.of(z, trained.inverse(z, 0.0, np.zeros(1)), 0), radius=0.01)
+    guarded = replace(plain, trained=replace(trained, region=region))
+    files = c_files(guarded, record.prior, "plant")
+    assert any("outside of the region" in line for line in files.notes)
+    assert not c_files(plain, record.prior, "plant").notes
+    assert_replays(build(tmp_path, guarded, record.prior), plain, record, 1e-12)
+    shown = files.replay.replace("(double)filter.x[i]", "(double)filter.outside")
+    assert shown != files.replay
+    program = build_files(tmp_path, replace(files, replay=shown), (*FLAGS, *SANITIZERS))
+    found, _ = replay(program, csv_of(record, system))
+    expected = guarded.run(record).outside[0]
+    assert not expected[:20].any()
+    assert expected[20:].any()
+    np.testing.assert_array_equal(found[:, 1], expected)
 
 
 @pytest.mark.parametrize(

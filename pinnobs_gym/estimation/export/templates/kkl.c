@@ -2,7 +2,7 @@ void @name@_init(@name@ *filter, const @real@ *xhat0)
 {
     memset(filter, 0, sizeof *filter);
     memcpy(filter->x, xhat0 ? xhat0 : prior_mean, sizeof filter->x);
-    filter->step = usual_step[0]; /* that of the model's benchmark; others are found when needed */
+    @unmarked@filter->step = usual_step[0]; /* that of the model's benchmark; others are found when needed */
     memcpy(filter->Phi, usual_Phi, sizeof filter->Phi);
     memcpy(filter->Gamma0, usual_Gamma0, sizeof filter->Gamma0);
     memcpy(filter->Gamma1, usual_Gamma1, sizeof filter->Gamma1);
@@ -147,7 +147,7 @@ static int advance(@name@ *filter, struct sample *now, seconds t)
     memcpy(a, filter->z, sizeof filter->z);
     clock_at((real)(t - filter->first), now->u, a + NZ);
     perceptron(decoder, decoder_sizes, DECODER_LAYERS, a);
-    for (int i = 0; i < NX; i++) {
+    @mark@for (int i = 0; i < NX; i++) {
         filter->x[i] = a[i];
         if (plan.low) filter->x[i] = absorbed(a[i], plan.low[i], plan.high[i]);
     }
