@@ -53,6 +53,7 @@ def draw(page: Page) -> str:
         css=Markup(_text("page.css")),
         policy=Markup(_policy(scripts)),
         scripts=[Markup(script) for script in scripts],
+        newline=Markup("\n"),
         data=Markup(embedded(charts, drawn, page.chosen)),
     )
 
