@@ -23,6 +23,9 @@ from pinnobs_gym.scoring.row_format import LOG_FILES, is_name
 from pinnobs_gym.scoring.rows import Row, Stored, game_of, seed_of
 from pinnobs_gym.scoring.tuned import SUFFIX
 
+SUITE_FILE = "reproduced.toml"
+"""The file of a suite that a command writes."""
+
 
 @dataclass(frozen=True)
 class EstimatorMethod:
@@ -205,9 +208,7 @@ def _entry_of(run: ScoredRun) -> Entry:
     row, made_by = run.rows[0], _made_by(run)
     tuned = row["estimator"].endswith(SUFFIX)
     name = row["estimator"].partition(" (")[0].removesuffix(SUFFIX)
-    labelled = "settings" in made_by
-    settings = made_by["settings"] if labelled else row["settings"]
-    known = dict(settings) if isinstance(settings, Mapping) else {}
+    labelled, known = "settings" in made_by, _settings_of(run)
     if not labelled and " (" in row["estimator"]:  # a recipe that is not its own
         known = {**_preset(name, row), **known}
     return Entry(
@@ -216,6 +217,13 @@ def _entry_of(run: ScoredRun) -> Entry:
         {key: value for key, value in known.items() if _is_setting(row, key, value)},
         tuned,
     )
+
+
+def _settings_of(run: ScoredRun) -> Mapping[str, Any]:
+    """Return the settings of a run that are not the usual ones, also those that a label stands
+    for."""
+    found = _made_by(run).get("settings", run.rows[0]["settings"])
+    return found if isinstance(found, Mapping) else {}
 
 
 def _preset(name: str, row: Row) -> dict[str, str]:
@@ -237,10 +245,6 @@ def _is_setting(row: Row, name: str, value: Any) -> bool:
 
 def _are_plain(entries: Sequence[Entry]) -> bool:
     return not any(entry.settings or entry.label for entry in entries)
-
-
-SUITE_FILE = "reproduced.toml"
-"""The file of a suite that a command writes."""
 
 
 def _suite(entries: Sequence[Entry]) -> str:
@@ -276,8 +280,7 @@ def _not_played(runs: Sequence[ScoredRun]) -> list[str]:
     found = []
     for run in runs:
         row = run.rows[0]
-        settings = _made_by(run).get("settings", row["settings"])
-        lost = sorted(set(settings) - set(_entry_of(run).settings)) if settings else []
+        lost = sorted(_settings_of(run).keys() - _entry_of(run).settings.keys())
         if lost:
             found.append(
                 f"# {row['estimator']}: without its {', '.join(lost)}, which evaluate() has"
