@@ -7,6 +7,7 @@ Nothing here knows any of them by name: what discovery finds gets a page.
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 import types
 from collections.abc import Iterable, Mapping, Sequence
@@ -383,7 +384,9 @@ def _keys(cls: type) -> list[tuple[str, ...]]:
     lines = []
     for name, default, meaning in _settings(cls, _names(cls)):
         expected = suites.expected(name.strip("`"))
-        lines.append((name, default, expected, meaning))
+        # As TOML has it: a list in square brackets, and nothing for None.
+        shown = re.sub(r"^`\((.*?),?\)`$", r"`[\1]`", default).replace("`None`", "")
+        lines.append((name, shown, expected, meaning))
     return lines
 
 

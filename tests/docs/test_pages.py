@@ -113,7 +113,8 @@ def test_every_key_of_a_suite_is_on_their_page(generated):
         for field in fields(cls):
             assert field.kw_only or f"| `{field.name}` | " in text
     assert "| `episodes` | `100` | at least 1, at most 10000000 | Episodes of each" in text
-    assert "| `systems` | `()` | a list of names | Names or" in text
+    assert "| `systems` | `[]` | a list of names | Names or" in text
+    assert "| `budgets` | `[45.0]` | a list of positive" in text
     assert "`quick`:\n\n```toml\n# Less than a minute" in text
 
 
