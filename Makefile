@@ -34,7 +34,7 @@ benchmark: $(VENV)/installed-dev
 	$(BIN)/python scripts/benchmark.py
 
 docs: $(VENV)/installed-docs
-	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -q -j auto docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
 $(VENV)/bin/python:

@@ -10,14 +10,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # in the kernels of executed page
 # So are the commands of this installation.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
+import api
 import pages
 
 project = "pinnobs-gym"
 author = "the authors of pinnobs-gym"
 version = release = importlib.metadata.version("pinnobs-gym")
-extensions = ["myst_nb"]
+extensions = ["myst_nb", "mathml"]
+html_math_renderer = "mathml"
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 nitpicky = True
+python_use_unqualified_type_names = True
+toc_object_entries = False
+maximum_signature_line_length = 90
 smartquotes = False  # the mark of x' is a prime
 
 myst_enable_extensions = ["dollarmath", "attrs_inline"]
@@ -39,3 +44,4 @@ html_show_copyright = False
 def setup(app):
     """Write the pages that are made from the code before Sphinx looks for pages."""
     app.connect("builder-inited", lambda app: pages.write(Path(app.srcdir) / "reference"))
+    app.connect("doctree-read", api.unlink_others)

@@ -1,4 +1,5 @@
-"""The pages that are made from the code: one per system, estimator and trainer, and the tables.
+"""The pages that are made from the code: one per system, estimator and trainer, the Python API, the
+commands, the suites, and the tables.
 
 Nothing here knows any of them by name: what discovery finds gets a page.
 """
@@ -14,6 +15,11 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from api import api_pages, in_markdown
+from commands import commands_page
+from moving import moving_picture
+from published import scores_of_estimator, scores_on_system
+
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.cli.system_page import field_docs, page, variable_docs
 from pinnobs_gym.envs.game import Game
@@ -21,16 +27,20 @@ from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
+from pinnobs_gym.leaderboard import suites
 from pinnobs_gym.leaderboard.grid import markdown_table
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring import consistency, metrics, row_format
-from pinnobs_gym.scoring.playing import play
+from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.tuned_file import path_of, read
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.symbolic import Equations, aligned, latex, name_in_latex, rates, trace
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.trainer import Trainer
+
+CHOICE = "When to choose it: "
+"""How the paragraph of an estimator's docstring begins that says when to choose it."""
 
 
 def write(folder: Path) -> None:
@@ -45,7 +55,10 @@ def write(folder: Path) -> None:
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
     for cls in SYSTEMS.classes().values():
-        write_figure(folder / "systems" / f"{cls.__name__}.png", _episode(cls))
+        played, title = _episode(cls)
+        place = folder / "systems" / cls.__name__
+        write_figure(place.with_suffix(".png"), played.figure(title))
+        place.with_suffix(".svg").write_text(moving_picture(played, title), encoding="utf-8")
 
 
 def pages() -> dict[str, str]:
@@ -59,6 +72,9 @@ def pages() -> dict[str, str]:
         "estimators/index.md": _estimators(estimators),
         **{f"trainers/{name}.md": trainer_page(name, m) for name, m in trainers.items()},
         "trainers/index.md": _trainers(trainers),
+        **{f"api/{name}": page for name, page in api_pages().items()},
+        "commands.md": commands_page(),
+        "suites.md": _suites(),
         "conditions.md": _conditions(),
         "metrics.md": _metrics(),
         "row_schema.txt": variable_docs(row_format)["Row"] + "\n",
@@ -68,9 +84,12 @@ def pages() -> dict[str, str]:
 def system_page(cls: type[System]) -> str:
     """What `pinnobs systems NAME` prints, with its equations as the code has them."""
     head, _, rest = page(cls, env_id(cls)).partition("\n## ")
-    picture = f"![EKF on {cls.__name__}]({cls.__name__}.png)"
-    told = f"One episode of `{env_id(cls)}` with the [EKF](../estimators/ekf.md):\n\n{picture}\n"
-    return "\n".join([head, _equations(cls), told, f"## {rest}"])
+    name, ekf = cls.__name__, "the [EKF](../estimators/ekf.md)"
+    moving = f"![{name}: the EKF finds the state from the first guess on]({name}.svg)"
+    told = f"Truth and estimate of {ekf}, from the first guess on:\n\n{moving}\n"
+    whole = f"## An Episode\n\nWhole, with {ekf}:\n\n![EKF on {name}]({name}.png)\n"
+    parts = [head, told, _equations(cls), whole, f"## {rest}", scores_on_system(cls)]
+    return "\n".join(parts)
 
 
 def _equations(cls: type[System]) -> str:
@@ -117,11 +136,11 @@ def _math(equations: Iterable[tuple[Any, Any]] | str) -> str:
     return f"```{{math}}\n\\begin{{aligned}}\n{text.strip()}\n\\end{{aligned}}\n```\n"
 
 
-def _episode(cls: type[System]) -> Any:
-    """A picture of the EKF in one episode."""
+def _episode(cls: type[System]) -> tuple[Played, str]:
+    """Return an episode as the EKF has played it, and what to call it."""
     game = Game.of(cls, condition=cls.ranked_condition)
     ekf = EKF.for_setup(game.source.system, game.source.setup)
-    return play(game, ekf, [0]).figure(f"{game.name.env_id}, {game.name.condition}: ekf")
+    return play(game, ekf, [0]), f"{cls.__name__}, {game.name.condition}: ekf"
 
 
 def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
@@ -133,7 +152,10 @@ def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
         ("training", f"[`{trainer}`](../trainers/{trainer}.md)" if trainer else "needs none"),
         ("class", f"`{cls.__module__}.{cls.__qualname__}`"),
     ]
-    parts = [f"# {name}\n", docstring(cls), "\n", markdown_table(("", ""), told)]
+    what, choice = split_choice(cls)
+    parts = [f"# {name}\n", what, "\n", markdown_table(("", ""), told)]
+    if choice:
+        parts.append(f"\n## When to choose it\n\n{choice}\n")
     if cls.equations:
         parts += ["\n## Equations\n", _math(cls.equations), _NOTATION]
     base = {f.name for f in fields(BaseEstimator)}
@@ -148,7 +170,18 @@ def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
         ranges = [(f"`{n}`", f"{r.low:g} to {r.high:g}") for n, r in cls.tunable.items()]
         parts += [f"\n`pinnobs tune {name}` searches\n", markdown_table(("name", "range"), ranges)]
         parts += _tuned(name)
+    parts.append(scores_of_estimator(name))
     return "\n".join(parts) + "\n"
+
+
+def split_choice(cls: type[BaseEstimator]) -> tuple[str, str]:
+    """Return an estimator's docstring without the paragraph that says when to choose it, and that
+    paragraph; empty if there is none."""
+    paragraphs = docstring(cls).split("\n\n")
+    choices = [each for each in paragraphs if each.startswith(CHOICE)]
+    what = "\n\n".join(each for each in paragraphs if each not in choices)
+    choice = " ".join(choices).removeprefix(CHOICE)
+    return what, choice[:1].upper() + choice[1:]
 
 
 def _tuned(name: str) -> list[str]:
@@ -322,6 +355,45 @@ def _metrics() -> str:
     )
 
 
+def _suites() -> str:
+    """The keys of a suite's file, and the files that ship with the package."""
+    shown = {
+        name: (suites.FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+        for name in suites.names()
+    }
+    return "\n".join(
+        [
+            "# Suites\n",
+            f"{docstring(suites)}\n",
+            "Play one with `pinnobs leaderboard --suite NAME`, or `--suite mine.toml`. A key that "
+            "is not known, or a value that does not fit, is an error in one line that names it.\n",
+            "## Keys\n",
+            markdown_table(("key", "default", "expected", "meaning"), _keys(suites.Suite)),
+            "\n## Keys of an estimator's table\n",
+            markdown_table(
+                ("key", "default", "meaning"), _settings(suites.Entry, _names(suites.Entry))
+            ),
+            "\n## Those of the package\n",
+            *(f"`{name}`:\n\n```toml\n{text}```\n" for name, text in shown.items()),
+        ]
+    )
+
+
+def _keys(cls: type) -> list[tuple[str, ...]]:
+    """Name, default, what is expected, and meaning of the keys of a suite."""
+    lines = []
+    for name, default, meaning in _settings(cls, _names(cls)):
+        expected = suites.expected(name.strip("`"))
+        # As TOML has it: a list in square brackets, and nothing for None.
+        shown = re.sub(r"^`\((.*?),?\)`$", r"`[\1]`", default).replace("`None`", "")
+        lines.append((name, shown, expected, meaning))
+    return lines
+
+
+def _names(cls: type) -> list[str]:
+    return [f.name for f in fields(cls) if not f.kw_only]
+
+
 def first_line(subject: Any) -> str:
     """The first paragraph of a docstring, in one line."""
     return _line((inspect.getdoc(subject) or "").partition("\n\n")[0])
@@ -332,13 +404,5 @@ def _line(text: str | None) -> str:
 
 
 def docstring(subject: Any) -> str:
-    """A docstring in Markdown: its sections (Args and the like) as bold words and lists."""
-    text = inspect.getdoc(subject) or ""
-    parts = re.split(r"^(Args|Returns|Raises):\n", text, flags=re.MULTILINE)
-    found = [parts[0]]
-    for title, body in zip(parts[1::2], parts[2::2], strict=True):
-        body = inspect.cleandoc(body)
-        if title != "Returns":
-            body = re.sub(r"^(\w+):", r"- `\1`:", body, flags=re.MULTILINE)
-        found.append(f"**{title}**\n\n{body}\n")
-    return "\n".join(found)
+    """Return a docstring in Markdown: its sections (Args and the like) as bold words and lists."""
+    return in_markdown(inspect.getdoc(subject) or "")

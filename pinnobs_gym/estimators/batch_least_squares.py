@@ -35,6 +35,10 @@ class BatchLeastSquares(OfflineEstimator):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and R that of the
     known output noise.
+
+    When to choose it: where a whole record is at hand, and the model is exact or nearly so: no
+    other estimate of the trajectory is then as close. Where unknown forces act on the plant,
+    `rts_smoother`.
     """
 
     max_iterations: int = 20

@@ -16,6 +16,9 @@ class CKF(SigmaPointFilter):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
     the known one with `assumed_noise` added.
+
+    When to choose it: in place of `ukf`, where nothing about its points is to be set. The two
+    hardly differ.
     """
 
     name = "ckf"

@@ -49,6 +49,10 @@ class EKF(RecursiveEstimator, GaussianEstimator):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
     the known one with `assumed_noise` added.
+
+    When to choose it: first. It is the cheapest filter with covariances, and the others are
+    measured against it. Where it goes astray from a poor first guess, or f or h bend within a
+    standard deviation, take `ukf` or `mhe`; for outliers `robust_ekf`.
     """
 
     gate: float | None = None

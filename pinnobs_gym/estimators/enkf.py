@@ -62,6 +62,10 @@ class EnKF(RecursiveEstimator, GaussianEstimator):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
     the known one with `assumed_noise` added.
+
+    When to choose it: where the plant has hundreds of states or more, as a discretised field does,
+    so that covariance matrices and Jacobians are too large. With few states `ukf` costs less and is
+    no worse.
     """
 
     members: int = 50

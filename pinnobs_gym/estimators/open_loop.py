@@ -14,7 +14,11 @@ from pinnobs_gym.simulation.record import Prior
 
 @dataclass(frozen=True)
 class OpenLoop(RecursiveEstimator):
-    """The model integrated from x̂₀, without use of the outputs."""
+    """The model integrated from x̂₀, without use of the outputs.
+
+    When to choose it: never, but as the baseline: what beats it has learned something from the
+    outputs. Of a plant that contracts it may be enough, and then estimation is not needed.
+    """
 
     name = "open_loop"
     template = "observer"

@@ -75,6 +75,9 @@ class PinnGain(LearnedEstimator, RecursiveEstimator, GaussianEstimator):
 
     The variant ``gru`` is a recurrent network for the gain in x̂ = x̂⁻ + K(y − h(t, x̂⁻, u)), without
     a covariance.
+
+    When to choose it: where one plant is estimated often enough to be worth a training beforehand,
+    and the gain of `ekf` is not good enough in the transient. True states are not needed.
     """
 
     trained: TrainedGain = field(kw_only=True, repr=False)

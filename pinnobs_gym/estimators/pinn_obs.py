@@ -126,6 +126,9 @@ class PinnObsReplay(LearnedEstimator, Estimator):
 
     The gain was learned along one trajectory from one initial estimate. Its training does not make
     the observer stable along other trajectories.
+
+    When to choose it: to study how a gain learned along one record acts on others, or to reproduce
+    the paper. Episodes that are far from the record of the training can diverge.
     """
 
     trained: TrainedNetwork = field(kw_only=True, repr=False)
@@ -243,7 +246,11 @@ class PinnObsReplay(LearnedEstimator, Estimator):
 @dataclass(frozen=True)
 class PinnObsDirect(LearnedEstimator, OfflineEstimator):
     """The network's own estimates x̂(t) (Farkane et al., PINN-Obs, "Proposed Adaptive PINN-Based
-    Model"), which are valid only for its training record."""
+    Model"), which are valid only for its training record.
+
+    When to choose it: to see what a trained network says of the record of its own training. It
+    cannot be used on any other.
+    """
 
     trained: TrainedNetwork = field(kw_only=True, repr=False)
     """The trained network."""
@@ -289,7 +296,11 @@ class PinnObsDirect(LearnedEstimator, OfflineEstimator):
 
 @dataclass(frozen=True)
 class PinnObs(OfflineEstimator):
-    """PINN-Obs trained separately on every record, with the network's x̂(t) as estimates."""
+    """PINN-Obs trained separately on every record, with the network's x̂(t) as estimates.
+
+    When to choose it: to reproduce the paper, one training per record. `batch_least_squares` and
+    `rts_smoother` are more precise on the systems here, at a thousandth of the cost.
+    """
 
     config: Any = field(default_factory=lambda: PinnObs.trainer_config({}))
     """The recipe; all rows use its seed."""

@@ -17,6 +17,9 @@ class RobustEKF(EKF):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, the noise is the known
     one with `assumed_noise` added, and the settings are the defaults below.
+
+    When to choose it: where outputs have outliers, or the filter has to recover from a state that
+    jumped or from a first guess that is wrong by more than P says.
     """
 
     gate: float | None = 0.9999

@@ -43,6 +43,10 @@ class RTSSmoother(OfflineEstimator, GaussianEstimator):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, and the noise is
     the known one with `assumed_noise` added.
+
+    When to choose it: where a whole record is at hand and unknown forces act on the plant, or the
+    record is long: it costs a few times as much as `ekf`. With an exact model,
+    `batch_least_squares`.
     """
 
     template: ClassVar[str] = "smoother"

@@ -126,6 +126,9 @@ class Sb3(LearnedEstimator, Estimator):
 
     The meaning of its actions is a form of `pinnobs_gym.envs.actions`. With ``gain`` the agent
     chooses the gain of an observer on the model at every sample.
+
+    When to choose it: to study reinforcement learning as a way to an estimator, or where only a
+    reward is known. The filters are more precise on the systems here.
     """
 
     trained: TrainedAgent = field(kw_only=True, repr=False)

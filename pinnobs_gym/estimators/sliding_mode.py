@@ -27,6 +27,10 @@ class SlidingMode(ConstantGainObserver):
     Default tuning is the same rule for all systems: L is designed as for the Luenberger observer
     (`pinnobs_gym.estimation.observer_gains.settling_gain`), ε is `layer` standard deviations of the
     output noise, and ρ = `switching`·ε.
+
+    When to choose it: where an unknown force or an error of the model is bounded and acts where the
+    outputs see it. With a right model it is no better than `luenberger` by much, and far from a
+    filter.
     """
 
     rate: float | None = None

@@ -37,6 +37,9 @@ class StrongTrackingEKF(RecursiveEstimator, GaussianEstimator):
 
     Default tuning is the same rule for all systems: P₀ is that of the prior, the noise is the known
     one with `assumed_noise` added, and the settings are the defaults below.
+
+    When to choose it: where parameters or loads jump without notice: it finds the state again at
+    once. Where the model holds, `ekf` is more precise.
     """
 
     gamma: float = 1e-6

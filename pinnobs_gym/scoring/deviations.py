@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -63,15 +63,34 @@ def _of_training(estimator: BaseEstimator) -> dict[str, Any]:
         trainer, usual = trainer_class(cls), cls.trainer_config({})
     except ValueError:  # its trainer is not known here, so that no settings are the usual ones
         return {}
-    # The preset that is nearest to the settings; the estimator's own one if several are.
-    makers = {"": lambda: usual, **trainer.presets}
-    presets = {name: make() for name, make in makers.items()}
-    differences = {name: _differences(config, asdict(each)) for name, each in presets.items()}
-    nearest = min(differences, key=lambda name: len(differences[name]))
+    nearest, differences = _nearest(usual, trainer.presets, config)
     found: dict[str, Any] = {}
-    if nearest and presets[nearest].recipe == usual.recipe:
+    if nearest and trainer.presets[nearest]().recipe == usual.recipe:
         found["preset"] = nearest
-    return found | differences[nearest]
+    return found | differences
+
+
+def preset_of(cls: type[BaseEstimator], config: Mapping[str, Any]) -> str:
+    """Return the preset that is nearest to the settings of a training, as they are in rows; empty
+    if that is the estimator's own, or if it is not trained.
+
+    Raises:
+        ValueError: in one line, if its trainer is not known here.
+    """
+    if not (cls.needs_training or cls.trains_on_record):
+        return ""
+    return _nearest(cls.trainer_config({}), trainer_class(cls).presets, config)[0]
+
+
+def _nearest(
+    usual: Any, presets: Mapping[str, Callable[[], Any]], config: Mapping[str, Any]
+) -> tuple[str, dict[str, Any]]:
+    """Return the preset that is nearest to some settings, and what differs from it; the name is
+    empty for the estimator's own recipe, which counts first if several are as near."""
+    makers = {"": lambda: usual, **presets}
+    differences = {name: _differences(config, asdict(make())) for name, make in makers.items()}
+    nearest = min(differences, key=lambda name: len(differences[name]))
+    return nearest, differences[nearest]
 
 
 def _differences(config: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,6 +30,8 @@ from pinnobs_gym.scoring.provenance import (
 )
 from pinnobs_gym.scoring.recency import LastUse
 from pinnobs_gym.scoring.row_format import (
+    FLOOR,
+    FLOOR_WHOLE,
     LAST_SEED,
     MOST_EPISODES,
     NEEDED,
@@ -45,6 +47,7 @@ from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.notices import say_first
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.values import is_finite, shortly
+from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import LOGS
 from pinnobs_gym.training.log import SILENT, Log
 
@@ -239,8 +242,10 @@ def run_episodes(
     common = {**game_fields(game), **estimator_fields(estimator, game)}
     if stand_in is not None:
         common |= stand_in.code
-    if label is not None:
-        common |= {"estimator": label, "settings": {}}  # the label stands for the settings
+    if label is not None:  # which stands for the settings
+        told = {"estimator": ESTIMATORS.spec_of(type(estimator)), "settings": common["settings"]}
+        common |= {"estimator": label, "settings": {}}
+        common["made_by"] = {**common.get("made_by", {}), **told}
     plays = partial(play, game, estimator) if stand_in is None else partial(stand_in.play, game)
     return score_episodes(common, plays, seeds, results, progress)
 
@@ -386,6 +391,7 @@ def estimator_fields(estimator: BaseEstimator, game: AnyGame) -> Row:
     knows += [LOGS] if estimator.training.get("condition") == LOGS else []
     tuned = is_tuned(type(estimator), estimator.options, game)
     knows += [TUNED] if tuned else []
+    made_by = _made_by(estimator, game)
     return {
         "estimator": estimator.label + (SUFFIX if tuned else ""),
         "track": f"{estimator.track}, condition known" if informed else estimator.track,
@@ -396,5 +402,17 @@ def estimator_fields(estimator: BaseEstimator, game: AnyGame) -> Row:
         "estimator_hash": estimator_hash(estimator),
         "training": canonical(estimator.training),
         "training_seed": estimator.training.get("seed"),
+        **({"made_by": made_by} if made_by else {}),
         "versions": versions(),
     }
+
+
+def _made_by(estimator: BaseEstimator, game: AnyGame) -> dict[str, str]:
+    """Return what commands take for an estimator and a system that the package does not have."""
+    cls, system = type(estimator), type(game.source.system)
+    found = {}
+    if cls.track not in (FLOOR, FLOOR_WHOLE) and ESTIMATORS.spec_of(cls) != ESTIMATORS.name_of(cls):
+        found["estimator"] = ESTIMATORS.spec_of(cls)
+    if SYSTEMS.spec_of(system) != SYSTEMS.name_of(system):
+        found["system"] = SYSTEMS.spec_of(system)
+    return found

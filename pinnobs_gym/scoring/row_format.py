@@ -36,6 +36,9 @@ Row: TypeAlias = dict[str, Any]
   and so have estimates that were submitted (`pinnobs_gym.scoring.submitted`); ``knows`` of these
   begins with ``submitted``, and their ``options`` have the hash of the estimates.
 - ``settings``: what is not as usual (`pinnobs_gym.scoring.deviations`); names in tables have it.
+- ``made_by``: what a command or a suite takes to play it, where the names do not say it; absent
+  otherwise. ``estimator``: name or ``module:Class``; ``settings``: those that a label stands for;
+  ``system``: ``module:Class``.
 - ``estimator_code``: hash of the estimator's code.
 - ``estimator_hash``: hash of its code, settings, model and training.
 - ``training``, ``training_seed``: for trained estimators, how they were trained: seconds, config,
@@ -334,6 +337,8 @@ def _check(row: Row, constants: bool) -> None:
         for name in LOG_FILES:
             if name in row and not is_name(row[name]):
                 raise ValueError(f"{name}={shown(row[name])}; expected {NAME_EXPECTED}")
+        if not _is_object(row.get("made_by", {})):
+            raise ValueError(f"made_by={shown(row['made_by'])}; expected {_OBJECT[0]}")
         if not _is_count(row.get("batch", 0)):
             raise ValueError(f"batch={shown(row['batch'])}; expected {_COUNT[0]}")
         _check_training(row["training"])

@@ -22,7 +22,7 @@ from pinnobs_gym.scoring.row_format import KEY, LOG_FILES, OPTIONAL, SCHEMA, Row
 
 TOLERANCE = 1e-6
 """Largest relative difference between numbers of the same episode from different machines."""
-_ASIDE = ("us_per_step", "batch", "versions", "date", *LOG_FILES)
+_ASIDE = ("us_per_step", "batch", "versions", "date", "made_by", *LOG_FILES)
 """The fields in which two rows of an episode may differ."""
 _ESTIMATES = frozenset((*SCORES, *OPTIONAL_SCORES, "state_rmse"))
 """The fields with numbers that depend on the estimates."""

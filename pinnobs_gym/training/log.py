@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,6 +15,12 @@ from pinnobs_gym.training.event_file import EventFile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+FOLDER = "tensorboard"
+"""Name of the folders that hold the runs of a command."""
+HPARAMS = {name: f"{i} {name}" for i, name in enumerate(("estimator", "system"), 1)}
+"""Columns that lead the HPARAMS table."""
 
 
 class Log:
@@ -54,16 +59,19 @@ class Log:
             self._add(_summary().Value(tag=tag, image=_image(figure)), step)
 
     def hparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
-        """Add the run's settings and final metrics to the HPARAMS table."""
-        if not self.active:
+        """Add the run's settings and final metrics to the HPARAMS table, as the line of its name.
+
+        TensorBoard shows the settings in which runs differ first, and either in the order of their
+        names: those with a number before them (`HPARAMS`) lead.
+        """
+        if self._folder is None:
             return
         from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 
         # The table accepts neither None nor sequences. Its columns are not declared, since
         # TensorBoard would use those of the first run for all runs.
         shown = {k: v if isinstance(v, bool | int | float) else str(v) for k, v in params.items()}
-        run = hashlib.sha256(str(self._folder).encode()).hexdigest()[:12]  # a row per run
-        for value in hparams_pb(shown, trial_id=run).value:
+        for value in hparams_pb(shown, trial_id=_run(self._folder)).value:
             self._add(value, 0)
         for tag, value in metrics.items():
             self.scalar(tag, value, 0)
@@ -102,6 +110,15 @@ class Log:
         say_first("TensorBoard", f"{reason}; what follows is done without this TensorBoard log")
         self.close()
         self._folder = None
+
+
+def _run(folder: Path) -> str:
+    """Return what TensorBoard calls the run of a folder: its path below that of all runs, or else
+    its name."""
+    parts = folder.absolute().parts
+    if FOLDER not in parts[:-1]:
+        return folder.name
+    return "/".join(parts[len(parts) - parts[::-1].index(FOLDER) :])
 
 
 def _summary() -> Any:

@@ -14,7 +14,7 @@ from pinnobs_gym.estimation.learned.trained import Trained
 from pinnobs_gym.files import CannotWrite
 from pinnobs_gym.simulation.notices import say_first
 from pinnobs_gym.training.checkpoint import load_checkpoint, save_checkpoint
-from pinnobs_gym.training.log import SILENT, Log
+from pinnobs_gym.training.log import HPARAMS, SILENT, Log
 from pinnobs_gym.training.trainer import Trainer
 
 TrainedT = TypeVar("TrainedT", bound=Trained)
@@ -163,7 +163,8 @@ def _log_end(trainer: Trainer[Any, TrainedT], trained: TrainedT, log: Log) -> No
     """Log the figures of the trained object, and its row of the HPARAMS table."""
     for name, figure in trainer.figures(trained).items():
         log.figure(f"trained/{name}", figure, trainer.iteration)
-    settings = {"system": trained.system, **trained.config}
+    settings = {HPARAMS["estimator"]: trainer.name, HPARAMS["system"]: trained.system}
+    settings |= trained.config
     metrics = {"end/loss": trained.loss, "end/iterations": float(trained.iterations)}
     log.hparams(settings, metrics)
 

@@ -1,22 +1,30 @@
 """The documentation: every page is there, links lead somewhere, and its code runs."""
 
+import importlib
 import re
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from snippets import ROOT, cells, run_cells, run_page
 from waiting import PATIENCE
 
+import pinnobs_gym
 from pinnobs_gym import Setup, System
+from pinnobs_gym.cli import COMMANDS
 from pinnobs_gym.cli.system_page import page
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import Estimator
 from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators.open_loop import OpenLoop
+from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.scoring.metrics import OPTIONAL_SCORES, SCORES
+from pinnobs_gym.scoring.playing import play
 from pinnobs_gym.scoring.row_format import JOB, KEY
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import stack
@@ -35,6 +43,7 @@ def generated():
     """The module that makes pages, and the pages."""
     sys.path.insert(0, str(DOCS))
     try:
+        import mathml  # noqa: F401
         import pages
     finally:
         sys.path.remove(str(DOCS))
@@ -57,6 +66,150 @@ def test_everything_that_is_found_has_a_page(generated):
         assert re.search(rf"``?{name}``?", texts["metrics.md"]), name
     for name in (*KEY, *JOB):
         assert f"``{name}``" in texts["row_schema.txt"]
+
+
+def test_every_public_name_has_an_entry(generated):
+    """Against the lines of the sources that begin a class or a function of a module."""
+    _, texts = generated
+    entries = "\n".join(text for name, text in texts.items() if name.startswith("api/"))
+    seen = 0
+    for folder in (ROOT / "pinnobs_gym", ROOT / "trainers"):
+        for path in folder.rglob("*.py"):
+            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            module = module.removesuffix(".__init__")
+            defined = r"^(?:async def|def|class) ([A-Za-z]\w*)"
+            for name in re.findall(defined, path.read_text(encoding="utf-8"), re.MULTILINE):
+                entry = rf"\n`+\{{py:(class|function)\}} {name}\b"
+                own = entries.partition(f"\n## `{module}`\n")[2].partition("\n## `")[0]
+                assert re.search(entry, own), f"{module}.{name}"
+                seen += 1
+    assert seen > 1000
+    for name in pinnobs_gym.__all__:
+        assert name.startswith("_") or f"{{py:obj}}`{name} <" in texts["api/index.md"], name
+
+
+def test_every_option_of_a_command_is_on_their_page(generated):
+    text = generated[1]["commands.md"]
+    seen = 0
+    for name in COMMANDS:
+        section = text.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
+        module = importlib.import_module(f"pinnobs_gym.cli.commands.{name}")
+        commands = [c for c in vars(module).values() if is_dataclass(c) and hasattr(c, "run")]
+        for command in (each for each in commands if each.__module__ == module.__name__):
+            for field in fields(command):
+                if "Positional" in str(field.type) or "Options" in str(field.type):
+                    continue
+                if field.name != "config":  # of `train`, which are on the trainers' pages
+                    assert f"--{field.name.replace('_', '-')}" in section, f"{name} {field.name}"
+                    seen += 1
+    assert seen > 80
+    assert "| `--seed INT` | Seed of the first episode. (default: 0) |" in text
+    assert "| `--trained {None}\\|PATH` | Trained estimator to load; published" in text
+
+
+def test_every_key_of_a_suite_is_on_their_page(generated):
+    text = generated[1]["suites.md"]
+    for cls in (Suite, Entry):
+        for field in fields(cls):
+            assert field.kw_only or f"| `{field.name}` | " in text
+    assert "| `episodes` | `100` | at least 1, at most 10000000 | Episodes of each" in text
+    assert "| `systems` | `[]` | a list of names | Names or" in text
+    assert "| `budgets` | `[45.0]` | a list of positive" in text
+    assert "`quick`:\n\n```toml\n# Less than a minute" in text
+
+
+@pytest.mark.parametrize("name", ESTIMATORS.classes())
+def test_an_estimators_page_says_when_to_choose_it(generated, name):
+    pages, texts = generated
+    _, choice = pages.split_choice(ESTIMATORS.classes()[name])
+    assert len(choice) > 40, f"its docstring has no paragraph that begins with {pages.CHOICE!r}"
+    assert f"\n## When to choose it\n\n{choice}\n" in texts[f"estimators/{name}.md"]
+    assert pages.CHOICE not in texts[f"estimators/{name}.md"]
+
+
+def test_pages_have_the_published_scores(generated):
+    _, texts = generated
+    system, estimator = texts["systems/Academic.md"], texts["estimators/ukf.md"]
+    line = re.search(r"\| \[ukf\]\(../estimators/ukf.md\) \| online \| (.*) \|", system)
+    assert line is not None
+    assert f"| [Academic](../systems/Academic.md) | ukf | `nominal` | {line[1]} |" in estimator
+    rank, steady, transient, *_ = line[1].split(" | ")
+    assert int(rank) >= 1
+    assert 0 < float(steady) < float(transient) < 1
+
+
+def test_an_estimator_without_published_scores_has_a_page(generated):
+    class Unheard(OpenLoop):
+        """Says when."""
+
+        name = "unheard"
+
+    text = generated[0].estimator_page("unheard", Unheard)
+    assert "Published scores" not in text
+    assert "When to choose" not in text
+
+
+def test_every_equation_becomes_mathml(generated):
+    from mathml import mathml
+
+    _, texts = generated
+    seen = 0
+    for name, text in texts.items():
+        for equation in re.findall(r"^```\{math\}\n(.*?)\n```$", text, re.MULTILINE | re.DOTALL):
+            tree = ElementTree.fromstring(mathml(equation, block=True))
+            said = "".join(tree.itertext())
+            assert not re.search(r"[\\&]|begin|frac|left", said), name
+            assert tree.find(".//mtr") is not None
+            assert tree.get("display") == "block"
+            seen += 1
+    assert seen > 30
+
+
+def test_an_index_stands_beside_a_sign_with_an_accent(generated):
+    from mathml import mathml
+
+    tree = ElementTree.fromstring(mathml(r"\hat x_k^-", block=False))
+    (index,) = tree
+    base, below, above = index
+    assert (index.tag, base.tag, below.text, above.text) == ("msubsup", "mover", "k", "−")
+    assert [part.text for part in base] == ["x", "ˆ"]
+
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.mark.parametrize("name", SYSTEMS.classes())
+def test_a_system_has_a_moving_picture(generated, name):
+    """Which begins at the first guess, and whose lines are the truth and the estimate."""
+    pages, texts = generated
+    assert f"({name}.svg)" in texts[f"systems/{name}.md"]
+    game = Game.of(name)
+    played = play(game, OpenLoop.for_setup(game.source.system, game.source.setup), [0])
+    text = pages.moving_picture(played, "a < b")
+    assert len(text) < 300_000
+    tree = ElementTree.fromstring(text)
+    assert tree.findtext(f"{SVG}title") == "a < b"
+    groups = [g for g in tree.iter(f"{SVG}g") if g.get("clip-path")]
+    guesses = [c for c in tree.iter(f"{SVG}circle") if c.get("fill") == "none"]
+    assert len(groups) == len(guesses) == game.source.system.nx
+    motion = re.findall(r"prefers-reduced-motion:reduce\)\{([^}]*)\}", text)
+    assert motion == [".cover,.dot{display:none"]
+    end = 3 * game.source.setup.transient_end
+    last = np.flatnonzero(played.record.t <= min(end, game.source.setup.duration))[-1]
+    for i, (group, guess) in enumerate(zip(groups, guesses, strict=True)):
+        truth, estimate = [
+            [tuple(map(float, point.split())) for point in re.split("[ML]", path.get("d", ""))[1:]]
+            for path in group
+            if path.get("fill") == "none"
+        ]
+        assert estimate[0] == (float(guess.get("cx", 0)), float(guess.get("cy", 0)))
+        x, prior = played.truth[0, :, i], played.record.prior.mean[0, i]
+        # Heights are linear in values: two of them give the scale, a third one has to fit.
+        heights = np.array([truth[0][1], estimate[0][1], truth[-1][1]])
+        values = np.array([x[0], prior, x[last]])
+        if abs(values[1] - values[0]) > 0.05 * np.ptp(values):
+            slope = (heights[1] - heights[0]) / (values[1] - values[0])
+            assert heights[2] == pytest.approx(heights[0] + slope * (values[2] - values[0]), abs=4)
 
 
 def test_a_systems_page_is_the_commands_and_its_equations(generated):
@@ -193,8 +346,11 @@ def test_the_site_builds_without_a_warning_and_shows_what_it_ran(tmp_path):
     tutorial = (site / "tutorial.html").read_text(encoding="utf-8")
     assert tutorial.count('src="_images/') == 2  # the pictures of its episodes
     assert "mine is better than the EKF in" in tutorial
-    assert "<img" in (site / "reference/systems/Satellite.html").read_text(encoding="utf-8")
+    satellite = (site / "reference/systems/Satellite.html").read_text(encoding="utf-8")
+    assert "_images/Satellite.svg" in satellite
+    assert "<mtable" in satellite
     for path in site.rglob("*.html"):
+        assert "mathjax" not in path.read_text(encoding="utf-8").lower()
         for link in re.findall(
             r'(?:href|src)="(?!https?:|#|data:|mailto:)([^"#?]+)', path.read_text()
         ):

@@ -43,10 +43,21 @@ class Shown:
 
     def columns(self):
         """The columns of the HPARAMS table: settings, metrics."""
-        table = self._hparams.experiment_from_metadata(
-            RequestContext(), "", True, self._metadata, []
-        )
+        table = self._table()
         return {one.name for one in table.hparam_infos}, {m.name.tag for m in table.metric_infos}
+
+    def ordered(self):
+        """The columns of settings in their order."""
+        return [one.name for one in self._table().hparam_infos]
+
+    def line(self, run):
+        """The name of a run's line in that table."""
+        content = self._metadata[run][SESSION_START_INFO_TAG]
+        return parse_session_start_info_plugin_data(content).group_name
+
+    def _table(self):
+        context = RequestContext()
+        return self._hparams.experiment_from_metadata(context, "", True, self._metadata, [])
 
     def settings(self, run):
         """The line of a run in the HPARAMS table."""
@@ -78,8 +89,46 @@ def test_the_runs_are_the_estimators_on_the_systems(played):
     assert len(runs) == 4
     assert set(shown.runs) == set(runs)
     for run, group in runs.items():
-        names = (group[0]["env_id"].removeprefix("pinnobs/"), "benchmark", "dt5")
-        assert run.startswith("/".join([*names, group[0]["estimator"]]))
+        names = (group[0]["estimator"], group[0]["env_id"].removeprefix("pinnobs/"), "dt5")
+        assert run == "/".join([*names, group[0]["estimator_hash"][:6]])
+
+
+def test_the_name_of_a_run_leaves_out_what_is_usual(tmp_path):
+    row = {"env_id": "pinnobs/A-v0", "setup": "benchmark", "condition": "nominal"}
+    row |= {"estimator": "ekf", "estimator_hash": "0123456789ab"}
+    found = {}
+    for setup, condition in (("benchmark", "nominal"), ("paper", "nominal"), ("paper", "dt5")):
+        path = log_folder(tmp_path, row | {"setup": setup, "condition": condition})
+        found[setup, condition] = path.relative_to(tmp_path / "tensorboard").as_posix()
+    assert list(found.values()) == [
+        "ekf/A-v0/012345",
+        "ekf/A-v0/setup-paper/012345",
+        "ekf/A-v0/setup-paper/dt5/012345",
+    ]
+
+
+def test_the_error_over_time_is_a_curve(played):
+    """The same errors whose squares over the whole episode are a score of it."""
+    runs, shown = played
+    for run in runs:
+        curve = shown.scalars(run, "over samples/median_nrmse")
+        assert len(curve) > 50
+        assert list(curve) == sorted(curve)
+        assert min(curve) == 0
+        assert all(np.isfinite(list(curve.values())))
+    own = next(run for run in runs if run.startswith("ekf/ReverseDuffing"))
+    curve = shown.scalars(own, "over samples/median_nrmse")
+    steps = np.array(list(curve))
+    late = np.median([curve[k] for k in steps[steps > 0.5 * steps[-1]]])
+    row = runs[own][0]
+    assert late == pytest.approx(row["nrmse_tail"], rel=1.5)
+    assert late < 0.1 * curve[0]
+
+
+def test_the_table_is_led_by_estimator_and_system(played):
+    runs, shown = played
+    assert shown.ordered()[:2] == ["1 estimator", "2 system"]
+    assert {shown.line(run) for run in runs} == set(runs)
 
 
 def test_scalars_are_the_scores_of_the_rows(played):
@@ -109,8 +158,10 @@ def test_the_table_has_every_estimators_settings_and_medians(played):
     for run, group in runs.items():
         first = group[0]
         told = shown.settings(run)
-        for name in ("env_id", "setup", "condition", "estimator", "track"):
+        for name in ("setup", "condition", "track"):
             assert told[name] == first[name]
+        assert told["1 estimator"] == first["estimator"]
+        assert f"pinnobs/{told['2 system']}" == first["env_id"]
         for name, value in first["options"].items():
             assert told[name] == (value if isinstance(value, bool | int | float) else str(value))
         assert set(told) <= settings  # also what the first run of all has not

@@ -59,7 +59,7 @@ def factors(styled: Styled, order: Sequence[str], low: float, high: float) -> Sp
         exact("low"),
         exact("high"),
     ]
-    title = f"steady NRMSE / {styled.peer}'s, over all systems"
+    title = f"steady NRMSE / {styled.peer}'s"
     x = alt.X("ratio:Q", scale=scale, title=title, axis=log_axis(low, high))
     base = (
         named("standings")

@@ -139,6 +139,10 @@ def _game(styled: Styled, game: GameResults) -> _Part:
             shown = limits, measured, game.states.in_part
             spec = over_time.state(styled, i, name, end, *shown)
             specs[f"state{game.number}-{i}"] = spec
+            of = game.states.error_limits
+            largest = [of[each][i] if each in of else 1.0 for each in styled.places]
+            spec = over_time.error(styled, i, end, largest)
+            specs[f"error{game.number}-{i}"] = spec
     return _charts(f"game{game.number}", specs, tables)
 
 

@@ -115,7 +115,7 @@ def _results(
         over_floor=over_floor({e.name: e.standing for e in table.entries if e.name in players}),
         floor_errors=errors(_curves(game, floors, folders)),
         floor_settling=settling(floor_rows, until=max(settled["t"])),
-        states=states(own, _logs(rows.values())),
+        states=states(own, _logs(rows.values()), _transient_end(game)),
     )
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.leaderboard.board import Part, board
 from pinnobs_gym.leaderboard.contenders import Contender
 from pinnobs_gym.leaderboard.ranks import Line
@@ -18,6 +20,18 @@ from pinnobs_gym.systems import SYSTEMS
 
 SHOWN = 3
 """Number of the best online estimators that are selected initially, besides the peer."""
+
+
+@dataclass(frozen=True)
+class About:
+    """What an estimator is."""
+
+    name: str
+    """Its name, without its settings."""
+    first: str
+    """The first contender of this name."""
+    what: str
+    """One line."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,8 @@ class Page:
 
     tracks: Mapping[str, str]
     """Track of each estimator, in display order."""
+    abouts: tuple[About, ...]
+    """What estimators are, in display order."""
     chosen: tuple[str, ...]
     """The estimators selected initially in charts over time."""
     main: Part
@@ -71,6 +87,7 @@ def page_model(stored: Stored, folders: Sequence[Path], shipped: Sequence[Row] =
     tables = {table.game: table for part in results.parts[::-1] for table in part.tables}
     return Page(
         tracks={contender.name: contender.track for contender in drawn},
+        abouts=tuple(abouts(drawn)),
         chosen=_chosen(main.lines, main.places.peer),
         main=main,
         on_record=on_record,
@@ -86,6 +103,25 @@ def _listed(found: Iterable[Contender], lines: Iterable[Line]) -> list[Contender
     by_name = {contender.name: contender for contender in found}
     order = dict.fromkeys([*(line.estimator for line in lines), *sorted(by_name)])
     return [by_name[name] for name in order]
+
+
+def abouts(found: Iterable[Contender]) -> list[About]:
+    """Return what estimators are, one for all that differ in settings or training."""
+    named: dict[str, About] = {}
+    for contender in found:
+        name = contender.name.partition(" (")[0].partition(", ")[0]
+        named.setdefault(name, About(name, contender.name, _what(name, contender)))
+    return list(named.values())
+
+
+def _what(name: str, contender: Contender) -> str:
+    """Return in one line what an estimator is, as far as this process knows it by its name; nothing
+    that rows name is imported."""
+    cls = ESTIMATORS.classes().get(name)
+    if cls is not None:
+        return " ".join((inspect.getdoc(cls) or "").partition("\n\n")[0].split())
+    spec = str(contender.runs[0].rows[0].get("made_by", {}).get("estimator", ""))
+    return f"not of this installation: {spec}" if spec else "not of this installation"
 
 
 def _chosen(lines: Iterable[Line], peer: str) -> tuple[str, ...]:

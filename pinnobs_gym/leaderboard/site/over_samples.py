@@ -11,6 +11,7 @@ from pinnobs_gym.envs.figures import jumps
 from pinnobs_gym.leaderboard.site.columns import Columns, extend, medians, numbers, quantiles
 from pinnobs_gym.scoring.curves import Curves
 from pinnobs_gym.scoring.thinning import kept
+from pinnobs_gym.simulation.residual import nearest
 
 POINTS = 120
 """Largest number of times at which a curve is drawn."""
@@ -32,8 +33,11 @@ class States:
     """``t``, true states ``x0``, ...; outputs ``y0``, ..., numbered by the state that they
     measure. A gap in a state breaks its line, where an angle jumps by a period."""
     estimates: Columns
-    """``estimator``, ``t``, estimates ``m0``, ... and twice their standard deviations ``s0``, ...,
-    with gaps if there are none, and where an angle jumps."""
+    """``estimator``, ``t``, estimates ``m0``, ..., twice their standard deviations ``s0``, ... and
+    their errors ``e0``, ..., with gaps if there are none, and where an angle jumps."""
+    error_limits: Mapping[str, tuple[float, ...]]
+    """For each estimator, the largest absolute value on the axis of each state's error, such that
+    the errors after the transient fill it."""
 
 
 def errors(found: Mapping[str, Curves]) -> Columns:
@@ -74,13 +78,14 @@ def reference(found: Iterable[Curves], after: float) -> Columns:
     return {"t": numbers(t[k][some]), "median": numbers(medians(lines[:, some]))}
 
 
-def states(found: Mapping[str, Curves], logs: Mapping[int, str]) -> States | None:
+def states(found: Mapping[str, Curves], logs: Mapping[int, str], after: float) -> States | None:
     """Return the example episode that most estimators share, of the lowest seed in a tie; None
     without curves.
 
     Args:
         found: each estimator's curves.
         logs: names of the files of those episodes that are logs, by their seeds.
+        after: end of the transient window in s from the first sample.
     """
     seeds = [own.example.seed for own in found.values()]
     if not seeds:
@@ -95,7 +100,23 @@ def states(found: Mapping[str, Curves], logs: Mapping[int, str]) -> States | Non
         limits=tuple(map(_limits, first.example.x.T, first.example.xhat.T)),
         truth=_truth(first),
         estimates=_estimates(shown),
+        error_limits={name: _error_limits(own, after) for name, own in shown.items()},
     )
+
+
+def _errors(own: Curves) -> np.ndarray:
+    """Return the errors of an example (num_samples, nx), those of angles within half a turn."""
+    x = own.example.x.astype(float)
+    return nearest(own.example.xhat.astype(float), x, own.state_period) - x
+
+
+def _error_limits(own: Curves, after: float) -> tuple[float, ...]:
+    """Return `States.error_limits` of an example."""
+    error = np.abs(_errors(own))
+    late = own.example.t - own.example.t[0] > after * (1 + 1e-9)
+    error = np.where(np.isfinite(error), error, 0.0)[late if late.any() else slice(None)]
+    scale = np.nanmax(np.abs(own.example.x), axis=0, initial=1e-9)
+    return tuple(float(f"{limit:.3g}") for limit in 1.25 * error.max(axis=0) + 1e-9 * scale)
 
 
 def _truth(own: Curves) -> Columns:
@@ -131,7 +152,7 @@ def _estimates(shown: Mapping[str, Curves]) -> Columns:
     """Return `States.estimates` of all examples."""
     nx = next(iter(shown.values())).example.x.shape[1]
     table: Columns = {"estimator": [], "t": []}
-    table |= {f"{part}{i}": [] for i in range(nx) for part in ("m", "s")}
+    table |= {f"{part}{i}": [] for i in range(nx) for part in ("m", "s", "e")}
     for name, own in shown.items():
         example, std = own.example, own.example.std
         curves = zip(example.xhat.T, _periods(own), example.x.T, strict=True)
@@ -141,6 +162,7 @@ def _estimates(shown: Mapping[str, Curves]) -> Columns:
         t, mean = _broken(breaks, example.t, example.xhat)
         std = np.full(example.xhat.shape, np.nan) if std is None else std
         parts = {"m": mean, "s": 2 * _broken(breaks, example.t, std)[1]}
+        parts["e"] = _broken(breaks, example.t, _errors(own))[1]
         new = {f"{part}{i}": numbers(v[:, i]) for part, v in parts.items() for i in range(nx)}
         extend(table, estimator=[name] * len(t), t=numbers(t), **new)
     return table

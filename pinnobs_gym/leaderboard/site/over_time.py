@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import altair as alt
@@ -98,6 +99,50 @@ def settling(styled: Styled, end: float) -> Spec:
         chosen.mark_point(opacity=0, size=90, filled=True).encode(tooltip=tips),
         height=HEIGHT,
         shown=[],
+    )
+
+
+def error(styled: Styled, index: int, end: float, limits: Sequence[float]) -> Spec:
+    """Chart the error of the selected estimator in one state of the example episode, with twice
+    its standard deviation about zero. The page can set the end (s) of the time axis.
+
+    Args:
+        styled: the styles.
+        index: the state.
+        end: the end of the time axis in s.
+        limits: of each estimator in the order of the styles, the largest error on its axis.
+    """
+    scale = alt.Scale(
+        domainMin=alt.ExprRef(expr="-limits[selected]"),
+        domainMax=alt.ExprRef(expr="limits[selected]"),
+        nice=False,
+        clamp=True,
+    )
+    until = alt.Scale(domainMin=0, domainMax=alt.ExprRef(expr="until"), nice=False)
+    x = alt.X("t:Q", scale=until, axis=alt.Axis(tickCount=6, labels=False), title=None)
+
+    def y(field: str) -> alt.Y:
+        axis = alt.Axis(tickCount=3, format="~g")
+        return alt.Y(f"{field}:Q", scale=scale, title="error", axis=axis)
+
+    mine = (
+        named("estimates")
+        .transform_filter("datum.estimator === selected")
+        .transform_calculate(
+            low=f"isValid(datum.s{index}) ? -datum.s{index} : null",
+            high=f"isValid(datum.s{index}) ? datum.s{index} : null",
+        )
+        .encode(x=x, color=styled.colour)
+    )
+    zero = named("one").transform_calculate(zero="0").mark_rule(style="level")
+    return finished(
+        mine.mark_area(opacity=0.18, clip=True).encode(y=y("low"), y2="high:Q"),
+        zero.encode(y=y("zero")),
+        mine.mark_line(clip=True).encode(y=y(f"e{index}")),
+        height=70,
+        selected=-1,
+        until=end,
+        limits=list(limits),
     )
 
 

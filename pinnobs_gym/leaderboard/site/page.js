@@ -58,7 +58,7 @@
     const name = place.dataset.chart;
     const { spec, data } = page.charts[name];
     const now = paramsOf(name);
-    const params = (spec.params ?? []).map((p) => ({ ...p, value: now[p.name] }));
+    const params = (spec.params ?? []).map((p) => ({ ...p, value: now[p.name] ?? p.value }));
     const whole = { ...spec, params, config: theme(), datasets: datasetsOf(data) };
     views.get(name)?.finalize();
     const made = await vegaEmbed(place, whole, {
@@ -140,6 +140,7 @@
       head.firstElementChild.addEventListener("click", () => {
         const down = head.getAttribute("aria-sort") === "ascending";
         heads.forEach((other) => other.removeAttribute("aria-sort"));
+        for (const row of body.rows) row.classList.remove("begins");  // tracks are mixed now
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
         const compare = (a, b) => {
           const [f, g] = [a, b].map((row) => row.classList.contains("floor"));

@@ -17,8 +17,10 @@ import vl_convert
 from markupsafe import Markup, escape
 
 from pinnobs_gym.leaderboard import ranks_table, standings_table
+from pinnobs_gym.leaderboard.board import Part
 from pinnobs_gym.leaderboard.chapters import ON_RECORD
 from pinnobs_gym.leaderboard.display import printable
+from pinnobs_gym.leaderboard.grid import Grid
 from pinnobs_gym.leaderboard.numerals import number
 from pinnobs_gym.leaderboard.places import Place
 from pinnobs_gym.leaderboard.site.across import Factors
@@ -40,10 +42,11 @@ def draw(page: Page) -> str:
         lstrip_blocks=True,
         finalize=_visible,
     )
-    environment.filters |= {"marked": _marked, "anchor": _anchor}
+    environment.filters |= {"marked": _marked, "anchor": _anchor, "stacked": _stacked}
+    environment.filters |= {"breakable": _breakable}
     return environment.from_string(_text("page.html")).render(
         page=page,
-        overview=lambda part: ranks_table.grid(part.lines, part.places.peer),
+        overview=_overview,
         note=ranks_table.NOTE,
         on_record=ON_RECORD,
         grid=standings_table.grid,
@@ -53,8 +56,17 @@ def draw(page: Page) -> str:
         css=Markup(_text("page.css")),
         policy=Markup(_policy(scripts)),
         scripts=[Markup(script) for script in scripts],
+        newline=Markup("\n"),
         data=Markup(embedded(charts, drawn, page.chosen)),
     )
+
+
+def _overview(part: Part) -> Grid:
+    """Return the overview of a part with a column per game, and letters for what estimators know,
+    so that it fits a window of usual width."""
+    known = [line.knows for line in part.lines]
+    whole = ranks_table.grid(part.lines, part.places.peer)
+    return standings_table.with_letters(whole, known, standings_table.facts_of(known))
 
 
 @dataclass(frozen=True)
@@ -139,6 +151,24 @@ def _visible(value: Any) -> Any:
 def _marked(text: str) -> Markup:
     """Convert parts in backticks to code elements."""
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(_visible(text)))))
+
+
+def _stacked(text: str) -> Markup:
+    """Put what is said of a number below it: its interval, or how many episodes diverged."""
+    shown = _visible(text)
+    if found := re.fullmatch(r"(\S+) (\([^()]*\))(.*)", shown):
+        value, below, rest = map(escape, found.groups())
+    elif found := re.fullmatch(r"(\S+), (div \d+ %)", shown):
+        value, below, rest = *map(escape, found.groups()), ""
+    else:
+        return escape(shown)
+    return Markup(f"{value}{rest} <small>{below}</small>")
+
+
+def _breakable(text: str) -> Markup:
+    """Let a line end within a name: before a capital, and after a hyphen or an underscore."""
+    parts = re.split(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/])", _visible(text))
+    return Markup("<wbr>").join(map(escape, parts))
 
 
 def _anchor(title: str) -> str:

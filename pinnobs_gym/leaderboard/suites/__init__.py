@@ -136,15 +136,21 @@ def load(spec: str) -> Suite:
     return Suite(**values, file=file, given=frozenset(values))
 
 
+def expected(key: str) -> str:
+    """Return in words what the value of a key has to be."""
+    words, _ = _EXPECTED[key]
+    return f"a list of {words}" if key in _SEVERAL else words
+
+
 def _checked(key: str, value: Any) -> Any:
     """Check a value and return it in the form that the suite stores."""
-    expected, fits = _EXPECTED[key]
+    _, fits = _EXPECTED[key]
     several = key in _SEVERAL
     if several and not isinstance(value, list):
-        raise ValueError(f"{key}={shortly(value)}; expected a list of {expected}")
+        raise ValueError(f"{key}={shortly(value)}; expected {expected(key)}")
     for part in value if several else [value]:
         if not fits(part):
-            raise ValueError(f"{key}={shortly(value)}; expected {'a list of ' * several}{expected}")
+            raise ValueError(f"{key}={shortly(value)}; expected {expected(key)}")
     if key == "estimators":
         return tuple(_entry(part) for part in value)
     if several and len({repr(part) for part in value}) < len(value):

@@ -46,7 +46,7 @@ def test_lines_of_an_angle_have_a_gap_where_it_jumps():
     example = Example(0, t, x, x + np.array([0.2, 0.1]), x[:, :1], np.full(x.shape, 0.25))
     own = curves(np.ones((1, 8)), t=t)
     own = replace(own, example=example, state_period=(2 * np.pi, None))
-    found = over_samples.states({"a": own}, {})
+    found = over_samples.states({"a": own}, {}, after=3.0)
     assert found is not None
     # π lies between 3 and 4 s; the sample at 4 s is drawn behind a gap.
     assert found.truth["t"] == [0, 1, 2, 3, 4, 4, 5, 6, 7]
@@ -56,14 +56,17 @@ def test_lines_of_an_angle_have_a_gap_where_it_jumps():
     lines = lines_of(found.estimates, "a")
     assert [line[0] for line in lines] == found.truth["t"]
     assert [line[1:3] for line in lines if None in line] == [(None, None)]
-    plain = over_samples.states({"a": replace(own, state_period=None)}, {})
+    # An estimate beyond half a turn is as far from the truth as any other.
+    errors = [line[3::3] for line in lines if None not in line]
+    np.testing.assert_allclose(errors, 8 * [(0.2, 0.1)], rtol=1e-3)
+    plain = over_samples.states({"a": replace(own, state_period=None)}, {}, after=3.0)
     assert plain is not None
     assert plain.truth["t"] == t.tolist()
 
 
 def test_the_example_is_of_the_episode_that_most_have():
     own = {"a": curves(np.ones((1, 3)), seed=5), "b": curves(np.ones((1, 3)))}
-    found = over_samples.states({**own, "c": curves(np.ones((1, 3)))}, {})
+    found = over_samples.states({**own, "c": curves(np.ones((1, 3)))}, {}, after=1.0)
     assert found is not None
     assert found.called == "seed 0"
     assert found.truth == {
@@ -73,5 +76,23 @@ def test_the_example_is_of_the_episode_that_most_have():
         "y0": [0, 1, 2],
     }
     assert set(found.estimates["estimator"]) == {"b", "c"}
-    assert lines_of(found.estimates, "b")[1] == (1, 2, 0.5, 0, 0.5)
-    assert over_samples.states({}, {}) is None
+    assert lines_of(found.estimates, "b")[1] == (1, 2, 0.5, 1, 0, 0.5, 1)
+    assert over_samples.states({}, {}, after=1.0) is None
+
+
+def test_errors_are_drawn_on_the_scale_of_those_after_the_transient():
+    """Errors of 10 s and -0.5 s in the transient of 2 s, then of at most 0.04 and of none."""
+    t = np.arange(6.0)
+    x = np.stack([np.full(6, 100.0), t], axis=-1)
+    error = np.stack([[10, 5, 2, 0.04, -0.02, 0.01], [-0.5, 0, 0, 0, 0, 0]], axis=-1)
+    own = curves(np.ones((1, 6)), t=t)
+    own = replace(own, example=Example(0, t, x, x + error, x[:, :1], None))
+    found = over_samples.states({"a": own}, {}, after=2.0)
+    assert found is not None
+    first, second = found.error_limits["a"]
+    assert first == pytest.approx(1.25 * 0.04, rel=0.01)
+    assert 0 < second < 1e-6  # of an axis that has to have a length
+    assert found.estimates["e0"] == [10, 5, 2, 0.04, -0.02, 0.01]
+    whole = over_samples.states({"a": own}, {}, after=np.inf)  # of a game that is not known here
+    assert whole is not None
+    assert whole.error_limits["a"][0] == pytest.approx(12.5)

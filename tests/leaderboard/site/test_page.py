@@ -18,11 +18,12 @@ from pinnobs_gym.leaderboard.site.charts import Styled
 from pinnobs_gym.leaderboard.site.comparisons import cost, factors, over_floor, ratios
 from pinnobs_gym.leaderboard.site.drawings import charts_of
 from pinnobs_gym.leaderboard.site.model import page_model
-from pinnobs_gym.leaderboard.site.over_time import errors, settling, state
+from pinnobs_gym.leaderboard.site.over_time import error, errors, settling, state
 from pinnobs_gym.leaderboard.site.page import draw
 from pinnobs_gym.leaderboard.site.palette import styles
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.rows import Stored
+from pinnobs_gym.systems import SYSTEMS
 
 CHROMIUM = shutil.which("chromium")
 ARGUMENTS = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
@@ -254,6 +255,7 @@ def test_charts_are_valid():
         errors(styled, 20.0, 1e-3, 1.0),
         settling(styled, 20.0),
         state(styled, 0, "x1", 20.0, (0.0, 1.0), True),
+        error(styled, 0, 20.0, [0.1, 0.2]),
         factors(styled, ["ekf"], 0.5, 20.0),
         ratios(styled, ["ekf"], 0.5, 20.0),
         over_floor(styled, ["ekf"], 0.5, 20.0),
@@ -441,13 +443,77 @@ def test_nothing_is_wider_than_a_phone(opened):
     draw_all(page)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     wide = page.evaluate(
-        "[...document.querySelectorAll('main *, header *')].filter(each => !each.closest("
-        "'.box, #picker') && each.getBoundingClientRect().right > 391).map(each => each.tagName)"
+        "[...document.querySelectorAll('main *, header *')].filter(each => !each.closest('.box, "
+        "#picker, nav') && each.getBoundingClientRect().right > 391).map(each => each.tagName)"
     )
     assert wide == []
     # A table that is wider scrolls in its own box.
     box = page.locator("#overview .box")
     assert box.evaluate("box => box.scrollWidth > box.clientWidth")
+    for each in ("nav", "#picker"):  # so does a line of links or of chips
+        right = page.locator(each).evaluate("each => each.getBoundingClientRect().right")
+        assert right <= 391
+
+
+def test_on_a_phone_scores_come_first(opened):
+    page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+    draw_all(page)
+    page.evaluate("window.scrollTo(0, 0)")
+    table, chart = page.locator("#overview table"), page.locator("[data-chart=factors]")
+    score = table.locator("tbody tr").nth(1).locator("td").nth(1)  # the peer has no interval
+    assert "(" in score.inner_text()  # the factor to the peer, with its interval
+    box, below = score.bounding_box(), chart.bounding_box()
+    assert box is not None
+    assert below is not None
+    assert box["x"] + box["width"] <= 390
+    assert box["y"] + box["height"] <= 844
+    assert below["y"] > box["y"]
+    wide = opened(viewport={"width": 1280, "height": 900})
+    draw_all(wide)
+    chart, table = wide.locator("[data-chart=factors]"), wide.locator("#overview table")
+    assert chart.bounding_box()["y"] < table.bounding_box()["y"]  # where there is room for both
+
+
+def test_the_whole_overview_fits_a_window_of_usual_width(opened, tmp_path):
+    """Of all systems of the package, with the columns of the floor and of divergence."""
+    made = []
+    for name, cls in SYSTEMS.classes().items():
+        facts = {"env_id": f"pinnobs/{name}-v0", "condition": cls.ranked_condition, **COMMON}
+        facts["knows"] = ["model", "prior", "noise", "initial set", "simulated true states"]
+        for each in ("kkl_autoencoder", "pinn_obs_replay (guided by a smoother)", "ukf"):
+            made += rows_of(each, [0.012345] * 58 + [9.0] * 2, ranked=True, **facts)
+        floor = {"track": "floor", "estimator_hash": "floor", "effective_sample_size": 900.0}
+        made += rows_of("exact_bayes", [0.0123] * 60, ranked=True, **{**facts, **floor})
+    path = tmp_path / "index.html"
+    path.write_text(draw(page_model(Stored(made, []), [])), encoding="utf-8")
+    page = opened(path, viewport={"width": 1280, "height": 900})
+    heads = page.locator("#overview thead th").all_inner_texts()
+    assert len(heads) >= 8 + len(SYSTEMS.classes())
+    box = page.locator("#overview .box")
+    assert box.evaluate("box => box.scrollWidth") <= box.evaluate("box => box.clientWidth")
+    assert "knows: a model, b prior" in page.locator("#overview .note").first.inner_text()
+
+
+def test_the_page_says_what_estimators_are(site):
+    text = site.read_text(encoding="utf-8")
+    section = text.partition('<section id="estimators">')[2].partition("</section>")[0]
+    said = " ".join(re.sub(r"<[^>]*>", " ", section.replace("<wbr>", "")).split())
+    for name, what in (
+        ("ekf", "The continuous-discrete extended Kalman filter (Jazwinski 1970, section 8.3)."),
+        ("open_loop", "The model integrated from x̂₀, without use of the outputs."),
+    ):
+        assert f" {name} {what}" in said
+    assert section.count("<dt>") == 4
+
+
+def test_what_an_unknown_estimator_is_comes_from_its_rows():
+    made = rows_of("mine", [0.1] * 6, made_by={"estimator": "my_module:Mine"}, **COMMON)
+    made += rows_of("other", [0.1] * 6, **COMMON)
+    names = {each.name: each.what for each in page_model(Stored(made, []), []).abouts}
+    assert names == {
+        "mine": "not of this installation: my_module:Mine",
+        "other": "not of this installation",
+    }
 
 
 def test_the_dark_changes_page_and_charts(opened):
