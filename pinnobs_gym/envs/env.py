@@ -37,6 +37,10 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
     ends the episode with `NOT_FINITE_REWARD`; otherwise only the time limit ends it. The
     observation after the last action is never scored.
 
+    An observation is the outputs, the inputs and t/T. Under a condition that loses outputs, the
+    latest present value stands for a missing output (zero before the first), and a mask follows
+    the outputs: 1 for each that is present, 0 for each that is missing.
+
     For learning agents, ``action_mode`` selects other actions and observations;
     `pinnobs_gym.envs.actions` has the forms. The estimate is then computed from the action by the
     form.

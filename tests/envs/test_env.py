@@ -439,15 +439,17 @@ def test_parameters_are_honoured() -> None:
 
 
 def errors(num_envs: int = 20, **kwargs: Any) -> np.ndarray:
-    """y − h(x) of many episodes of the oscillator, (num_samples, num_envs)."""
+    """y − h(x) of many episodes of the oscillator, (num_samples, num_envs); NaN if y is missing."""
     envs = make_vec(DUFFING, num_envs, **kwargs)
     observations, infos = envs.reset(seed=0)
-    found = [observations[:, 0] - infos["state"][:, 0]]
-    over = np.array([False])
-    while not over.any():
+    found, over = [], np.array([False])
+    while True:
+        assert envs.observation_space.contains(observations)
+        present = observations[:, 1] == 1 if observations.shape[1] == 3 else np.full(num_envs, True)
+        found.append(np.where(present, observations[:, 0] - infos["state"][:, 0], np.nan))
+        if over.any():
+            return np.array(found)
         observations, _, _, over, infos = envs.step(infos["state"])
-        found.append(observations[:, 0] - infos["state"][:, 0])
-    return np.array(found)
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,11 @@ class Combined(Condition):
         return all(part.reference for part in self.parts)
 
     @property
+    def loses_outputs(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether outputs may be missing under any part."""
+        return any(part.loses_outputs for part in self.parts)
+
+    @property
     def summary(self) -> str:
         return "; ".join(part.summary for part in self.parts)
 
