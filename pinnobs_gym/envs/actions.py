@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.model import model_step
@@ -82,9 +83,7 @@ class Form(ABC):
     action_space: Box
     """The action space of one episode."""
 
-    def __init__(
-        self, system: System, setup: Setup, stack: int = 1, mask: bool = False
-    ) -> None:
+    def __init__(self, system: System, setup: Setup, stack: int = 1, mask: bool = False) -> None:
         if not is_whole(stack, 1):
             raise ValueError(f"stack={shortly(stack)}; expected a whole number of at least 1")
         self.system, self.setup, self.stack, self.mask = system, setup, int(stack), mask
@@ -356,6 +355,7 @@ def form_of(
     if not isinstance(action_mode, str) or action_mode not in FORMS:
         raise ValueError(
             f"unknown action_mode {shortly(action_mode)}; known are {', '.join(FORMS)}"
+            f"{did_you_mean(action_mode, FORMS)}"
         )
     return FORMS[action_mode](system, setup, stack, mask)
 

@@ -13,7 +13,7 @@ import numpy as np
 from pinnobs_gym.estimation.given import checked_reset, checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
-from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.registry import did_you_mean, trainer_class
 from pinnobs_gym.simulation.declared import check_fields
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
@@ -165,7 +165,9 @@ class BaseEstimator(ABC):
             if name not in taken:
                 known = sorted(f.name for f in cls.setting_fields() if f.init)
                 expected = f"one of {', '.join(known)}" if known else "no settings"
-                raise ValueError(f"setting {name!r}; expected {expected}")
+                raise ValueError(
+                    f"setting {name!r}; expected {expected}{did_you_mean(name, known)}"
+                )
         return cls(system, setup.noise_std, setup.process_noise, **options)
 
     @classmethod

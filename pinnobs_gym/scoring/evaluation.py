@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from pinnobs_gym.envs.game import AnyGame, Game
+from pinnobs_gym.envs.policy import is_policy, policy_of
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import CannotWrite
@@ -103,7 +104,7 @@ class Results:
 
 
 def evaluate(
-    estimator: BaseEstimator | type[BaseEstimator] | str,
+    estimator: BaseEstimator | type[BaseEstimator] | str | Any,
     env_id: str,
     *,
     episodes: int = 100,
@@ -125,14 +126,17 @@ def evaluate(
 
     Args:
         estimator: an instance, which keeps its own model; or a class, a name or ``module:Class``,
-            which is instantiated with the env's model and noise.
+            which is instantiated with the env's model and noise; or a policy: a model of
+            Stable-Baselines3, or a function of observations (batch, features) that returns actions
+            (see `pinnobs_gym.envs.policy.policy_of`).
         env_id: such as ``pinnobs/ReverseDuffing-v0``; or the name of the system.
         episodes: number of episodes, of seeds seed, seed + 1, ...
         seed: of the first episode.
         setup: ``benchmark`` or ``paper``.
         condition: change of the episodes relative to the setup, such as ``load_step`` or
             ``noise5+dropout10``.
-        options: settings of an estimator that is instantiated here.
+        options: settings of an estimator that is instantiated here; of a policy ``action_mode``,
+            ``stack_outputs``, ``normalize`` and ``title``.
         tuned: whether it has the settings that are stored with the system, see
             `pinnobs_gym.scoring.tuned`, in place of ``options``.
         results: a rows file to append to, in whole batches. Episodes already in it, of the same
@@ -313,7 +317,7 @@ def _scored(played: Played) -> list[Row]:
 
 
 def make_estimator(
-    estimator: BaseEstimator | type[BaseEstimator] | str,
+    estimator: BaseEstimator | type[BaseEstimator] | str | Any,
     game: AnyGame,
     options: Mapping[str, Any],
     tuned: bool = False,
@@ -334,6 +338,8 @@ def make_estimator(
             raise ValueError(f"options {dict(options)} go with a name or a class, not an instance")
         _check_model(estimator.system, system)
         return estimator
+    if is_policy(estimator):
+        return _policy(estimator, game, options)
     cls = ESTIMATORS.resolve(estimator)
     if tuned:
         options = required_settings(cls, game)
@@ -345,6 +351,19 @@ def make_estimator(
         return cls.for_setup(system, setup, **options)
     except TypeError as error:
         raise ValueError(f"estimator {ESTIMATORS.name_of(cls)!r}: {error}") from None
+
+
+def _policy(policy: Any, game: AnyGame, options: Mapping[str, Any]) -> BaseEstimator:
+    """Return a policy as an estimator of a game; see `make_estimator`."""
+    if not isinstance(game, Game):
+        raise ValueError("a policy plays simulated episodes; expected an estimator for a log")
+    known = ("action_mode", "stack_outputs", "normalize", "title")
+    for name in options:
+        if name not in known:
+            raise ValueError(f"option {name!r} of a policy; expected one of {', '.join(known)}")
+    source = game.source
+    lossy = source.condition.loses_outputs
+    return policy_of(policy, source.system, source.setup, loses_outputs=lossy, **options)
 
 
 def _check_model(model: System, system: System) -> None:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
@@ -437,6 +438,7 @@ class System(ABC):
         if not isinstance(setup, str) or setup not in cls.setups:
             raise ValueError(
                 f"unknown setup {shortly(setup)} of {cls.__name__}; it has {', '.join(cls.setups)}"
+                f"{did_you_mean(setup, cls.setups)}"
             )
         changes: dict[str, Any] = {"dt": dt, "duration": duration, "noise_std": noise_std}
         changes = {name: value for name, value in changes.items() if value is not None}

@@ -14,8 +14,9 @@ from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import AnyGame, Game
+from pinnobs_gym.envs.policy import WARNING, Policy, load_policy
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators import ESTIMATORS, policy_file
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.against import opponents
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
@@ -43,7 +44,10 @@ class Evaluate:
     system: str
     """Name or module:Class of the system."""
     estimator: str = "ekf"
-    """Name or module:Class of the estimator."""
+    """Name or module:Class of the estimator; or policy:FILE.zip for a model that Stable-Baselines3
+    saved. Such a file can hold code, which runs as it is loaded."""
+    normalization: Path | None = None
+    """Of a policy: the file of its VecNormalize. It can hold code, too."""
     trained: Path | None = None
     """Trained estimator to load; published stands for the one that ships with the package."""
     set: tuple[str, ...] = ()
@@ -80,20 +84,44 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate and print."""
-        cls = ESTIMATORS.resolve(self.estimator)
         if self.tuned and (self.set or self.trained is not None):
             other = "--trained" if self.trained is not None else "--set"
             raise ValueError(f"--tuned and {other}; expected one of them")
-        return self._run_logs(cls) if self.log else self._run_episodes(cls)
+        if (path := policy_file(self.estimator)) is not None:
+            return self._run_policy(path)
+        if self.normalization is not None:
+            raise ValueError("--normalization without --estimator policy:FILE.zip")
+        cls = ESTIMATORS.resolve(self.estimator)
+        if self.log:
+            return self._run_logs(cls)
+        game, options = self._game(), settings_of(cls, self.set)
+        trained = self._trained(cls, game)
+        return self._run_episodes(game, make_estimator(trained or cls, game, options, self.tuned))
 
-    def _run_episodes(self, cls: type[BaseEstimator]) -> int:
-        """Evaluate on simulated episodes."""
-        game = Game.of(self.system, self.setup, self.condition)
-        options = settings_of(cls, self.set)
+    def _run_policy(self, path: Path) -> int:
+        """Evaluate a model that Stable-Baselines3 saved, on simulated episodes."""
+        for option, value in (
+            ("--log", self.log),
+            ("--trained", self.trained),
+            ("--tuned", self.tuned),
+        ):
+            if value:
+                raise ValueError(f"{option} and --estimator {self.estimator}; expected one of them")
+        game, options = self._game(), settings_of(Policy, self.set)
+        for each in filter(None, (path, self.normalization)):
+            console.print(f"warning: {each} {WARNING}", style="yellow", soft_wrap=True)
+        policy, normalize = load_policy(path, self.normalization)
+        options |= {"normalize": normalize, "title": path.stem}
+        return self._run_episodes(game, make_estimator(policy, game, options))
+
+    def _game(self) -> Game:
+        """Return the game that is played, after checks of what needs none of it."""
         if self.video is not None:
             check_video(self.video)
-        trained = self._trained(cls, game)
-        estimator = make_estimator(trained or cls, game, options, self.tuned)
+        return Game.of(self.system, self.setup, self.condition)
+
+    def _run_episodes(self, game: Game, estimator: BaseEstimator) -> int:
+        """Evaluate on simulated episodes."""
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, Unknowns
 from pinnobs_gym.simulation.conditions.measurement import (
     Delay,
@@ -133,6 +134,7 @@ def canonical_name(name: str) -> str:
         if not isinstance(part, str) or part not in CONDITIONS:
             raise ValueError(
                 f"unknown condition {shortly(part)}; known are {', '.join(CONDITIONS)}"
+                f"{did_you_mean(part, CONDITIONS)}"
             )
     named.sort(key=list(CONDITIONS).index)
     for first, second in pairwise(named):
