@@ -351,8 +351,10 @@ def _constants(node: ast.ClassDef) -> dict[str, Any]:
     constants = {}
     for statement in node.body:
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            value = statement.value
-            constant = value.value if isinstance(value, ast.Constant) else None
+            try:
+                constant = ast.literal_eval(statement.value)
+            except ValueError:
+                constant = None
             constants[statement.targets[0].id] = constant
     return constants
 

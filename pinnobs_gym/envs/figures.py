@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +19,8 @@ TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
 """Colours of true states, estimates and measured outputs."""
 _ROUNDING = 1e-9
 """Largest difference, over its period, of an angle and an output that measures it."""
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND")
+"""Environment variables of which one is set on Linux where a window can be shown."""
 _LARGEST = 1e100
 """Largest absolute value that is drawn, since an axis cannot span all numbers."""
 
@@ -169,6 +173,19 @@ def _limits(values: np.ndarray, scale: float) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
     margin = 0.1 * (high - low) + 0.15 * scale
     return low - margin, high + margin
+
+
+class Metadata:
+    """The ``metadata`` of a single env. Where there is no display, that of an instance leaves out
+    the mode ``human``, so that whoever tries all modes, as Gymnasium's checker does, does not try
+    this one; asked for by name, it says what is missing."""
+
+    def __get__(self, env: Any, owner: type) -> dict[str, Any]:
+        modes = ["human", "rgb_array"]
+        hidden = sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS)
+        if hidden and env is not None and env.render_mode != "human":
+            modes.remove("human")
+        return {"render_modes": modes, "render_fps": 30}
 
 
 class EpisodePicture:

@@ -228,6 +228,7 @@ def run_episodes(
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
     stand_in: StandIn | None = None,
+    phase: Callable[[str], None] | None = None,
 ) -> Evaluated:
     """Run and score the episodes that are not stored yet, batch by batch.
 
@@ -239,13 +240,16 @@ def run_episodes(
         progress: called after each batch with its number of episodes.
         label: name of the estimator in rows; its own if None.
         stand_in: what plays in its place; rows have the code that this was trained by.
+        phase: called with what is done from then on.
     """
     common = {**game_fields(game), **estimator_fields(estimator, game)}
     if stand_in is not None:
         common |= stand_in.code
     if label is not None:
         common |= {"estimator": label, "settings": {}}  # the label stands for the settings
-    plays = partial(play, game, estimator) if stand_in is None else partial(stand_in.play, game)
+    plays = partial(play, game, estimator, phase=phase)
+    if stand_in is not None:
+        plays = partial(stand_in.play, game)
     return score_episodes(common, plays, seeds, results, progress)
 
 

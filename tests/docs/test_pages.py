@@ -60,8 +60,8 @@ def test_everything_that_is_found_has_a_page(generated):
 
 
 def test_a_systems_page_is_the_commands_and_its_equations(generated):
-    _, texts = generated
-    text = texts["systems/InductionMotor.md"]
+    pages, texts = generated
+    text = pages.system_page(SYSTEMS.resolve("InductionMotor"))
     for part in page(SYSTEMS.resolve("InductionMotor"), "pinnobs/InductionMotor-v0").split("\n\n"):
         assert part.strip() in text
     assert r"\dot{\omega} &= - \frac{T_{L}}{J}" in text

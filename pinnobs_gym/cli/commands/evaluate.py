@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import LOG_OPTIONS, check_apart, parse, settings_of
 from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
@@ -19,6 +19,8 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS, policy_file
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.against import opponents
+from pinnobs_gym.leaderboard.published import manifest
+from pinnobs_gym.leaderboard.published.manifest import Manifest
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
 from pinnobs_gym.leaderboard.published.trained import load_published
 from pinnobs_gym.scoring.evaluation import (
@@ -160,7 +162,30 @@ class Evaluate:
         shipped = published_floors([game.name])  # reject what is damaged before anything is run
         check_writable(self.out)
         run: Any = partial(score, Results(rows_file(self.out), fresh=self.fresh))
-        report(game, with_progress(len(seeds), run), self.out, picture, others, shipped)
+        evaluated = with_progress(len(seeds), run, phases=not self.log)
+        report(game, evaluated, self.out, picture, others, shipped)
+        self._say_next(game)
+
+    def _say_next(self, game: AnyGame) -> None:
+        """Print the command to type next: the same against what is published, or all tables."""
+        published = Manifest.read(manifest.FOLDER)
+        entries = [] if published is None else published.rows
+        if self.against is not None or not any(entry.game == game.name for entry in entries):
+            print_next("tables", rows_file(self.out))
+            return
+        chosen = {
+            "--setup": (self.setup, "benchmark"),
+            "--condition": (self.condition, "nominal"),
+            "--trained": (self.trained, None),
+            "--normalization": (self.normalization, None),
+            "--out": (self.out, Evaluate.out),
+        }
+        words = [
+            word for name, (own, usual) in chosen.items() if own != usual for word in (name, own)
+        ]
+        words += ["--tuned"] * self.tuned + (["--set", *self.set] if self.set else [])
+        estimator = ["--estimator", self.estimator]
+        print_next("evaluate", "--system", self.system, *estimator, *words, "--against", PUBLISHED)
 
     def _trained(self, cls: type[BaseEstimator], game: AnyGame) -> BaseEstimator | None:
         """Return the trained estimator to score, None if it needs none."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pinnobs_gym.cli.board_report import report, say_outdated
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.run_view import Kind, RunView
 from pinnobs_gym.files import check_writable
@@ -121,6 +121,7 @@ class Leaderboard:
                 style="yellow",
                 soft_wrap=True,
             )
+        print_next("report", path, "-o", self.out / "site")
         return 1 if view.failed or left_out else 0
 
     def planned(self) -> list[Job]:
