@@ -34,6 +34,7 @@ def state_figure(
     y: np.ndarray | None = None,
     P: np.ndarray | None = None,
     title: str = "",
+    errors: bool = False,
 ) -> Figure:
     """Return a figure of estimates over time, with a panel per state.
 
@@ -49,8 +50,12 @@ def state_figure(
         y: outputs (num_samples, ny); those that directly measure a state are drawn as dots.
         P: covariances (num_samples, nx, nx), drawn as a band of two standard deviations.
         title: title of the figure.
+        errors: whether a last panel shows the error of each state over its scale, if x is known.
     """
-    figure, column = panels(system.nx, width=8, height=1.0 + 1.6 * system.nx)
+    rows = system.nx + errors
+    figure, column = panels(rows, width=8, height=1.0 + 1.6 * rows)
+    if errors and x is not None:
+        _draw_errors(column[-1, 0], system, t, system.state_residual(xhat, x))
     measured = measured_states(system)
     references = None
     if x is not None and np.isnan(x).any():
@@ -60,7 +65,8 @@ def state_figure(
     if x is not None:
         xhat = nearest(xhat, x, system.state_period)
     periods = system.state_period or [None] * system.nx
-    for i, (panel, name) in enumerate(zip(column[:, 0], system.state_names, strict=True)):
+    shown = column[: system.nx, 0]
+    for i, (panel, name) in enumerate(zip(shown, system.state_names, strict=True)):
         unit = system.units.get(name)
         panel.set_ylabel(plain(f"{name} ({unit})" if unit else name))
         if y is not None and i in measured:
@@ -94,6 +100,17 @@ def state_figure(
     column[0, 0].legend(loc="upper right", fontsize=8, ncols=3)
     column[-1, 0].set_xlabel(f"t ({system.time_unit})")
     return figure
+
+
+def _draw_errors(panel: Any, system: System, t: np.ndarray, error: np.ndarray) -> None:
+    """Draw the absolute errors (num_samples, nx) over the states' scales, logarithmically."""
+    scaled = abs(_drawable(error)) / np.asarray(system.scale, dtype=float)
+    for name, curve in zip(system.state_names, scaled.T, strict=True):
+        panel.plot(t, np.where(curve > 0, curve, np.nan), lw=1, label=plain(name))
+    panel.set_yscale("log")
+    panel.set_ylabel("|error| / scale")
+    panel.grid(alpha=0.3)
+    panel.legend(loc="upper right", fontsize=8, ncols=3)
 
 
 def plain(text: str) -> str:

@@ -48,6 +48,7 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.values import is_finite, shortly
 from pinnobs_gym.training.by_name import LOGS
 from pinnobs_gym.training.log import SILENT, Log
+from pinnobs_gym.training.progress import shown_progress
 
 BATCH = 256
 """Number of episodes run together."""
@@ -116,7 +117,7 @@ def evaluate(
     results: Path | str | None = None,
     fresh: bool = False,
     log: Log = SILENT,
-    progress: Callable[[int], None] | None = None,
+    progress: bool | Callable[[int], None] = False,
 ) -> Rows:
     """Score an estimator on the episodes of an env.
 
@@ -145,7 +146,8 @@ def evaluate(
             are written to a folder beside it.
         fresh: run all episodes, also those in ``results``, whose rows are replaced.
         log: TensorBoard log of scalars, figures and hyperparameters.
-        progress: called after each batch with its number of episodes.
+        progress: whether to show a progress bar in a terminal, or elsewhere a line now and then; or
+            a function, called after each batch with its number of episodes.
 
     Returns:
         The rows, in the order of seeds; a list of dicts with a method ``to_pandas``.
@@ -157,12 +159,37 @@ def evaluate(
     game = Game.of(env_id, setup, condition)
     made = make_estimator(estimator, game, options or {}, tuned)
     stored = None if results is None else Results(Path(results), fresh=fresh)
-    evaluated = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
+    play_all = partial(run_episodes, game, made, seeds_of(seed, episodes), stored)
+    evaluated = _with_progress(episodes, play_all, progress)
     if evaluated.reused:
         _LOGGER.warning(evaluated.reuse(Path(results or "")))
     log_episodes(log, evaluated.rows, evaluated.first_played)
     log_summary(log, evaluated.rows)
     return Rows(evaluated.rows)
+
+
+def _with_progress(
+    episodes: int, play_all: Callable[..., Evaluated], progress: bool | Callable[[int], None]
+) -> Evaluated:
+    """Return what ``play_all`` scores, with its progress shown if asked for."""
+    if not isinstance(progress, bool):
+        return play_all(progress)
+    if not progress:
+        return play_all()
+    with shown_progress() as show:
+        done, doing = 0, ""
+
+        def said(now: str) -> None:
+            nonlocal doing
+            doing = now
+            show(done / episodes, f"{done} of {episodes} episodes, {doing}")
+
+        def count(more: int) -> None:
+            nonlocal done
+            done += more
+            show(done / episodes, f"{done} of {episodes} episodes")
+
+        return play_all(count, phase=said)
 
 
 def seeds_of(seed: int, episodes: int) -> range:

@@ -14,6 +14,7 @@ from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, residual
+from pinnobs_gym.simulation.shown import call_of, html, summary_of
 from pinnobs_gym.simulation.start_law import Box, Gaussian, StartLaw, check_covariance
 from pinnobs_gym.simulation.values import (
     LARGEST,
@@ -294,6 +295,25 @@ class System(ABC):
         if self.state_low is None and self.state_high is None:
             return None
         return box(self.state_low, self.state_high, self.nx)
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__repr__" not in vars(cls):  # which a dataclass would write of all fields
+            cls.__repr__ = System.__repr__
+
+    def __repr__(self) -> str:
+        return call_of(self)
+
+    def _repr_html_(self) -> str:
+        scales = vector(self.scale, self.nx, "scale")
+        rows = [
+            *((name, "state", f"{s:g}") for name, s in zip(self.state_names, scales, strict=True)),
+            *((name, "output", "") for name in self.output_names),
+            *((name, "input", "") for name in self.input_names),
+        ]
+        with_units = [(name, kind, self.units.get(name, ""), scale) for name, kind, scale in rows]
+        header = ("name", "kind", "unit", "scale")
+        return html(repr(self), summary_of(type(self)), header, with_units)
 
     @abstractmethod
     def f(self, t: Array, x: Array, u: Array) -> Array:

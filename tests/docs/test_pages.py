@@ -1,5 +1,6 @@
 """The documentation: every page is there, links lead somewhere, and its code runs."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -172,6 +173,18 @@ def test_the_cells_of_a_guide_run_and_take_few_lines(path, tmp_path):
     assert any("assert" in text for text in own)  # that the estimates are right
     assert any('Image("estimates.png"' in text for text in own)
     assert len([line for text in own for line in text.splitlines() if line.strip()]) < 60
+
+
+def test_the_first_steps_run_and_are_stripped(tmp_path):
+    path = DOCS / "first_steps.ipynb"
+    printed = run_cells(path, tmp_path).splitlines()
+    ekf, mine = (float(line.split()[-1]) for line in printed[-2:])
+    assert ekf < mine < 0.2  # as the picture shows
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        assert cell["cell_type"] == "markdown" or not cell["outputs"]
+    links = re.findall(r"\]\(([^)]+)\)", path.read_text(encoding="utf-8"))
+    assert links
+    assert all((DOCS / link).is_file() for link in links)
 
 
 @pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.stem)
