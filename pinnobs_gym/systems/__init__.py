@@ -17,7 +17,7 @@ class Systems(Registry["System"]):
 
     def resolve(self, spec: str | type[System], near: type | None = None) -> type[System]:
         found = re.fullmatch(r"(?:pinnobs_gym:)?(?:pinnobs/)?(\w+)-v(\d+)", str(spec))
-        if found is None:
+        if found is None or found[1] not in {*self.sources, *self._known}:
             return super().resolve(spec, near)
         cls = super().resolve(found[1], near)
         if cls.version != int(found[2]):

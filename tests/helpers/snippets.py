@@ -31,8 +31,8 @@ def cells(path):
 def run_cells(path, folder):
     """Run a page's cells in one process, in which they share their names. Returns what they print.
 
-    Of the notations of notebooks, cells may have ``%%writefile name.py``, lines ``!pinnobs ...`` and
-    ``%matplotlib inline``, which says nothing here."""
+    Of the notations of notebooks, cells may have ``%%writefile name.py``, lines ``!pinnobs ...``
+    and ``%matplotlib inline``, which says nothing here."""
     parts = []
     for _, text in cells(path):
         first, _, rest = text.partition("\n")

@@ -62,7 +62,8 @@ class Leaderboard:
     """Time limit of each job in s of wall-clock time; a job that exceeds it is ended and has
     failed. If not given, two hours and four times the budget; none with 1 process."""
     backend: Literal["loky", "dask"] = "loky"
-    """Where jobs run: processes of this machine, or the workers of a Dask scheduler."""
+    """Where jobs run: processes of this machine, or the workers of a Dask scheduler, which needs
+    the extra "dask"."""
     scheduler: str | None = None
     """Address of the Dask scheduler, such as tcp://host:8786."""
     retry_failed: bool = False

@@ -20,7 +20,8 @@ from pinnobs_gym.scoring.rows import game_of
 
 @dataclass(frozen=True)
 class Report:
-    """Make a static page of scores that needs no server and no network."""
+    """Make a static page of scores that needs no server and no network. Needs the extra
+    "report"."""
 
     rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Rows files, such as runs/leaderboard/rows.jsonl; the curves in a folder "curves" beside each

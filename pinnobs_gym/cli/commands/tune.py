@@ -28,7 +28,7 @@ from pinnobs_gym.systems import SYSTEMS
 class Tune:
     """Search the settings of estimators on episodes that are never scored. What is searched for is
     the least geometric mean of the steady and the transient NRMSE. Trials are stored, and an
-    interrupted search continues."""
+    interrupted search continues. Needs the extra "tune"."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Names or module:Class of the estimators."""
