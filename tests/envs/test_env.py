@@ -74,7 +74,13 @@ def test_gymnasiums_checker_passes_without_a_display(monkeypatch: pytest.MonkeyP
     assert make(DUFFING).unwrapped.metadata["render_modes"] == ["human", "rgb_array"]
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name == "ReverseDuffing" else pytest.param(name, marks=pytest.mark.slow)
+        for name in IDS
+    ],
+)
 def test_the_reward_threshold_is_the_mean_return_of_the_ukf(name: str) -> None:
     """By the env's own reward, in the episodes of seeds 0 to 99 of the vectorised env."""
     envs = make_vec(IDS[name], 100)
