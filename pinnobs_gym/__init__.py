@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from pinnobs_gym.envs.registration import register_envs, register_system
 
 if TYPE_CHECKING:
-    from pinnobs_gym.estimation.estimator import Estimator, State
+    from pinnobs_gym.envs.simulated import plot, simulate
+    from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
     from pinnobs_gym.estimation.live import Live
     from pinnobs_gym.leaderboard.published.trained import load
     from pinnobs_gym.scoring.evaluation import evaluate
@@ -20,12 +21,16 @@ if TYPE_CHECKING:
     from pinnobs_gym.scoring.table import read_rows
     from pinnobs_gym.simulation.augmented import augmented
     from pinnobs_gym.simulation.augmented_system import Unknown
+    from pinnobs_gym.simulation.record import Prior, Record
     from pinnobs_gym.simulation.system import Setup, System, independent, stack
     from pinnobs_gym.simulation.table import table
 
 __all__ = [
+    "Estimates",
     "Estimator",
     "Live",
+    "Prior",
+    "Record",
     "Setup",
     "State",
     "System",
@@ -36,8 +41,10 @@ __all__ = [
     "evaluate_logs",
     "independent",
     "load",
+    "plot",
     "read_rows",
     "register",
+    "simulate",
     "stack",
     "table",
 ]
@@ -46,9 +53,14 @@ __version__: str
 """Version of the installed package."""
 
 _HOMES = {
+    "Estimates": "estimation.estimator",
     "Estimator": "estimation.estimator",
     "State": "estimation.estimator",
     "Live": "estimation.live",
+    "Prior": "simulation.record",
+    "Record": "simulation.record",
+    "plot": "envs.simulated",
+    "simulate": "envs.simulated",
     "Setup": "simulation.system",
     "System": "simulation.system",
     "independent": "simulation.system",

@@ -6,6 +6,7 @@ Resolving a name imports only the file that defines it. Listing all classes impo
 from __future__ import annotations
 
 import ast
+import difflib
 import importlib
 import importlib.util
 import inspect
@@ -14,7 +15,7 @@ import pkgutil
 import struct
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -150,7 +151,8 @@ class Registry(Generic[T]):
                     f"unknown {self._kind} {spec!r}; there is none in {place}, which is imported "
                     f"as {self._package}"
                 )
-            raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}")
+            guess = did_you_mean(spec, {*self._known, *self.sources})
+            raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}{guess}")
         return self._known[spec]
 
     def beside(self, cls: type) -> dict[str, type[T]]:
@@ -272,6 +274,14 @@ def discard_stale_bytecode(source: Path) -> bool:
     return True
 
 
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return the known name that an unknown one is most like, as the end of a message; empty if it
+    is like none."""
+    by_letters = {each.casefold(): each for each in known}
+    near = difflib.get_close_matches(str(name).casefold(), by_letters, n=1, cutoff=0.7)
+    return "".join(f"; did you mean {by_letters[each]!r}?" for each in near)
+
+
 def error_line(error: BaseException) -> str:
     """Return the kind and the text of an error in one line of at most 1000 printable characters.
 
@@ -341,8 +351,10 @@ def _constants(node: ast.ClassDef) -> dict[str, Any]:
     constants = {}
     for statement in node.body:
         if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            value = statement.value
-            constant = value.value if isinstance(value, ast.Constant) else None
+            try:
+                constant = ast.literal_eval(statement.value)
+            except ValueError:
+                constant = None
             constants[statement.targets[0].id] = constant
     return constants
 

@@ -1,12 +1,13 @@
-"""Update the README's picture and table, and the tables of docs/results.md, from stored scores.
+"""Update the README's pictures, and the tables of docs/results.md, from stored scores.
 
     python scripts/readme.py [--rows-file published]
         [--conditions-file runs/conditions/rows.jsonl]
         [--paper-file runs/paper/results.jsonl] [--comparison-file runs/paper/comparison.md]
         [--figures docs/figures]
 
-The leaderboard, of the published rows, goes to the README, the other tables to docs/results.md, and
-all measured figures to docs/benchmarks.md. Sections without stored scores are left unchanged.
+The leaderboard, of the published rows, goes to the README as a picture and to docs/results.md as
+tables, the other tables to docs/results.md, and all measured figures to docs/benchmarks.md.
+Sections without stored scores are left unchanged.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from pathlib import Path
 import measured
 import tyro
 from machine import processor
+from matplotlib.figure import Figure
 from reproduction import report as paper
 from reproduction.tables import TABLES
 
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.envs.episodes import EpisodeSource
-from pinnobs_gym.envs.figures import state_figure
+from pinnobs_gym.envs.figures import ESTIMATE, TRUE, plain, state_figure
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.files import replacing
 from pinnobs_gym.leaderboard import ranks_table
-from pinnobs_gym.leaderboard.board import board
+from pinnobs_gym.leaderboard.board import Board, Part, board
 from pinnobs_gym.leaderboard.chapters import chapters
 from pinnobs_gym.leaderboard.grid import text_table
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, load_rows
@@ -57,19 +59,57 @@ def picture(path: Path, seed: int = 3) -> None:
     write_figure(path, figure)
 
 
-def summary(scored: list[rows.Row]) -> str:
-    """Return the tables of estimators across the systems: of those that are made before any record
-    is seen, and of those that are trained on each."""
+def leaderboard_picture(path: Path, part: Part) -> None:
+    """Draw the factor of each estimator to the peer in the steady window, with its interval and
+    rank, those that see the whole record first below the others."""
+    shown = [line for line in part.lines if "steady" in line.places]
+    height, largest = 1.0 + 0.22 * len(shown), 30.0
+    figure = Figure(figsize=(9, height))
+    panel = figure.add_axes((0.36, 0.5 / height, 0.61, 1 - 0.85 / height))
+    for y, line in enumerate(shown):
+        place = line.places["steady"]
+        low, value, high = (
+            min(each, largest) for each in (place.factor.low, place.factor.value, place.factor.high)
+        )
+        colour = ESTIMATE if line.track == "online" else "#4a6fa5"
+        panel.plot([low, high], [y, y], color=colour, lw=2, alpha=0.5)
+        panel.plot(value, y, ">" if place.factor.value > largest else "o", color=colour, ms=5)
+    ranks = [line.places["steady"].rank for line in shown]
+    names = [
+        f"{plain(line.estimator)}  {'–' if rank is None else rank}"
+        for line, rank in zip(shown, ranks, strict=True)
+    ]
+    panel.set_yticks(range(len(shown)), names, fontsize=8)
+    panel.set_ylim(len(shown) - 0.4, -0.6)
+    panel.set_xscale("log")
+    panel.axvline(1.0, color=TRUE, lw=0.8)
+    panel.grid(axis="x", alpha=0.3, which="both")
+    panel.set_xlabel(f"steady error over that of {plain(part.places.peer)}, 95 % interval")
+    panel.set_title(
+        f"Rank and error over {len(shown[0].games)} systems (blue: see the whole record; "
+        f"▸: beyond {largest:g})",
+        fontsize=10,
+    )
+    write_figure(path, figure)
+
+
+def measured_on(scored: list[rows.Row]) -> str:
+    """Return when and how the leaderboard was measured."""
     dates = sorted(row["date"][:10] for row in scored)
     seeds = {row["training_seed"] for row in scored if not row["training"].get("per_record")}
     trainings = len(seeds - {None})
-    intro = (
+    return (
         f"Measured on {dates[-1]} with Python {platform.python_version()}, one thread a job "
         f"({processor()}), {trainings} trainings of each estimator that is trained before. "
         "`pinnobs tables published` prints the details of each system."
     )
-    parts = [intro]
-    for chapter in chapters(board(rows.Stored(scored, []))):
+
+
+def summary(scored: list[rows.Row], found: Board) -> str:
+    """Return the tables of estimators across the systems: of those that are made before any record
+    is seen, and of those that are trained on each."""
+    parts = [measured_on(scored)]
+    for chapter in chapters(found):
         if chapter.key.endswith("overview"):
             grid = chapter.tables[0][0][0]
             parts += [chapter.note, text_table(grid.header, grid.lines)]
@@ -135,10 +175,15 @@ def main(
             file=sys.stderr,
         )
         return 2
+    tables = ""
     if scored:
+        found_board = board(rows.Stored(scored, []))
         picture(ROOT / "docs" / "reverse_duffing.png")
-        _rewrite(ROOT / "README.md", {"leaderboard": summary(scored)})
+        leaderboard_picture(ROOT / "docs" / "leaderboard.png", found_board.main)
+        _rewrite(ROOT / "README.md", {"leaderboard": measured_on(scored)})
+        tables = summary(scored, found_board)
     sections = {
+        "leaderboard": tables,
         "conditions": under_conditions(everywhere) if everywhere else "",
         "paper": section,
         "comparison": compared.partition("\n\n")[2].strip(),  # under the page's own heading

@@ -6,9 +6,11 @@ import ast
 import importlib
 import os
 import pkgutil
+import platform
 import sys
 from collections.abc import Callable, Sequence
 from importlib import resources
+from importlib.metadata import version
 from typing import NoReturn
 
 from pinnobs_gym.cli import commands
@@ -16,12 +18,20 @@ from pinnobs_gym.cli.ending import end
 from pinnobs_gym.cli.streams import print_anything, until_pipe_closes
 from pinnobs_gym.leaderboard.display import one_line, show_messages_printable, words_of
 from pinnobs_gym.leaderboard.jobs.stopping import Stopped, stop_line
-from pinnobs_gym.registry import error_line
+from pinnobs_gym.registry import did_you_mean, error_line
 
 COMMANDS = sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 """Names of the commands."""
 _NO_MEMORY = "can't allocate memory", "CUDA out of memory"
 """What torch says if there is not enough, as a RuntimeError."""
+
+
+EXTRAS = (
+    'Extras, as in pip install "pinnobs-gym[report]": report (pinnobs report), tune (pinnobs '
+    "tune), video (evaluate --video), parquet (episodes --format parquet), dask (leaderboard "
+    "--backend dask), lmi (luenberger by an LMI), rl (recurrent agents)."
+)
+"""What the extras of the package are for."""
 
 
 class HelpShown(SystemExit):
@@ -30,7 +40,7 @@ class HelpShown(SystemExit):
 
 def usage() -> str:
     """Return the help text, with one line per command from the first line of its module."""
-    lines = ["usage: pinnobs COMMAND ...", ""]
+    lines = ["usage: pinnobs COMMAND ... | --version", ""]
     for name in COMMANDS:
         source = resources.files(commands).joinpath(f"{name}.py").read_text(encoding="utf-8")
         docstring = ast.get_docstring(ast.parse(source)) or name  # importing the module is slow
@@ -40,9 +50,12 @@ def usage() -> str:
         [
             *lines,
             "",
-            "pinnobs COMMAND --help says more. A system, estimator or trainer of your own is given "
-            "as module:Class.",
+            "pinnobs COMMAND --help says more. A system is given by its name or env id; one of "
+            "your own, as an estimator or a trainer, by module:Class.",
+            EXTRAS,
             "With PINNOBS_TRACEBACK=1 in the environment an error shows where it came from.",
+            "",
+            "next: pinnobs evaluate --system ReverseDuffing",
         ]
     )
 
@@ -52,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     error occurred, 2 for invalid input, 130 after Ctrl-C, 141 if the reader of its output left, 143
     after SIGTERM."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments and arguments[0] in ("-V", "--version"):
+        print(f"pinnobs-gym {version('pinnobs-gym')}, Python {platform.python_version()}")
+        return 0
     if not arguments or arguments[0] in ("-h", "--help"):
         print_anything()
         return until_pipe_closes(lambda: _help(0 if arguments else 2))
@@ -71,7 +87,8 @@ def _help(status: int) -> int:
 
 def _run(name: str, arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
-        raise ValueError(f"unknown command {name!r}; known are {', '.join(COMMANDS)}")
+        guess = did_you_mean(name, COMMANDS)
+        raise ValueError(f"unknown command {name!r}; known are {', '.join(COMMANDS)}{guess}")
     return importlib.import_module(f"{commands.__name__}.{name}").run(arguments)
 
 

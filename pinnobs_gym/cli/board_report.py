@@ -9,7 +9,6 @@ from pinnobs_gym.cli.console import console, print_table
 from pinnobs_gym.files import replacing
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.chapters import chapters, markdown
-from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.scoring.rows import Row, Stored
 
 
@@ -49,11 +48,6 @@ def report(stored: Stored, shipped: Sequence[Row], conditions: set[str], out: Pa
     ):
         if where.exists():
             console.print(f"{what + ':':14} {where}", soft_wrap=True)
-    console.print(
-        f"to make a page: pinnobs report {quoted(str(out / 'rows.jsonl'))} "
-        f"-o {quoted(str(out / 'site'))}",
-        soft_wrap=True,
-    )
 
 
 def say_outdated(outdated: Mapping[str, Sequence[str]]) -> None:

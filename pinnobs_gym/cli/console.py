@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,7 +19,9 @@ from rich.progress import (
 from rich.segment import Segment
 
 from pinnobs_gym.leaderboard.display import printable_lines
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.grid import PROSE, Layouts, fitting
+from pinnobs_gym.training.progress import in_terminal
 
 
 class PrintableConsole(Console):
@@ -40,18 +43,31 @@ class PrintableConsole(Console):
 
 
 _PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
-console = PrintableConsole(**_PLAIN, width=None if Console().is_terminal else PROSE)
+console = (
+    PrintableConsole(**_PLAIN)
+    if in_terminal()
+    else PrintableConsole(**_PLAIN, force_terminal=False, width=PROSE)
+)
 """The console for all output. Names are data: brackets and colons in them are printed as they
 are."""
 
 
 def table_width() -> int | None:
     """Return the width of tables: that of the terminal; elsewhere the environment variable COLUMNS
-    or, without it, None: a pipe or a file gets all columns, as ``less -S`` can show them."""
+    or, without it, None: a pipe or a file gets all columns, as ``less -S`` can show them. The
+    output of a notebook's cell is a terminal only to the command, and has `PROSE` columns."""
     if console.is_terminal:
         return console.width
+    if sys.stdout is not None and sys.stdout.isatty():
+        return PROSE
     given = os.environ.get("COLUMNS", "")
     return int(given) if given.isdecimal() and int(given) else None
+
+
+def print_next(*words: object) -> None:
+    """Print the command to type next, given its words after ``pinnobs``."""
+    line = " ".join(quoted(str(word)) for word in words)
+    console.print(f"next: pinnobs {line}", soft_wrap=True, highlight=False)
 
 
 def print_table(layouts: Layouts, hint: str = "") -> None:

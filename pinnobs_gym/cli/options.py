@@ -21,6 +21,7 @@ from pinnobs_gym.cli import HelpShown
 from pinnobs_gym.cli.numbers import NUMBERS
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimation.hints import field_hints, fits, in_words
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.values import shortly
 
 T = TypeVar("T")
@@ -52,6 +53,12 @@ def parse(kind: type[T], command: str, arguments: Sequence[str], **options: Any)
         if not end.code:
             raise HelpShown(0) from None
     message = _first_of(errors.getvalue()).removeprefix("Error parsing config: ")
+    known = {*_options(kind), "--help"}
+    for option, _ in by_option(arguments):
+        once = option.replace("--no-", "--", 1)
+        if once.startswith("--") and once not in known:
+            message = f"unknown option {option}{did_you_mean(option, known)}"
+            break
     raise ValueError(f"{message}; see pinnobs {command} --help") from None
 
 
@@ -119,15 +126,23 @@ def _joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
 
 def _lists(kind: Any) -> set[str]:
     """Return the options of a dataclass of options that take several values."""
-    found: set[str] = set()
+    return {
+        option
+        for option, hint in _options(kind).items()
+        if any(tuple in (each, get_origin(each)) for each in (hint, *get_args(hint)))
+    }
+
+
+def _options(kind: Any) -> dict[str, Any]:
+    """Return the options of a dataclass of options, with the types of their values."""
+    found: dict[str, Any] = {}
     made = get_origin(kind) or kind  # a generic class, or the class itself
     parameters = dict(zip(getattr(made, "__parameters__", ()), get_args(kind), strict=False))
     for name, hint in field_hints(made).items():
         within = parameters.get(hint, hint)
-        if is_dataclass(within):
-            found |= _lists(within)
-        elif any(tuple in (each, get_origin(each)) for each in (within, *get_args(within))):
-            found.add("--" + name.replace("_", "-"))
+        found |= (
+            _options(within) if is_dataclass(within) else {"--" + name.replace("_", "-"): within}
+        )
     return found
 
 
@@ -169,6 +184,7 @@ def settings_of(cls: type[BaseEstimator], settings: Sequence[str]) -> dict[str, 
             listed = ", ".join(sorted([*own, *nested])) or "none"
             raise ValueError(
                 f"setting {shortly(setting)}; expected name=value with a name of: {listed}"
+                f"{did_you_mean(name, [*own, *nested])}"
             )
         value = _parsed(name, text, hint)
         if name in values and value != values[name]:

@@ -27,17 +27,23 @@ def rows_file(out: Path) -> Path:
     return out / "rows.jsonl"
 
 
-def with_progress(episodes: int, score: Callable[[Callable[[int], None]], Evaluated]) -> Evaluated:
+def with_progress(
+    episodes: int, score: Callable[..., Evaluated], phases: bool = False
+) -> Evaluated:
     """Return the result of ``score``, which is given a function to call after each batch with its
-    number of episodes, and show a progress bar meanwhile."""
+    number of episodes, and show a progress bar meanwhile. If it has phases, its argument ``phase``
+    is a function to call with what it does."""
     with progress() as bar:
         task = bar.add_task("episodes", total=episodes)
 
         def count(done: int) -> None:
             bar.advance(task, done)
 
-        evaluated = score(count)
-        bar.update(task, completed=episodes)
+        def phase(doing: str) -> None:
+            bar.update(task, description=f"episodes: {doing}")
+
+        evaluated = score(count, phase=phase) if phases else score(count)
+        bar.update(task, completed=episodes, description="episodes")
     return evaluated
 
 

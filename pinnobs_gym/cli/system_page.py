@@ -10,6 +10,7 @@ from typing import Any
 
 from docstring_parser import parse_from_object
 
+from pinnobs_gym.cli.agent_section import for_agents
 from pinnobs_gym.cli.told_section import compiled, jacobians, told
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
 from pinnobs_gym.leaderboard.grid import markdown_table
@@ -46,7 +47,9 @@ def page(cls: type[System], env_id: str) -> str:
         *repeating(system, system.state_names, system.state_period),
         *bounded(system),
         "\n## Observation Space\n",
-        f"`Box(({system.ny + system.nu + 1},), float32)`: the outputs, the inputs, then time.\n",
+        f"`Box(({system.ny + system.nu + 1},), float32)`: the outputs, the inputs, then time. "
+        "Under a condition that loses outputs, the latest present value stands for a missing one, "
+        "and a mask follows the outputs: 1 for present, 0 for missing.\n",
         _table(
             ("", "name", "unit"),
             [
@@ -64,14 +67,17 @@ def page(cls: type[System], env_id: str) -> str:
         "\n## Reward\n",
         "−mean(((x̂ − x)/scale)²) of the true state behind the observation that the action answers; "
         f"{NOT_FINITE_REWARD:g} for an action that is not finite.\n",
-        "## Starting State\n",
+        "## For Agents\n",
+        for_agents(cls, env_id),
+        "\n## Starting State\n",
         _setups(cls),
         "\n## Episode End\n",
         f"Truncated after {number_of_actions} in the `benchmark` setup; terminated only by an "
         "action that is not finite.\n",
         "## Arguments\n",
-        f'`gym.make("{env_id}", setup="benchmark", condition="nominal", dt=None, duration=None, '
-        "noise_std=None, parameters=None, render_mode=None)`. Reset options: `x0`, `xhat0`. "
+        f'`gym.make("{env_id}", setup="benchmark", condition="nominal", action_mode="estimate", '
+        'reward="error", stack_outputs=1, dt=None, duration=None, noise_std=None, '
+        "parameters=None, render_mode=None)`. Reset options: `x0`, `xhat0`. "
         "Parameters:\n",
         _parameters(cls),
         "\n## Conditions\n",

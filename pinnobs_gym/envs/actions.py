@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 from pinnobs_gym.estimation.gaussian import GaussianEstimator
 from pinnobs_gym.estimation.kalman import joseph_update, predict
 from pinnobs_gym.estimation.least_squares import root
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.model import model_step
@@ -47,7 +48,10 @@ class AgentMemory:
     u: np.ndarray
     """Inputs at the last samples, shape (batch, nu)."""
     y: np.ndarray
-    """The last outputs, newest first, shape (batch, stack, ny); NaN before the first."""
+    """The last outputs, newest first, shape (batch, stack, ny); NaN where they are missing and
+    before the first."""
+    held: np.ndarray
+    """The same with the latest present output in place of missing ones; zero before the first."""
     surprise: np.ndarray
     """Innovations over their typical standard deviation, shape (batch, ny); zero where y is
     missing."""
@@ -72,22 +76,23 @@ class Form(ABC):
         system: the model.
         setup: defines the length of episodes, the prior and the noise.
         stack: number of the last outputs in the features.
+        mask: whether features that hold outputs also say which of them are present.
     """
 
     name: ClassVar[str]
     action_space: Box
     """The action space of one episode."""
 
-    def __init__(self, system: System, setup: Setup, stack: int = 1) -> None:
+    def __init__(self, system: System, setup: Setup, stack: int = 1, mask: bool = False) -> None:
         if not is_whole(stack, 1):
             raise ValueError(f"stack={shortly(stack)}; expected a whole number of at least 1")
-        self.system, self.setup, self.stack = system, setup, int(stack)
+        self.system, self.setup, self.stack, self.mask = system, setup, int(stack), mask
         self.scale = vector(system.scale, system.nx, "scale")
         bound = system.state_bound or tuple(10 * s for s in system.scale)
         self.bound = np.asarray(bound, dtype=float)
         self.duration = float(setup.times[-1])
         self.prepare()
-        self.observation_space = _features_box(self.num_features)
+        self.observation_space = self.features_space()
 
     @abstractmethod
     def prepare(self) -> None:
@@ -102,6 +107,13 @@ class Form(ABC):
     def num_features(self) -> int:
         """Number of features; the last one is a time from 0 to 1."""
 
+    def features_space(self) -> Box:
+        """Return the space of the features of one episode."""
+        high = np.full(self.num_features, np.inf, np.float32)
+        low = -high
+        low[-1], high[-1] = 0, 1
+        return Box(low, high)
+
     def begin(self, mean: np.ndarray, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         """Return the memory before the first samples.
 
@@ -111,7 +123,7 @@ class Form(ABC):
             u: inputs at these times, shape (batch, nu).
         """
         y = np.full((len(mean), self.stack, self.system.ny), np.nan)
-        return AgentMemory(np.asarray(mean, dtype=float), t, t, u, y, y[:, 0])
+        return AgentMemory(np.asarray(mean, dtype=float), t, t, u, y, np.zeros_like(y), y[:, 0])
 
     def observe(
         self, memory: AgentMemory, t: np.ndarray, y: np.ndarray, u: np.ndarray
@@ -124,8 +136,10 @@ class Form(ABC):
             y: outputs, shape (batch, ny); NaN marks a missing output.
             u: inputs, shape (batch, nu).
         """
-        outputs = np.concatenate([y[:, None], memory.y[:, :-1]], axis=1)
-        memory = self.predict(replace(memory, y=outputs), t, u)
+        latest = np.where(np.isnan(y), memory.held[:, 0], y)
+        pairs = ((y, memory.y), (latest, memory.held))
+        outputs, held = (np.concatenate([new[:, None], old[:, :-1]], axis=1) for new, old in pairs)
+        memory = self.predict(replace(memory, y=outputs, held=held), t, u)
         memory = replace(memory, t=t, u=u)
         return self.features(memory), memory
 
@@ -162,26 +176,34 @@ class Form(ABC):
 
 class EstimateForm(Form):
     """Base class of forms whose action is an estimate. Features are the last outputs, newest first,
-    then u and t/T; the model is not used."""
+    then with ``mask`` a 1 for each of them that is present and a 0 for one that is missing, then u
+    and t/T. In place of a missing output is the latest present one, zero before the first. The
+    model is not used."""
 
     @property
     def num_features(self) -> int:
-        return self.stack * self.system.ny + self.system.nu + 1
+        return (1 + self.mask) * self.stack * self.system.ny + self.system.nu + 1
+
+    def features_space(self) -> Box:
+        space, outputs = super().features_space(), self.stack * self.system.ny
+        if not self.mask:
+            return space
+        low, high = space.low.copy(), space.high.copy()
+        low[outputs : 2 * outputs], high[outputs : 2 * outputs] = 0, 1
+        return Box(low, high)
 
     def predict(self, memory: AgentMemory, t: np.ndarray, u: np.ndarray) -> AgentMemory:
         return memory
 
-    def outputs_and_time(self, memory: AgentMemory) -> np.ndarray:
-        """Return the last outputs, newest first, with zeros before the first; then u and t/T."""
-        y = memory.y
-        if self.stack > 1:
-            y = np.concatenate([y[:, :1], np.nan_to_num(y[:, 1:])], axis=1)
+    def features(self, memory: AgentMemory) -> np.ndarray:
+        parts = [memory.held, ~np.isnan(memory.y)] if self.mask else [memory.held]
         time = (memory.t - memory.start) / self.duration
-        return np.concatenate([y.reshape(len(y), -1), memory.u, time[:, None]], axis=1)
+        outputs = [part.reshape(len(time), -1) for part in parts]
+        return np.concatenate([*outputs, memory.u, time[:, None]], axis=1)
 
 
 class Estimate(EstimateForm):
-    """The action is x̂ in physical units; the features are y, u and t/T, as in the env."""
+    """The action is x̂ in physical units."""
 
     name = "estimate"
 
@@ -189,25 +211,17 @@ class Estimate(EstimateForm):
         largest = self.bound.astype(np.float32)
         self.action_space = Box(-largest, largest)
 
-    def features(self, memory: AgentMemory) -> np.ndarray:
-        return self.outputs_and_time(memory)
-
     def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         return replace(memory, xhat=self.checked(actions))
 
 
 class Normalized(EstimateForm):
-    """The action is x̂ over the bounds of the states. Features are zero where an output is missing,
-    since networks cannot process NaN."""
+    """The action is x̂ over the bounds of the states."""
 
     name = "normalized"
 
     def prepare(self) -> None:
         self.action_space = _unit_box(self.system.nx)
-
-    def features(self, memory: AgentMemory) -> np.ndarray:
-        features = self.outputs_and_time(memory)
-        return np.where(np.isnan(features), 0.0, features)
 
     def act(self, memory: AgentMemory, actions: np.ndarray) -> AgentMemory:
         return replace(memory, xhat=self.bound * self.checked(actions))
@@ -217,8 +231,9 @@ class PredictionForm(Form):
     """Base class of forms whose action corrects the model's prediction x̂⁻ by a fraction of the
     typical error σ(k), a fixed schedule common to all episodes (`typical`).
 
-    Features: asinh of the innovation over √S, x̂⁻ over its scale, u over its largest value, and
-    log(1 + k)/log(1 + N), with k the index of the sample and N that of the last sample.
+    Features: asinh of the innovation over √S, zero where the output is missing, x̂⁻ over its scale,
+    u over its largest value, and log(1 + k)/log(1 + N), with k the index of the sample and N that
+    of the last sample.
     """
 
     def prepare(self) -> None:
@@ -329,8 +344,10 @@ FORMS: dict[str, type[Form]] = {f.name: f for f in (Estimate, Normalized, Gain, 
 """The forms by their ``action_mode``."""
 
 
-def form_of(action_mode: str, system: System, setup: Setup, stack: int = 1) -> Form:
-    """Return the form of that name.
+def form_of(
+    action_mode: str, system: System, setup: Setup, stack: int = 1, mask: bool = False
+) -> Form:
+    """Return the form of that name; see `Form`.
 
     Raises:
         ValueError: listing the known names, if it is unknown.
@@ -338,8 +355,9 @@ def form_of(action_mode: str, system: System, setup: Setup, stack: int = 1) -> F
     if not isinstance(action_mode, str) or action_mode not in FORMS:
         raise ValueError(
             f"unknown action_mode {shortly(action_mode)}; known are {', '.join(FORMS)}"
+            f"{did_you_mean(action_mode, FORMS)}"
         )
-    return FORMS[action_mode](system, setup, stack)
+    return FORMS[action_mode](system, setup, stack, mask)
 
 
 def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
@@ -382,9 +400,3 @@ def typical(system: System, setup: Setup) -> tuple[np.ndarray, np.ndarray]:
 def _unit_box(size: int) -> Box:
     """Return a box of numbers from −1 to 1."""
     return Box(-1.0, 1.0, (size,), np.float32)
-
-
-def _features_box(size: int) -> Box:
-    low, high = np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32)
-    low[-1], high[-1] = 0, 1
-    return Box(low, high)

@@ -27,15 +27,16 @@ class AgentSide:
                 f"stack_outputs={shortly(stack)}; expected a whole number from 1 to {samples}, the "
                 "samples of an episode"
             )
-        self.form: Form = form_of(action_mode, source.system, source.setup, stack)
+        mask = source.condition.loses_outputs
+        self.form: Form = form_of(action_mode, source.system, source.setup, stack, mask)
         if reward not in ("error", "improvement"):
             raise ValueError(f"reward={shortly(reward)}; expected 'error' or 'improvement'")
         shape = self.form.action_space.shape
         assert shape is not None
         self.action_shape: tuple[int, ...] = shape
         """Shape of an action."""
-        self.plain = action_mode == "estimate" and stack == 1 and reward == "error"
-        """Whether actions and observations are the env's own."""
+        self.plain = action_mode == "estimate" and stack == 1 and reward == "error" and not mask
+        """Whether actions and observations are those of `Episodes`, without a form between."""
         self.improves = reward == "improvement"
         if self.improves and not isinstance(self.form, PredictionForm):
             raise ValueError(f"reward='improvement' needs a prediction; {action_mode!r} has none")
@@ -49,7 +50,7 @@ class AgentSide:
 
         Args:
             mean: prior means, shape (batch, nx).
-            samples: the env's own observations, shape (batch, ny + nu + 1).
+            samples: rows of `Episodes.observations`, shape (batch, ny + nu + 1).
             k: indices of the samples, shape (batch,).
             rows: the rows that are reset; the observations of the others do not change.
         """

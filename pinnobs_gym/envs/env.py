@@ -23,7 +23,7 @@ from pinnobs_gym.envs.arguments import (
 )
 from pinnobs_gym.envs.episode_buffer import EpisodeBuffer
 from pinnobs_gym.envs.episodes import Changes, EpisodeSource, Stream
-from pinnobs_gym.envs.figures import EpisodePicture
+from pinnobs_gym.envs.figures import EpisodePicture, Metadata
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.values import check_seed
 
@@ -36,6 +36,10 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
     estimate never acts on the plant. Actions are scored unclipped. An action that is not finite
     ends the episode with `NOT_FINITE_REWARD`; otherwise only the time limit ends it. The
     observation after the last action is never scored.
+
+    An observation is the outputs, the inputs and t/T. Under a condition that loses outputs, the
+    latest present value stands for a missing output (zero before the first), and a mask follows
+    the outputs: 1 for each that is present, 0 for each that is missing.
 
     For learning agents, ``action_mode`` selects other actions and observations;
     `pinnobs_gym.envs.actions` has the forms. The estimate is then computed from the action by the
@@ -59,7 +63,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
     observation, for scoring only, and after a reset ``xhat0`` and ``P0``, the prior.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+    metadata = Metadata()  # pyright: ignore[reportAssignmentType]
 
     def __init__(
         self,
@@ -73,7 +77,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
-        check_render_mode(render_mode, self.metadata["render_modes"])
+        check_render_mode(render_mode, type(self).metadata["render_modes"])
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)
         self.agent = AgentSide(self.source, action_mode, reward, stack_outputs)

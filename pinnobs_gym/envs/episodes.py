@@ -77,7 +77,8 @@ class Episodes:
     u: np.ndarray
     """Inputs, shape (num_steps + 1, batch, nu)."""
     observations: np.ndarray
-    """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1)."""
+    """y, u and t/T in single precision, shape (num_steps + 1, batch, ny + nu + 1); NaN marks a
+    missing output."""
 
 
 class EpisodeSource:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +19,8 @@ TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#9bb7d4"
 """Colours of true states, estimates and measured outputs."""
 _ROUNDING = 1e-9
 """Largest difference, over its period, of an angle and an output that measures it."""
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND")
+"""Environment variables of which one is set on Linux where a window can be shown."""
 _LARGEST = 1e100
 """Largest absolute value that is drawn, since an axis cannot span all numbers."""
 
@@ -30,6 +34,7 @@ def state_figure(
     y: np.ndarray | None = None,
     P: np.ndarray | None = None,
     title: str = "",
+    errors: bool = False,
 ) -> Figure:
     """Return a figure of estimates over time, with a panel per state.
 
@@ -45,8 +50,12 @@ def state_figure(
         y: outputs (num_samples, ny); those that directly measure a state are drawn as dots.
         P: covariances (num_samples, nx, nx), drawn as a band of two standard deviations.
         title: title of the figure.
+        errors: whether a last panel shows the error of each state over its scale, if x is known.
     """
-    figure, column = panels(system.nx, width=8, height=1.0 + 1.6 * system.nx)
+    rows = system.nx + errors
+    figure, column = panels(rows, width=8, height=1.0 + 1.6 * rows)
+    if errors and x is not None:
+        _draw_errors(column[-1, 0], system, t, system.state_residual(xhat, x))
     measured = measured_states(system)
     references = None
     if x is not None and np.isnan(x).any():
@@ -56,7 +65,8 @@ def state_figure(
     if x is not None:
         xhat = nearest(xhat, x, system.state_period)
     periods = system.state_period or [None] * system.nx
-    for i, (panel, name) in enumerate(zip(column[:, 0], system.state_names, strict=True)):
+    shown = column[: system.nx, 0]
+    for i, (panel, name) in enumerate(zip(shown, system.state_names, strict=True)):
         unit = system.units.get(name)
         panel.set_ylabel(plain(f"{name} ({unit})" if unit else name))
         if y is not None and i in measured:
@@ -90,6 +100,17 @@ def state_figure(
     column[0, 0].legend(loc="upper right", fontsize=8, ncols=3)
     column[-1, 0].set_xlabel(f"t ({system.time_unit})")
     return figure
+
+
+def _draw_errors(panel: Any, system: System, t: np.ndarray, error: np.ndarray) -> None:
+    """Draw the absolute errors (num_samples, nx) over the states' scales, logarithmically."""
+    scaled = abs(_drawable(error)) / np.asarray(system.scale, dtype=float)
+    for name, curve in zip(system.state_names, scaled.T, strict=True):
+        panel.plot(t, np.where(curve > 0, curve, np.nan), lw=1, label=plain(name))
+    panel.set_yscale("log")
+    panel.set_ylabel("|error| / scale")
+    panel.grid(alpha=0.3)
+    panel.legend(loc="upper right", fontsize=8, ncols=3)
 
 
 def plain(text: str) -> str:
@@ -169,6 +190,19 @@ def _limits(values: np.ndarray, scale: float) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
     margin = 0.1 * (high - low) + 0.15 * scale
     return low - margin, high + margin
+
+
+class Metadata:
+    """The ``metadata`` of a single env. Where there is no display, that of an instance leaves out
+    the mode ``human``, so that whoever tries all modes, as Gymnasium's checker does, does not try
+    this one; asked for by name, it says what is missing."""
+
+    def __get__(self, env: Any, owner: type) -> dict[str, Any]:
+        modes = ["human", "rgb_array"]
+        hidden = sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS)
+        if hidden and env is not None and env.render_mode != "human":
+            modes.remove("human")
+        return {"render_modes": modes, "render_fps": 30}
 
 
 class EpisodePicture:

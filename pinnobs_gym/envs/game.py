@@ -14,6 +14,7 @@ from pinnobs_gym.envs.episodes import Changes, Episodes, EpisodeSource
 from pinnobs_gym.envs.registration import env_id
 from pinnobs_gym.envs.vector_env import EstimationVectorEnv
 from pinnobs_gym.files import file_name
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.conditions import canonical_name
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import Setup, System
@@ -173,6 +174,7 @@ class Game:
 def _system_of(name: str) -> str:
     """Return the system of an env id as ``module:Class``."""
     if name not in gym.registry:
-        known = ", ".join(sorted(each for each in gym.registry if each.startswith("pinnobs/")))
-        raise ValueError(f"unknown env id {name!r}; known are {known}")
+        known = sorted(each for each in gym.registry if each.startswith("pinnobs/"))
+        guess = did_you_mean(name, known)
+        raise ValueError(f"unknown env id {name!r}; known are {', '.join(known)}{guess}")
     return gym.registry[name].kwargs["system"]

@@ -21,7 +21,7 @@ def register_system(cls: type[System]) -> None:
     """
     cls.validate()
     SYSTEMS.register(cls)
-    _register_env(_id(cls), f"{cls.__module__}:{cls.__qualname__}")
+    _register_env(_id(cls), f"{cls.__module__}:{cls.__qualname__}", cls.reward_threshold)
 
 
 def register_envs() -> None:
@@ -29,7 +29,8 @@ def register_envs() -> None:
     systems, and of installed plug-ins."""
     for name, origin in SYSTEMS.sources.items():
         version = origin.constants.get("version", 0)
-        _register_env(f"pinnobs/{name}-v{version}", f"{origin.module}:{name}")
+        threshold = origin.constants.get("reward_threshold")
+        _register_env(f"pinnobs/{name}-v{version}", f"{origin.module}:{name}", threshold)
     for cls in SYSTEMS.plug_ins():
         register_system(cls)
 
@@ -55,11 +56,12 @@ def _id(cls: type[System]) -> str:
     return f"pinnobs/{cls.__name__}-v{cls.version}"
 
 
-def _register_env(name: str, system: str) -> None:
+def _register_env(name: str, system: str, threshold: float | None) -> None:
     if name not in gym.registry:
         gym.register(
             name,
             entry_point="pinnobs_gym.envs.env:EstimationEnv",
             vector_entry_point="pinnobs_gym.envs.vector_env:EstimationVectorEnv",
+            reward_threshold=threshold,
             kwargs={"system": system},  # the module allows a new process to import it
         )

@@ -13,14 +13,15 @@ import numpy as np
 from pinnobs_gym.estimation.given import checked_reset, checked_run, checked_update
 from pinnobs_gym.estimation.hints import check_settings
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
-from pinnobs_gym.registry import trainer_class
+from pinnobs_gym.registry import did_you_mean, trainer_class
 from pinnobs_gym.simulation.declared import check_fields
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.probe import probe
 from pinnobs_gym.simulation.record import Prior, Record
+from pinnobs_gym.simulation.shown import call_of, html, summary_of
 from pinnobs_gym.simulation.system import Setup, System
-from pinnobs_gym.simulation.values import check_parameters
+from pinnobs_gym.simulation.values import check_parameters, shortly
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.export.algorithm import Algorithm
@@ -139,9 +140,20 @@ class BaseEstimator(ABC):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         checks = {"run": checked_run, "reset": checked_reset, "update": checked_update}
+        if "__repr__" not in vars(cls):  # which a dataclass would write of all fields
+            cls.__repr__ = BaseEstimator.__repr__
         for name, check in checks.items():
             if name in vars(cls) and not getattr(vars(cls)[name], "__isabstractmethod__", False):
                 setattr(cls, name, check(vars(cls)[name]))
+
+    def __repr__(self) -> str:
+        told = [f for f in fields(BaseEstimator) if f.name != "system"]
+        return call_of(self, repr(self.system), chosen=[*told, *self.setting_fields()])
+
+    def _repr_html_(self) -> str:
+        rows = [(name, shortly(value)) for name, value in self.options.items()]
+        rows += [("track", self.track), ("knows", ", ".join(self.knows))]
+        return html(repr(self), summary_of(type(self)), ("setting", "value"), rows)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "compiled"}
@@ -171,7 +183,9 @@ class BaseEstimator(ABC):
             if name not in taken:
                 known = sorted(f.name for f in cls.setting_fields() if f.init)
                 expected = f"one of {', '.join(known)}" if known else "no settings"
-                raise ValueError(f"setting {name!r}; expected {expected}")
+                raise ValueError(
+                    f"setting {name!r}; expected {expected}{did_you_mean(name, known)}"
+                )
         return cls(system, setup.noise_std, setup.process_noise, **options)
 
     @classmethod

@@ -83,7 +83,10 @@ class TrainedAgent(Trained):
         None."""
         known = dict(self.setup) | ({} if noise_std is None else {"noise_std": noise_std})
         setup = replace(system.setups["benchmark"], **known)
-        return form_of(self.action_mode, system, setup, self.stack)
+        form = form_of(self.action_mode, system, setup, self.stack)
+        # With a mask if it was trained under a condition that loses outputs.
+        masked = form_of(self.action_mode, system, setup, self.stack, mask=True)
+        return masked if self.normalization[0].size == masked.num_features else form
 
     def begin(self, batch: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the initial hidden and cell state of the recurrent layer, (batch, size) each; the

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from pinnobs_gym.envs.game import AnyGame, Game
+from pinnobs_gym.envs.policy import is_policy, policy_of
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import CannotWrite
@@ -50,6 +51,7 @@ from pinnobs_gym.simulation.values import is_finite, shortly
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.by_name import LOGS
 from pinnobs_gym.training.log import SILENT, Log
+from pinnobs_gym.training.progress import shown_progress
 
 BATCH = 256
 """Number of episodes run together."""
@@ -106,7 +108,7 @@ class Results:
 
 
 def evaluate(
-    estimator: BaseEstimator | type[BaseEstimator] | str,
+    estimator: BaseEstimator | type[BaseEstimator] | str | Any,
     env_id: str,
     *,
     episodes: int = 100,
@@ -118,7 +120,7 @@ def evaluate(
     results: Path | str | None = None,
     fresh: bool = False,
     log: Log = SILENT,
-    progress: Callable[[int], None] | None = None,
+    progress: bool | Callable[[int], None] = False,
 ) -> Rows:
     """Score an estimator on the episodes of an env.
 
@@ -128,14 +130,17 @@ def evaluate(
 
     Args:
         estimator: an instance, which keeps its own model; or a class, a name or ``module:Class``,
-            which is instantiated with the env's model and noise.
+            which is instantiated with the env's model and noise; or a policy: a model of
+            Stable-Baselines3, or a function of observations (batch, features) that returns actions
+            (see `pinnobs_gym.envs.policy.policy_of`).
         env_id: such as ``pinnobs/ReverseDuffing-v0``; or the name of the system.
         episodes: number of episodes, of seeds seed, seed + 1, ...
         seed: of the first episode.
         setup: ``benchmark`` or ``paper``.
         condition: change of the episodes relative to the setup, such as ``load_step`` or
             ``noise5+dropout10``.
-        options: settings of an estimator that is instantiated here.
+        options: settings of an estimator that is instantiated here; of a policy ``action_mode``,
+            ``stack_outputs``, ``normalize`` and ``title``.
         tuned: whether it has the settings that are stored with the system, see
             `pinnobs_gym.scoring.tuned`, in place of ``options``.
         results: a rows file to append to, in whole batches. Episodes already in it, of the same
@@ -144,7 +149,8 @@ def evaluate(
             are written to a folder beside it.
         fresh: run all episodes, also those in ``results``, whose rows are replaced.
         log: TensorBoard log of scalars, figures and hyperparameters.
-        progress: called after each batch with its number of episodes.
+        progress: whether to show a progress bar in a terminal, or elsewhere a line now and then; or
+            a function, called after each batch with its number of episodes.
 
     Returns:
         The rows, in the order of seeds; a list of dicts with a method ``to_pandas``.
@@ -156,12 +162,37 @@ def evaluate(
     game = Game.of(env_id, setup, condition)
     made = make_estimator(estimator, game, options or {}, tuned)
     stored = None if results is None else Results(Path(results), fresh=fresh)
-    evaluated = run_episodes(game, made, seeds_of(seed, episodes), stored, progress)
+    play_all = partial(run_episodes, game, made, seeds_of(seed, episodes), stored)
+    evaluated = _with_progress(episodes, play_all, progress)
     if evaluated.reused:
         _LOGGER.warning(evaluated.reuse(Path(results or "")))
     log_episodes(log, evaluated.rows, evaluated.first_played)
     log_summary(log, evaluated.rows)
     return Rows(evaluated.rows)
+
+
+def _with_progress(
+    episodes: int, play_all: Callable[..., Evaluated], progress: bool | Callable[[int], None]
+) -> Evaluated:
+    """Return what ``play_all`` scores, with its progress shown if asked for."""
+    if not isinstance(progress, bool):
+        return play_all(progress)
+    if not progress:
+        return play_all()
+    with shown_progress() as show:
+        done, doing = 0, ""
+
+        def said(now: str) -> None:
+            nonlocal doing
+            doing = now
+            show(done / episodes, f"{done} of {episodes} episodes, {doing}")
+
+        def count(more: int) -> None:
+            nonlocal done
+            done += more
+            show(done / episodes, f"{done} of {episodes} episodes")
+
+        return play_all(count, phase=said)
 
 
 def seeds_of(seed: int, episodes: int) -> range:
@@ -227,6 +258,7 @@ def run_episodes(
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
     stand_in: StandIn | None = None,
+    phase: Callable[[str], None] | None = None,
 ) -> Evaluated:
     """Run and score the episodes that are not stored yet, batch by batch.
 
@@ -238,6 +270,7 @@ def run_episodes(
         progress: called after each batch with its number of episodes.
         label: name of the estimator in rows; its own if None.
         stand_in: what plays in its place; rows have the code that this was trained by.
+        phase: called with what is done from then on.
     """
     common = {**game_fields(game), **estimator_fields(estimator, game)}
     if stand_in is not None:
@@ -246,7 +279,9 @@ def run_episodes(
         told = {"estimator": ESTIMATORS.spec_of(type(estimator)), "settings": common["settings"]}
         common |= {"estimator": label, "settings": {}}
         common["made_by"] = {**common.get("made_by", {}), **told}
-    plays = partial(play, game, estimator) if stand_in is None else partial(stand_in.play, game)
+    plays = partial(play, game, estimator, phase=phase)
+    if stand_in is not None:
+        plays = partial(stand_in.play, game)
     return score_episodes(common, plays, seeds, results, progress)
 
 
@@ -318,7 +353,7 @@ def _scored(played: Played) -> list[Row]:
 
 
 def make_estimator(
-    estimator: BaseEstimator | type[BaseEstimator] | str,
+    estimator: BaseEstimator | type[BaseEstimator] | str | Any,
     game: AnyGame,
     options: Mapping[str, Any],
     tuned: bool = False,
@@ -339,6 +374,8 @@ def make_estimator(
             raise ValueError(f"options {dict(options)} go with a name or a class, not an instance")
         _check_model(estimator.system, system)
         return estimator
+    if is_policy(estimator):
+        return _policy(estimator, game, options)
     cls = ESTIMATORS.resolve(estimator)
     if tuned:
         options = required_settings(cls, game)
@@ -350,6 +387,19 @@ def make_estimator(
         return cls.for_setup(system, setup, **options)
     except TypeError as error:
         raise ValueError(f"estimator {ESTIMATORS.name_of(cls)!r}: {error}") from None
+
+
+def _policy(policy: Any, game: AnyGame, options: Mapping[str, Any]) -> BaseEstimator:
+    """Return a policy as an estimator of a game; see `make_estimator`."""
+    if not isinstance(game, Game):
+        raise ValueError("a policy plays simulated episodes; expected an estimator for a log")
+    known = ("action_mode", "stack_outputs", "normalize", "title")
+    for name in options:
+        if name not in known:
+            raise ValueError(f"option {name!r} of a policy; expected one of {', '.join(known)}")
+    source = game.source
+    lossy = source.condition.loses_outputs
+    return policy_of(policy, source.system, source.setup, loses_outputs=lossy, **options)
 
 
 def _check_model(model: System, system: System) -> None:

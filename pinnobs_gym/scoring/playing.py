@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -109,7 +109,11 @@ class Played:
 
 
 def play(
-    game: Game, estimator: BaseEstimator, seeds: Sequence[int], x0: np.ndarray | None = None
+    game: Game,
+    estimator: BaseEstimator,
+    seeds: Sequence[int],
+    x0: np.ndarray | None = None,
+    phase: Callable[[str], None] | None = None,
 ) -> Played:
     """Run an estimator on episodes of a game.
 
@@ -121,12 +125,17 @@ def play(
         estimator: the estimator to run.
         seeds: of the episodes.
         x0: initial states (batch, nx) that replace the drawn ones.
+        phase: called with what is done from then on.
     """
     source = game.source
+    say = phase or (lambda doing: None)
+    say("simulating")
     episodes = game.episodes(seeds, x0)
     record = source.record(episodes)
     truth = np.ascontiguousarray(episodes.x[: record.num_samples].swapaxes(0, 1))
+    say("estimating")
     estimates, cost = timed(estimator, record)
+    say("scoring")
     return Played(game, tuple(seeds), record, truth, estimates, cost, drawn=x0 is None)
 
 

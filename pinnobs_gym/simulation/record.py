@@ -8,6 +8,7 @@ import numpy as np
 
 from pinnobs_gym.simulation.bounds import beyond
 from pinnobs_gym.simulation.initial_set import prior_moments
+from pinnobs_gym.simulation.shown import html
 from pinnobs_gym.simulation.system import Setup, System
 from pinnobs_gym.simulation.values import real_array
 
@@ -149,6 +150,27 @@ class Record:
                 )
         check_use(system, self.t, self.u)
         self.prior.check_fits(system, self.batch)
+
+    def __repr__(self) -> str:
+        missing = 100 * float(np.isnan(self.y).mean()) if self.y.size else 0.0
+        parts = [
+            f"{self.batch} episode{'s' * (self.batch != 1)}",
+            f"{self.num_samples} samples from t={self.t[0]:g} to {self.t[-1]:g}",
+            f"ny={self.y.shape[2]}",
+            f"nu={self.u.shape[2]}",
+        ]
+        parts += [f"{missing:.2g} % of the outputs missing"] * bool(missing)
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        names = [*(f"y{i + 1}" for i in range(self.y.shape[2]))]
+        names += [f"u{i + 1}" for i in range(self.u.shape[2])]
+        rows = []
+        for name, column in zip(names, np.moveaxis(np.dstack([self.y, self.u]), 2, 0), strict=True):
+            known = column[~np.isnan(column)]
+            least, most = (f"{known.min():.4g}", f"{known.max():.4g}") if known.size else ("", "")
+            rows.append((name, least, most, known.size))
+        return html(repr(self), "", ("", "least", "most", "samples"), rows)
 
     @property
     def batch(self) -> int:

@@ -9,10 +9,12 @@ from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.bounds import Bounds, StateBox, box
 from pinnobs_gym.simulation.noise import Level, Noise, SampledLevel, noise_root
 from pinnobs_gym.simulation.residual import Periods, residual
+from pinnobs_gym.simulation.shown import call_of, html, summary_of
 from pinnobs_gym.simulation.start_law import Box, Gaussian, StartLaw, check_covariance
 from pinnobs_gym.simulation.values import (
     LARGEST,
@@ -245,6 +247,9 @@ class System(ABC):
     """The setups by name; must contain ``benchmark``."""
     version: ClassVar[int] = 0
     """Version of the env id ``pinnobs/<class name>-v<version>``."""
+    reward_threshold: ClassVar[float | None] = None
+    """Return at which Gymnasium counts the env as solved: in this package the mean return of the
+    unscented Kalman filter in the benchmark's episodes of seeds 0 to 99."""
     ranked_condition: ClassVar[str] = "nominal"
     """The condition under which the leaderboard ranks estimators of this system."""
     uncertain: ClassVar[tuple[str, ...] | None] = None
@@ -290,6 +295,25 @@ class System(ABC):
         if self.state_low is None and self.state_high is None:
             return None
         return box(self.state_low, self.state_high, self.nx)
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__repr__" not in vars(cls):  # which a dataclass would write of all fields
+            cls.__repr__ = System.__repr__
+
+    def __repr__(self) -> str:
+        return call_of(self)
+
+    def _repr_html_(self) -> str:
+        scales = vector(self.scale, self.nx, "scale")
+        rows = [
+            *((name, "state", f"{s:g}") for name, s in zip(self.state_names, scales, strict=True)),
+            *((name, "output", "") for name in self.output_names),
+            *((name, "input", "") for name in self.input_names),
+        ]
+        with_units = [(name, kind, self.units.get(name, ""), scale) for name, kind, scale in rows]
+        header = ("name", "kind", "unit", "scale")
+        return html(repr(self), summary_of(type(self)), header, with_units)
 
     @abstractmethod
     def f(self, t: Array, x: Array, u: Array) -> Array:
@@ -437,6 +461,7 @@ class System(ABC):
         if not isinstance(setup, str) or setup not in cls.setups:
             raise ValueError(
                 f"unknown setup {shortly(setup)} of {cls.__name__}; it has {', '.join(cls.setups)}"
+                f"{did_you_mean(setup, cls.setups)}"
             )
         changes: dict[str, Any] = {"dt": dt, "duration": duration, "noise_std": noise_std}
         changes = {name: value for name, value in changes.items() if value is not None}

@@ -33,6 +33,7 @@ class Academic(System):
     output_names = ("y1",)
     scale = (1.2, 0.9)
     state_bound = (28.0, 2.6)
+    reward_threshold = -1.08
     setups = {
         "benchmark": Setup(
             x0_low=(-2.0, -1.5),

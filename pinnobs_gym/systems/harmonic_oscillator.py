@@ -35,6 +35,7 @@ class HarmonicOscillator(System):
     units = {"x3": "rad²/s²"}
     scale = (1.0, 1.8, 3.7)
     state_bound = (2.1, 5.0, 6.3)
+    reward_threshold = -1.3
     setups = {
         "benchmark": Setup(
             x0_low=(-2.0, -2.0, 0.5),

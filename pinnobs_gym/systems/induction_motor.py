@@ -86,6 +86,7 @@ class InductionMotor(System):
     uncertain = ("R_s", "R_r", "J", "T_L")
     model_step = 5e-4
     input_hold = "linear"
+    reward_threshold = -0.59
     setups = {
         "benchmark": Setup(
             x0_low=(-5.0, -5.0, -0.5, -0.5, 0.0),

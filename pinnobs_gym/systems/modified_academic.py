@@ -33,6 +33,7 @@ class ModifiedAcademic(System):
     output_names = ("y1",)
     scale = (2.0, 0.8)
     state_bound = (4.6, 3.2)
+    reward_threshold = -1.22
     setups = {
         "benchmark": Setup(
             x0_low=(-3.0, -1.5),

@@ -32,6 +32,7 @@ class ReverseDuffing(System):
     output_names = ("y1",)
     scale = (1.3, 1.0)
     state_bound = (2.3, 1.9)
+    reward_threshold = -1.27
     setups = {
         "benchmark": Setup(
             x0_low=(-2.2, -1.8),

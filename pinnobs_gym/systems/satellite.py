@@ -47,6 +47,7 @@ class Satellite(System):
     units = {"x1": "rad/s", "x2": "rad/s", "x3": "rad/s", "y1": "rad/s", "y3": "rad/s"}
     scale = (0.9, 1.3, 2.2)
     state_bound = (2.5, 3.3, 3.5)
+    reward_threshold = -1.75
     setups = {
         "benchmark": Setup(
             x0_low=(-2.0, -2.0, 1.0),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ from pinnobs_gym.files import CannotWrite
 from pinnobs_gym.simulation.notices import say_first
 from pinnobs_gym.training.checkpoint import load_checkpoint, save_checkpoint
 from pinnobs_gym.training.log import HPARAMS, SILENT, Log
+from pinnobs_gym.training.progress import Show, shown_progress
 from pinnobs_gym.training.trainer import Trainer
 
 TrainedT = TypeVar("TrainedT", bound=Trained)
@@ -40,7 +41,8 @@ def train(
         checkpoint: file of the training's state, rewritten every ``checkpoint_every`` iterations
             and at the end; where that fails, a line is logged, and the training goes on.
         resume: resume from the checkpoint, exactly unless the trainer says otherwise.
-        progress: show a progress bar in the terminal.
+        progress: show a progress bar in the terminal, or elsewhere a line now and then. It shows
+            the fraction of the iterations or of the budget, whichever ends the training first.
 
     Raises:
         ValueError: in one line, if the checkpoint is missing, damaged, or of another training: of
@@ -56,16 +58,19 @@ def train(
     config, shown = trainer.config, -1
     trainer.ending = "running"
     try:
-        with _bar(progress) as show, deferred_interrupt() as interrupt:
+        with (
+            shown_progress() if progress else nullcontext() as show,
+            deferred_interrupt() as interrupt,
+        ):
             while not ended_now(trainer, interrupt):
                 trainer.step()
                 if trainer.iteration % config.log_every == 0:
-                    _show(trainer, log, show if progress else None)
+                    _show(trainer, log, show)
                     shown = trainer.iteration
                 if checkpoint is not None and trainer.iteration % config.checkpoint_every == 0:
                     _save(trainer, checkpoint)
             if trainer.iteration not in (0, shown):
-                _show(trainer, log, show if progress else None)
+                _show(trainer, log, show)
         if checkpoint is not None:
             _save(trainer, checkpoint)
     except KeyboardInterrupt:  # within an iteration: the last checkpoint stays valid
@@ -147,16 +152,17 @@ def ended_now(trainer: Trainer[Any, Any], interrupt: Interrupt) -> bool:
     return trainer.ending != "running"
 
 
-Show = Callable[[float, int, str], None]
-
-
 def _show(trainer: Trainer[Any, Any], log: Log, show: Show | None) -> None:
     """Log the curves, and update the progress bar."""
     if log.active:
         for tag, value in trainer.curves().items():
             log.scalar(tag, value, trainer.iteration)
     if show is not None:
-        show(trainer.progress(), trainer.iteration, trainer.status())
+        budget = trainer.config.budget
+        part = trainer.progress()
+        if budget is not None and not trainer.paced_by_budget:
+            part = max(part, min(trainer.seconds / budget, 1.0))  # whichever ends it first
+        show(part, f"{trainer.iteration} iterations, {trainer.status()}")
 
 
 def _log_end(trainer: Trainer[Any, TrainedT], trained: TrainedT, log: Log) -> None:
@@ -167,28 +173,3 @@ def _log_end(trainer: Trainer[Any, TrainedT], trained: TrainedT, log: Log) -> No
     settings |= trained.config
     metrics = {"end/loss": trained.loss, "end/iterations": float(trained.iterations)}
     log.hparams(settings, metrics)
-
-
-@contextmanager
-def _bar(shown: bool) -> Iterator[Show]:
-    """Show a progress bar, and yield the function that updates it.
-
-    The function takes the finished fraction, the number of iterations and a description. If the
-    bar is not shown, it does nothing.
-    """
-    if not shown:
-        yield lambda part, iteration, description: None
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.fields[iteration]} iterations"),
-        BarColumn(bar_width=20),
-        TextColumn("{task.description}", markup=False),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns) as progress:
-        task = progress.add_task("", total=1.0, iteration=0)
-        yield lambda part, iteration, description: progress.update(
-            task, completed=part, iteration=iteration, description=description
-        )

@@ -8,6 +8,7 @@ from numbers import Integral, Real
 from typing import Any, ClassVar, Self, TypeVar
 
 from pinnobs_gym.estimation.hints import as_tuple, check_settings, field_hints, fits
+from pinnobs_gym.registry import did_you_mean
 
 SEEDS = 2**32
 """Number of seeds of a training, from 0 on: those that every library of random numbers takes."""
@@ -100,7 +101,8 @@ def changed(config: ConfigT, changes: Mapping[str, Any]) -> ConfigT:
     known = sorted(f.name for f in fields(settings) if f.init)
     for name in changes:
         if name not in known:
-            raise ValueError(f"setting {name!r}; expected one of {', '.join(known)}")
+            guess = did_you_mean(name, known)
+            raise ValueError(f"setting {name!r}; expected one of {', '.join(known)}{guess}")
     hints = field_hints(type(settings))
     values = dict(changes)
     for name, value in changes.items():

@@ -14,6 +14,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.learned.trained import Ending, Trained
 from pinnobs_gym.estimation.learned.trained_file import plain
 from pinnobs_gym.estimation.takes import EVERYTHING, check_taken
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.kernels.asked import ask
 from pinnobs_gym.simulation.noise import Level
 from pinnobs_gym.simulation.record import Record
@@ -121,7 +122,9 @@ class Trainer(ABC, Generic[ConfigT, TrainedT]):
         settings = dict(changes)
         name = settings.pop("preset", next(iter(cls.presets)))
         if name not in tuple(cls.presets):  # whatever the name is, also a list
-            raise ValueError(f"preset={name!r}; expected one of {', '.join(cls.presets)}")
+            known = ", ".join(cls.presets)
+            guess = did_you_mean(name, cls.presets)
+            raise ValueError(f"preset={name!r}; expected one of {known}{guess}")
         return changed(cls.presets[name](), settings)
 
     @property

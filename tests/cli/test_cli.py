@@ -169,7 +169,7 @@ def test_estimate_with_process_noise(folder, level):
         ),
         (["dance"], "unknown command 'dance'; known are episodes, estimate, estimators, evaluate"),
         (["train", "pinn_obs", "--system", "Academic", "--budget", "-1"], "budget=-1.0; expected"),
-        (["evaluate", "--systm", "Academic"], "Missing from pinnobs evaluate: --system"),
+        (["evaluate", "--systm", "Academic"], "unknown option --systm; did you mean '--system'?"),
         (
             ["evaluate", "--system", "Academic", "--episodes", "a"],
             "parsing --episodes: 'a'; expected a whole number",

@@ -6,8 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from angles import Compass
 
+from pinnobs_gym.cli import agent_section
 from pinnobs_gym.cli.system_page import page
+from pinnobs_gym.envs.actions import FORMS
+from pinnobs_gym.envs.env import EstimationEnv
 from pinnobs_gym.simulation.system import Setup, System, stack
+from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.satellite import Satellite
 
 
@@ -50,6 +54,35 @@ def test_the_page_says_which_states_and_outputs_repeat():
     for name in ("heading", "compass"):
         assert text.count(f"`{name}` repeats every 6.28319 rad: whole periods do not count.") == 1
     assert "repeats" not in page(Satellite, "pinnobs/Satellite-v0")
+
+
+def test_the_page_says_to_agents_what_the_envs_have():
+    text = page(InductionMotor, "pinnobs/InductionMotor-v0")
+    for mode in FORMS:
+        (line,) = re.findall(rf"^\| `{mode}` \|.*\| (\d+) \| (\d+) \|$", text, re.M)
+        env = EstimationEnv(InductionMotor, action_mode=mode)
+        assert line == (str(env.action_space.shape[0]), str(env.observation_space.shape[0]))
+    assert f"`reward_threshold` is {InductionMotor.reward_threshold}, the mean return" in text
+    assert "No returns are published" in page(Jar, "pinnobs/Jar-v0")
+    assert "reward_threshold" not in page(Jar, "pinnobs/Jar-v0")
+
+
+def test_published_returns_are_those_of_the_published_episodes(monkeypatch):
+    """Two episodes of ten samples with NRMSE 0.1 and 0.3: returns of −0.1 and −0.9."""
+    rows = [
+        {"estimator": name, "training_seed": seed, "nrmse": nrmse, "game_hash": "earlier"}
+        for name, seed, values in (
+            ("ekf", None, (0.1, 0.3)),
+            ("sb3", 0, (1, 1)),
+            ("sb3", 1, (0, 2)),
+        )
+        for nrmse in values
+    ]
+    monkeypatch.setattr(agent_section, "_published", lambda env_id: rows)
+    text = page(Jar, "pinnobs/Jar-v0")
+    assert "−10·NRMSE² each, without discount. They are of other code than the present." in text
+    assert "| ekf | -0.5 | -0.5 | -0.9 | 2 |" in text
+    assert "| sb3, the best of 2 in these episodes | -10 | -10 | -10 | 2 |" in text
 
 
 def test_the_page_says_what_the_outputs_tell():

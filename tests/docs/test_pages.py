@@ -1,6 +1,7 @@
 """The documentation: every page is there, links lead somewhere, and its code runs."""
 
 import importlib
+import json
 import re
 import shutil
 import subprocess
@@ -213,8 +214,8 @@ def test_a_system_has_a_moving_picture(generated, name):
 
 
 def test_a_systems_page_is_the_commands_and_its_equations(generated):
-    _, texts = generated
-    text = texts["systems/InductionMotor.md"]
+    pages, texts = generated
+    text = pages.system_page(SYSTEMS.resolve("InductionMotor"))
     for part in page(SYSTEMS.resolve("InductionMotor"), "pinnobs/InductionMotor-v0").split("\n\n"):
         assert part.strip() in text
     assert r"\dot{\omega} &= - \frac{T_{L}}{J}" in text
@@ -325,6 +326,18 @@ def test_the_cells_of_a_guide_run_and_take_few_lines(path, tmp_path):
     assert any("assert" in text for text in own)  # that the estimates are right
     assert any('Image("estimates.png"' in text for text in own)
     assert len([line for text in own for line in text.splitlines() if line.strip()]) < 60
+
+
+def test_the_first_steps_run_and_are_stripped(tmp_path):
+    path = DOCS / "first_steps.ipynb"
+    printed = run_cells(path, tmp_path).splitlines()
+    ekf, mine = (float(line.split()[-1]) for line in printed[-2:])
+    assert ekf < mine < 0.2  # as the picture shows
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        assert cell["cell_type"] == "markdown" or not cell["outputs"]
+    links = re.findall(r"\]\(([^)]+)\)", path.read_text(encoding="utf-8"))
+    assert links
+    assert all((DOCS / link).is_file() for link in links)
 
 
 @pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.stem)

@@ -19,6 +19,17 @@ def test_python_snippet(number, tmp_path):
         assert diverged == "False"
 
 
+def test_the_first_result(tmp_path):
+    (command,) = (s for s in SHELL if s.startswith("pinnobs evaluate"))
+    printed = run_command(command, tmp_path).splitlines()
+    assert any(line.split()[:2] == ["1", "ekf"] for line in printed)
+    assert printed[-1].startswith("next: pinnobs ")
+
+
+def test_it_is_short():
+    assert len(README.splitlines()) < 200
+
+
 def test_there_is_a_snippet_of_each_kind():
     for words in ("gym.make(", "class Luenberger(Estimator)", "class VanDerPol(System)"):
         assert any(words in snippet for snippet in PYTHON), words

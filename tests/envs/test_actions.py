@@ -15,6 +15,7 @@ from made_envs import ALLOWED_WARNINGS, DUFFING, IDS, MOTOR, make, make_vec, sho
 
 from pinnobs_gym.envs.actions import FORMS, OUTSIDE, Gain, PredictionForm, form_of, typical
 from pinnobs_gym.envs.arguments import NOT_FINITE_REWARD
+from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.model import model_step
 from pinnobs_gym.simulation.record import Prior, Record
@@ -170,14 +171,45 @@ def test_a_missing_output_corrects_nothing() -> None:
     assert form.act(memory, np.ones((1, 2))).xhat.tolist() == [[1.0, 1.0]]
 
 
-@pytest.mark.parametrize("mode", OTHERS)
-def test_observations_are_finite_where_outputs_are_missing(mode: str) -> None:
-    env = make(DUFFING, action_mode=mode, condition="dropout50")
-    raw = make(DUFFING, condition="dropout50")
-    raw.reset(seed=0)
-    seen = [env.reset(seed=0)[0], *(env.step(np.zeros(2))[0] for _ in range(20))]
+@pytest.mark.parametrize("condition", ["dropout50", "delay3", "gap", "noise5+dropout10"])
+@pytest.mark.parametrize("mode", FORMS)
+def test_observations_stay_in_their_space_where_outputs_are_missing(
+    mode: str, condition: str
+) -> None:
+    env = make(MOTOR, action_mode=mode, condition=condition)
+    actions = np.zeros(env.action_space.shape)
+    seen = [env.reset(seed=0)[0], *(env.step(actions)[0] for _ in range(300))]
     assert np.isfinite(seen).all()
-    assert any(np.isnan(raw.step(np.zeros(2))[0]).any() for _ in range(20))
+    assert all(env.observation_space.contains(each) for each in seen)
+
+
+@pytest.mark.parametrize("mode", ["estimate", "normalized"])
+@pytest.mark.parametrize("stack", [1, 3])
+def test_a_missing_output_is_the_latest_one_and_masked(mode: str, stack: int) -> None:
+    """Written out by hand from the record, sample by sample."""
+    arguments = {"condition": "dropout50", "duration": 0.05}
+    env = make(MOTOR, action_mode=mode, stack_outputs=stack, **arguments)
+    envs = make_vec(MOTOR, 2, action_mode=mode, stack_outputs=stack, **arguments)
+    y = Game.of("InductionMotor", **arguments).record([7]).y[0]
+    assert np.isnan(y).any(axis=0).all()
+    space, masks = env.observation_space, slice(2 * stack, 4 * stack)
+    assert space.low[masks].tolist() == [0] * 2 * stack
+    assert space.high[masks].tolist() == [1] * 2 * stack
+    observation, row = env.reset(seed=7)[0], envs.reset(seed=6)[0][1]
+    held = np.zeros((len(y) + stack, 2))  # zero before the first
+    for k, sample in enumerate(y):
+        for i in range(2):
+            held[k + stack, i] = held[k + stack - 1, i] if np.isnan(sample[i]) else sample[i]
+        present = np.zeros((stack, 2))
+        for back in range(min(stack, k + 1)):
+            present[back] = ~np.isnan(y[k - back])
+        latest = held[k + 1 : k + stack + 1][::-1]
+        np.testing.assert_allclose(observation[: 2 * stack], latest.ravel(), rtol=1e-6)
+        assert observation[masks].tolist() == present.ravel().tolist()
+        np.testing.assert_array_equal(row, observation)
+        action = np.zeros(env.action_space.shape)
+        observation = env.step(action)[0]
+        row = envs.step(np.zeros((2, *action.shape)))[0][1]
 
 
 def test_estimates_stay_in_bounds() -> None:

@@ -39,12 +39,15 @@ def test_its_episodes_are_those_of_the_env_and_its_scores_the_rewards(name):
     for i, seed in enumerate(seeds):
         env = make(IDS[name], condition="dropout30", **SHORT)
         observation, info = env.reset(seed=seed)
-        total, squares = 0.0, []
+        total, squares, held = 0.0, [], np.zeros(played.system.ny)
         for k, xhat in enumerate(played.estimates.xhat[i]):
             # In a batch of another size products round differently.
             np.testing.assert_allclose(info["state"], played.truth[i, k], rtol=1e-12, atol=1e-12)
             y = played.record.y[i, k]
-            np.testing.assert_allclose(observation[: len(y)], y, rtol=1e-6, atol=1e-7)
+            seen, mask = observation[: len(y)], observation[len(y) : 2 * len(y)]
+            np.testing.assert_array_equal(mask == 0, np.isnan(y))
+            held = np.where(np.isnan(y), held, y)
+            np.testing.assert_allclose(seen, held, rtol=1e-6, atol=1e-7)
             errors = ((xhat - info["state"]) / played.system.scale) ** 2
             observation, reward, _, over, info = env.step(xhat)
             total += reward

@@ -1,5 +1,6 @@
 """Code blocks of Markdown files, and how tests run them."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -17,8 +18,11 @@ def blocks(path, *kinds):
 
 def cells(path):
     """The cells of a page that is executed when the documentation is built, in order: (options,
-    text)."""
+    text); those of a notebook have no options."""
     text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        found = json.loads(text)["cells"]
+        return [("", "".join(c["source"])) for c in found if c["cell_type"] == "code"]
     return re.findall(
         r"^```\{code-cell\} ipython3\n((?::[^\n]*\n)*)\n?(.*?)^```", text, re.M | re.S
     )
@@ -27,14 +31,15 @@ def cells(path):
 def run_cells(path, folder):
     """Run a page's cells in one process, in which they share their names. Returns what they print.
 
-    Of the notations of notebooks, cells may have ``%%writefile name.py`` and lines
-    ``!pinnobs ...``."""
+    Of the notations of notebooks, cells may have ``%%writefile name.py``, lines ``!pinnobs ...``
+    and ``%matplotlib inline``, which says nothing here."""
     parts = []
     for _, text in cells(path):
         first, _, rest = text.partition("\n")
         if first.startswith("%%writefile "):
             (folder / first.split()[1]).write_text(rest, encoding="utf-8")
             continue
+        text = text.replace("%matplotlib inline\n", "")
         parts.append(re.sub(r"^!pinnobs (.*)$", _called, text, flags=re.M))
     return run_python("from pinnobs_gym.cli import main\n" + "\n".join(parts), folder)
 

@@ -13,7 +13,9 @@ from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.simulation.code_hash import content
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.training import loop
 from pinnobs_gym.training.checkpoint import load_checkpoint, save_checkpoint
+from pinnobs_gym.training.log import SILENT
 from pinnobs_gym.training.loop import train
 
 SMALL = {"episodes": 8, "held_out": 3, "width": 4, "streams": 6, "chunk": 10, "check_every": 1}
@@ -105,3 +107,16 @@ def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path):
             same += 1
     assert len(refused) > same
     assert all(is_one_line_about(error, checkpoint) for error in refused)
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(0.0, 0.01), (5.0, 0.5), (30.0, 1.0)])
+def test_progress_is_that_of_whatever_ends_the_training_first(monkeypatch, seconds, shown):
+    """After one of a hundred iterations, with a budget of 10 s."""
+    made = trainer(iterations=100, budget=10.0)
+    made.step()
+    monkeypatch.setattr(type(made), "seconds", property(lambda self: seconds))
+    found = []
+    loop._show(made, SILENT, lambda part, words: found.append((part, words)))
+    ((part, words),) = found
+    assert part == pytest.approx(shown)
+    assert words.startswith("1 iterations, loss ")

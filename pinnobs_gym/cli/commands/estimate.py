@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import parse, settings_of
 from pinnobs_gym.cli.output import print_judgement, write_estimates, write_figure
 from pinnobs_gym.cli.own_model import ModelOptions
@@ -75,6 +75,10 @@ class Estimate:
         doubted = False
         for log, estimator, out in zip(logs, estimators, outs, strict=True):
             doubted |= _estimate(log, estimator, setup, out)
+        if doubted or kind.exported is BaseEstimator.exported:
+            print_next("fit", "--system", self.system, "--log", *self.log, "--noise")
+        else:
+            print_next("export", self.estimator, "--system", self.system)
         return 1 if self.strict and doubted else 0
 
     def _estimator(self, kind: type[BaseEstimator], log: Log, setup: Setup) -> BaseEstimator:

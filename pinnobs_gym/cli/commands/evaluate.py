@@ -8,16 +8,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import LOG_OPTIONS, check_apart, parse, settings_of
 from pinnobs_gym.cli.own_model import ModelOptions
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import AnyGame, Game
+from pinnobs_gym.envs.policy import WARNING, Policy, load_policy
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.estimators import ESTIMATORS
+from pinnobs_gym.estimators import ESTIMATORS, policy_file
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.against import opponents
+from pinnobs_gym.leaderboard.published import manifest
+from pinnobs_gym.leaderboard.published.manifest import Manifest
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
 from pinnobs_gym.leaderboard.published.trained import load_published
 from pinnobs_gym.scoring.evaluation import (
@@ -43,7 +46,10 @@ class Evaluate:
     system: str
     """Name or module:Class of the system."""
     estimator: str = "ekf"
-    """Name or module:Class of the estimator."""
+    """Name or module:Class of the estimator; or policy:FILE.zip for a model that Stable-Baselines3
+    saved. Such a file can hold code, which runs as it is loaded."""
+    normalization: Path | None = None
+    """Of a policy: the file of its VecNormalize. It can hold code, too."""
     trained: Path | None = None
     """Trained estimator to load; published stands for the one that ships with the package."""
     set: tuple[str, ...] = ()
@@ -80,20 +86,44 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate and print."""
-        cls = ESTIMATORS.resolve(self.estimator)
         if self.tuned and (self.set or self.trained is not None):
             other = "--trained" if self.trained is not None else "--set"
             raise ValueError(f"--tuned and {other}; expected one of them")
-        return self._run_logs(cls) if self.log else self._run_episodes(cls)
+        if (path := policy_file(self.estimator)) is not None:
+            return self._run_policy(path)
+        if self.normalization is not None:
+            raise ValueError("--normalization without --estimator policy:FILE.zip")
+        cls = ESTIMATORS.resolve(self.estimator)
+        if self.log:
+            return self._run_logs(cls)
+        game, options = self._game(), settings_of(cls, self.set)
+        trained = self._trained(cls, game)
+        return self._run_episodes(game, make_estimator(trained or cls, game, options, self.tuned))
 
-    def _run_episodes(self, cls: type[BaseEstimator]) -> int:
-        """Evaluate on simulated episodes."""
-        game = Game.of(self.system, self.setup, self.condition)
-        options = settings_of(cls, self.set)
+    def _run_policy(self, path: Path) -> int:
+        """Evaluate a model that Stable-Baselines3 saved, on simulated episodes."""
+        for option, value in (
+            ("--log", self.log),
+            ("--trained", self.trained),
+            ("--tuned", self.tuned),
+        ):
+            if value:
+                raise ValueError(f"{option} and --estimator {self.estimator}; expected one of them")
+        game, options = self._game(), settings_of(Policy, self.set)
+        for each in filter(None, (path, self.normalization)):
+            console.print(f"warning: {each} {WARNING}", style="yellow", soft_wrap=True)
+        policy, normalize = load_policy(path, self.normalization)
+        options |= {"normalize": normalize, "title": path.stem}
+        return self._run_episodes(game, make_estimator(policy, game, options))
+
+    def _game(self) -> Game:
+        """Return the game that is played, after checks of what needs none of it."""
         if self.video is not None:
             check_video(self.video)
-        trained = self._trained(cls, game)
-        estimator = make_estimator(trained or cls, game, options, self.tuned)
+        return Game.of(self.system, self.setup, self.condition)
+
+    def _run_episodes(self, game: Game, estimator: BaseEstimator) -> int:
+        """Evaluate on simulated episodes."""
         episodes = 1 if game.source.deterministic else self.episodes
         if episodes < self.episodes:
             console.print(f"every episode of setup {self.setup!r} is the same: 1 is run")
@@ -132,7 +162,30 @@ class Evaluate:
         shipped = published_floors([game.name])  # reject what is damaged before anything is run
         check_writable(self.out)
         run: Any = partial(score, Results(rows_file(self.out), fresh=self.fresh))
-        report(game, with_progress(len(seeds), run), self.out, picture, others, shipped)
+        evaluated = with_progress(len(seeds), run, phases=not self.log)
+        report(game, evaluated, self.out, picture, others, shipped)
+        self._say_next(game)
+
+    def _say_next(self, game: AnyGame) -> None:
+        """Print the command to type next: the same against what is published, or all tables."""
+        published = Manifest.read(manifest.FOLDER)
+        entries = [] if published is None else published.rows
+        if self.against is not None or not any(entry.game == game.name for entry in entries):
+            print_next("tables", rows_file(self.out))
+            return
+        chosen = {
+            "--setup": (self.setup, "benchmark"),
+            "--condition": (self.condition, "nominal"),
+            "--trained": (self.trained, None),
+            "--normalization": (self.normalization, None),
+            "--out": (self.out, Evaluate.out),
+        }
+        words = [
+            word for name, (own, usual) in chosen.items() if own != usual for word in (name, own)
+        ]
+        words += ["--tuned"] * self.tuned + (["--set", *self.set] if self.set else [])
+        estimator = ["--estimator", self.estimator]
+        print_next("evaluate", "--system", self.system, *estimator, *words, "--against", PUBLISHED)
 
     def _trained(self, cls: type[BaseEstimator], game: AnyGame) -> BaseEstimator | None:
         """Return the trained estimator to score, None if it needs none."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pinnobs_gym.cli.console import console, print_table
+from pinnobs_gym.cli.console import console, print_next, print_table
 from pinnobs_gym.cli.fit_figure import fit_figure
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.output import write_figure
@@ -74,6 +74,7 @@ class Fit:
             with replacing(self.out) as temporary:
                 temporary.write_text(json.dumps(facts(made), indent=1) + "\n", encoding="utf-8")
             console.print(f"values: {self.out}", soft_wrap=True)
+        print_next("estimate", "--system", self.system, "--log", *self.log)
         return 0
 
     def _check_files(self) -> None:

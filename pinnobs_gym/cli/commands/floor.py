@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.run_view import Kind, RunView
 from pinnobs_gym.envs.game import Game
@@ -79,6 +79,7 @@ class FloorCommand:
                 soft_wrap=True,
             )
         console.print(f"rows: {path}", soft_wrap=True)
+        print_next("evaluate", "--system", self._systems[0], "--out", self.out)
         return 1 if failed else 0
 
     @property

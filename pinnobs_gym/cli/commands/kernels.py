@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pinnobs_gym.cli.console import console, print_table
+from pinnobs_gym.cli.console import console, print_next, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.simulation.kernels.build import NO_COMPILER, usable_compilers
@@ -39,6 +39,8 @@ class Kernels:
         _say(f"libraries: {len(libraries)}, {total / 1e6:.1f} MB, in {folder}")
         _say(f"compiler: {found[0] if found else NO_COMPILER}")
         _say(f"processor: {processor() or 'not known; code is not made for this one alone'}")
+        if libraries:
+            print_next("kernels", "--clear")
         return 0
 
 

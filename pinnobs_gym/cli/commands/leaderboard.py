@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pinnobs_gym.cli.board_report import report, say_outdated
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.run_view import Kind, RunView
 from pinnobs_gym.files import check_writable
@@ -62,7 +62,8 @@ class Leaderboard:
     """Time limit of each job in s of wall-clock time; a job that exceeds it is ended and has
     failed. If not given, two hours and four times the budget; none with 1 process."""
     backend: Literal["loky", "dask"] = "loky"
-    """Where jobs run: processes of this machine, or the workers of a Dask scheduler."""
+    """Where jobs run: processes of this machine, or the workers of a Dask scheduler, which needs
+    the extra "dask"."""
     scheduler: str | None = None
     """Address of the Dask scheduler, such as tcp://host:8786."""
     retry_failed: bool = False
@@ -121,6 +122,7 @@ class Leaderboard:
                 style="yellow",
                 soft_wrap=True,
             )
+        print_next("report", path, "-o", self.out / "site")
         return 1 if view.failed or left_out else 0
 
     def planned(self) -> list[Job]:

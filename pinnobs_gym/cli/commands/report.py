@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import check_writable, replacing
 from pinnobs_gym.leaderboard.published import manifest
@@ -20,7 +20,8 @@ from pinnobs_gym.scoring.rows import game_of
 
 @dataclass(frozen=True)
 class Report:
-    """Make a static page of scores that needs no server and no network."""
+    """Make a static page of scores that needs no server and no network. Needs the extra
+    "report"."""
 
     rows: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Rows files, such as runs/leaderboard/rows.jsonl; the curves in a folder "curves" beside each
@@ -53,6 +54,7 @@ class Report:
         with replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
         console.print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+        print_next("tables", *self.rows)
         return 0
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.scored import report, rows_file, with_progress
 from pinnobs_gym.files import check_writable
@@ -66,6 +66,7 @@ class Score:
             soft_wrap=True,
             highlight=False,
         )
+        print_next("tables", rows_file(self.out))
         return 0
 
 

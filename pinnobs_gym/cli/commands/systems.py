@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.markdown import Markdown
 
-from pinnobs_gym.cli.console import console, print_table
+from pinnobs_gym.cli.console import console, print_next, print_table
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.cli.system_page import page
 from pinnobs_gym.envs.registration import env_id
@@ -34,8 +34,10 @@ class Systems:
                 console.print(Markdown(printable_lines(text), hyperlinks=False))
             else:
                 console.out(text, highlight=False)
+            print_next("evaluate", "--system", self.name)
             return 0
         print_table([[listing()]], "pinnobs systems NAME says more")
+        print_next("systems", "ReverseDuffing")
         return 0
 
 

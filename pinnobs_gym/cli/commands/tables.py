@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from pinnobs_gym.cli.console import console, table_width
+from pinnobs_gym.cli.console import console, print_next, table_width
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.files import replacing
 from pinnobs_gym.leaderboard.board import board
@@ -57,10 +57,13 @@ class Tables:
         if self.out is None:
             lines = text.split("\n")  # control characters of CSV are for files only
             print("\n".join(map(printable, lines) if console.is_terminal else lines))
+            if console.is_terminal:  # elsewhere the tables alone
+                print_next("report", *self.rows, "-o", "site")
             return 0
         with replacing(self.out) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8", errors="replace", newline="\n")
         console.print(f"tables: {self.out}", soft_wrap=True)
+        print_next("report", *self.rows, "-o", "site")
         return 0
 
     def _text(self, found: Sequence[Chapter]) -> str:

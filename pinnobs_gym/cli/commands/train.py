@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import tyro
 
-from pinnobs_gym.cli.console import console
+from pinnobs_gym.cli.console import console, print_next, print_table
 from pinnobs_gym.cli.options import LOG_OPTIONS, by_option, check_apart, parse
 from pinnobs_gym.cli.output import write_figure
 from pinnobs_gym.cli.own_model import ModelOptions
@@ -18,6 +19,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.files import CannotWrite, check_writable
+from pinnobs_gym.leaderboard.grid import Column, Grid
 from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.registry import TRAINERS, trainer_name
 from pinnobs_gym.scoring import acceptance
@@ -71,6 +73,11 @@ class Train(Generic[ConfigType]):
 
 def run(arguments: Sequence[str]) -> int:
     """Train with the trainer named first, and return the command's exit status."""
+    if arguments and arguments[0] in ("-h", "--help"):
+        print_table([[listing()]])
+        console.print("pinnobs train TRAINER --help lists the settings of one.", soft_wrap=True)
+        print_next("train", "kkl_pinn", "--system", "ReverseDuffing", "--budget", 45)
+        return 0
     if not arguments or arguments[0].startswith("-"):
         raise ValueError(f"name a trainer first: pinnobs train {' | '.join(TRAINERS.sources)}")
     spec = arguments[0]
@@ -86,6 +93,7 @@ def run(arguments: Sequence[str]) -> int:
             raise ValueError(
                 f"{earlier} already exists; --resume continues it, --out names another folder"
             )
+    console.print("preparing: simulated episodes, and what is computed once", highlight=False)
     trainer = task.make()
     with Log(chosen.out / "tensorboard" / task.stem.name) as log:
         result = train(trainer, log=log, checkpoint=checkpoint, resume=chosen.resume, progress=True)
@@ -105,7 +113,25 @@ def run(arguments: Sequence[str]) -> int:
     if checkpoint.exists():
         console.print(f"checkpoint: {checkpoint} (--resume continues it)", soft_wrap=True)
     console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
+    online = [label for label, kind in estimators.items() if kind.track == "online"]
+    if task.game is not None and online:
+        setup, condition = task.game.name.setup, task.game.name.condition
+        also = [] if setup == "benchmark" else ["--setup", setup]
+        also += [] if condition == "nominal" else ["--condition", condition]
+        chosen_one = ["--system", chosen.system, *also, "--estimator", online[0]]
+        print_next("evaluate", *chosen_one, "--trained", path)
     return 0
+
+
+def listing() -> Grid:
+    """Return the table of trainers, with the estimators that need each."""
+    columns = tuple(Column(each, numeric=False) for each in ("trainer", "trains", "what it does"))
+    lines = []
+    for name, cls in TRAINERS.classes().items():
+        what = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
+        trained = ", ".join(_estimators_of(cls))
+        lines.append((name, trained, what))
+    return Grid("usage: pinnobs train TRAINER --system NAME ...", columns, tuple(lines))
 
 
 def _save(result: Trained, path: Path, checkpoint: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from pinnobs_gym.cli.console import console, progress
+from pinnobs_gym.cli.console import console, print_next, progress
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators import ESTIMATORS
@@ -28,7 +28,7 @@ from pinnobs_gym.systems import SYSTEMS
 class Tune:
     """Search the settings of estimators on episodes that are never scored. What is searched for is
     the least geometric mean of the steady and the transient NRMSE. Trials are stored, and an
-    interrupted search continues."""
+    interrupted search continues. Needs the extra "tune"."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Names or module:Class of the estimators."""
@@ -64,6 +64,15 @@ class Tune:
                 console.print()
             if not self._run(search):
                 return 130
+        first = searches[0]
+        name, system = ESTIMATORS.spec_of(first.estimator), first.game.name.env_id
+        best = first.best()
+        if best is not None and best.settings and not self.store:
+            given = [f"{key}={value}" for key, value in best.settings.items()]
+            print_next("evaluate", "--system", system, "--estimator", name, "--set", *given)
+        else:
+            tuned = ["--tuned"] * (best is not None and bool(best.settings))
+            print_next("evaluate", "--system", system, "--estimator", name, *tuned)
         return 0
 
     def _searches(self) -> list[Search]:

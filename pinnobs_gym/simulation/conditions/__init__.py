@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.conditions.base import Condition, Outputs, Unknowns
 from pinnobs_gym.simulation.conditions.measurement import (
     Delay,
@@ -40,6 +41,11 @@ class Combined(Condition):
     def reference(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the Cramér-Rao reference applies under every part."""
         return all(part.reference for part in self.parts)
+
+    @property
+    def loses_outputs(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether outputs may be missing under any part."""
+        return any(part.loses_outputs for part in self.parts)
 
     @property
     def summary(self) -> str:
@@ -128,6 +134,7 @@ def canonical_name(name: str) -> str:
         if not isinstance(part, str) or part not in CONDITIONS:
             raise ValueError(
                 f"unknown condition {shortly(part)}; known are {', '.join(CONDITIONS)}"
+                f"{did_you_mean(part, CONDITIONS)}"
             )
     named.sort(key=list(CONDITIONS).index)
     for first, second in pairwise(named):

@@ -75,6 +75,8 @@ class Condition:
     reference: ClassVar[bool] = True
     """Whether the Cramér-Rao reference applies: the model, prior and noise known to the estimators,
     with the process noise, are those of these episodes."""
+    loses_outputs: ClassVar[bool] = False
+    """Whether outputs may be missing."""
 
     @property
     def summary(self) -> str:

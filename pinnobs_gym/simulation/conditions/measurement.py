@@ -83,6 +83,7 @@ class Delay(Condition):
 
     samples: int
     reference = False
+    loses_outputs = True
 
     @property
     def summary(self) -> str:
@@ -134,6 +135,7 @@ class Dropouts(Condition):
 
     probability: float
     known_to_estimators = "which are missing"
+    loses_outputs = True
 
     @property
     def summary(self) -> str:
@@ -153,6 +155,7 @@ class Gap(Condition):
     seconds: float = 1.0
     largest_part: float = 0.2
     known_to_estimators = "which are missing"
+    loses_outputs = True
 
     @property
     def summary(self) -> str:
