@@ -7,29 +7,31 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pinnobs_gym.estimation.compiled_code import noise_at, of_rows
 from pinnobs_gym.estimation.estimator import Estimates, Estimator, State
 from pinnobs_gym.estimation.gaussian import checked
-from pinnobs_gym.estimation.learned.beliefs import BeliefFilter, Beliefs, filters_of, starts
+from pinnobs_gym.estimation.learned.beliefs import OUTLIER_SIZE, Beliefs, starts
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
 from pinnobs_gym.estimation.sigma_points import SigmaPointMemory
 from pinnobs_gym.estimation.takes import EVERYTHING
-from pinnobs_gym.simulation.noise import AssumedNoise
+from pinnobs_gym.estimators.ukf import UKF
+from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.notices import say_once
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.residual import Periods, nearest
 from pinnobs_gym.simulation.system import System
+from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
 
 if TYPE_CHECKING:
     from pinnobs_gym.estimation.export.algorithm import Algorithm
     from pinnobs_gym.simulation.kernels.plant_code import PlantCode
 
-__all__ = ["RobustGain", "RobustGainMemory", "SigmaPointMemory", "TrainedBeliefs"]
+__all__ = ["BeliefFilter", "RobustGain", "RobustGainMemory", "SigmaPointMemory", "TrainedBeliefs"]
 # A saved state of `Live` is made of the dataclasses that this module knows, SigmaPointMemory among
 # them.
 
@@ -40,6 +42,57 @@ _NUMBERS = 2 * 10**7
 _UNLIKELY = 0.02
 """Probability, over that of the likeliest hypothesis, below which one has no part in estimates: a
 filter that has long been lost may be arbitrarily far away."""
+
+
+@dataclass(frozen=True)
+class BeliefFilter(UKF):
+    """The unscented Kalman filter under one belief. What it cannot do is not told: a belief may be
+    far from what is true, and then has no part in the estimate."""
+
+    template = "sigma_points"
+
+    def _say_if_too_large(self, noise: AssumedNoise) -> None:
+        pass
+
+    def _notice(self, function: str) -> str:
+        return ""
+
+
+def filters_of(
+    beliefs: Beliefs, system: System, noise_std: Level | SampledLevel | None, process_noise: Any
+) -> tuple[BeliefFilter, ...]:
+    """Return the filter of each belief: on the model or, where the plant may deviate from it, on
+    the model with these deviations as further states.
+
+    Args:
+        beliefs: the beliefs.
+        system: the model.
+        noise_std: the known output noise, as `BaseEstimator.noise_std`.
+        process_noise: the known process noise, as `BaseEstimator.process_noise`.
+
+    Raises:
+        ValueError: in one line, if the plant has nothing that may deviate.
+    """
+    filters = []
+    known = system.noise(noise_std, process_noise)
+    for noise, deviation, outliers in zip(
+        beliefs.assumed_noise.tolist(),
+        beliefs.deviation.tolist(),
+        beliefs.outliers.tolist(),
+        strict=True,
+    ):
+        plant: System | None = system
+        level = process_noise
+        if deviation:
+            plant = with_uncertain_plant(system, deviation)
+            if plant is None:
+                raise ValueError(f"{type(system).__name__} has nothing that may deviate")
+            L = np.zeros((plant.nx, known.L(0.0).shape[1]))
+            L[: system.nx] = known.L(0.0)[..., 0]
+            level = L.tolist()
+        law = {"outliers": outliers, "outlier_size": OUTLIER_SIZE} if outliers else {}
+        filters.append(BeliefFilter(plant, noise_std, level, assumed_noise=noise, **law))
+    return tuple(filters)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,9 +189,10 @@ P_k = \sum_i p_k^{(i)} \bigl( P_k^{(i)} + (\hat x_k^{(i)} - \hat x_k)(\cdot)^\to
 
     def reset(self, prior: Prior) -> State:
         prior, beliefs = checked(prior), self.trained.beliefs
+        systems = [each.system for each in self.filters]
         states = tuple(
             each.reset(start)
-            for each, start in zip(self.filters, starts(beliefs, self.filters, prior), strict=True)
+            for each, start in zip(self.filters, starts(beliefs, systems, prior), strict=True)
         )
         probability = np.tile(np.exp(beliefs.log_prior), (len(prior.mean), 1))
         memory = RobustGainMemory(states, probability, np.zeros(probability.shape, dtype=bool))
@@ -188,10 +242,10 @@ P_k = \sum_i p_k^{(i)} \bigl( P_k^{(i)} + (\hat x_k^{(i)} - \hat x_k)(\cdot)^\to
     def hypotheses(self, record: Record) -> Estimates:
         """Return the estimates of the filter of each hypothesis, arrays (batch, hypotheses,
         num_samples, ...); see `Beliefs`. Rows that have diverged are not finite."""
-        prior = checked(record.prior)
+        prior, systems = checked(record.prior), [each.system for each in self.filters]
         found = []
         for each, start in zip(
-            self.filters, starts(self.trained.beliefs, self.filters, prior), strict=True
+            self.filters, starts(self.trained.beliefs, systems, prior), strict=True
         ):
             rows = np.repeat(np.arange(record.batch), len(start.mean) // record.batch)
             own = replace(record.rows(rows), prior=start)

@@ -1,22 +1,19 @@
-"""Beliefs about a plant, each with several hypotheses about its initial state, and the filters that
-run under them."""
+"""Beliefs about a plant, each with several hypotheses about its initial state."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pinnobs_gym.estimation.outliers import log_density
-from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.matrices import cholesky
-from pinnobs_gym.simulation.noise import AssumedNoise, Level, SampledLevel
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
-from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
 
 OUTLIER_SIZE = 30.0
 """Standard deviation of outliers, in those of the output noise."""
@@ -134,64 +131,13 @@ SMALL_NOISE = 1e-4
 """Process noise, as in `GaussianEstimator.assumed_noise`, up to which a model counts as right."""
 
 
-@dataclass(frozen=True)
-class BeliefFilter(UKF):
-    """The unscented Kalman filter under one belief. What it cannot do is not told: a belief may be
-    far from what is true, and then has no part in the estimate."""
-
-    template = "sigma_points"
-
-    def _say_if_too_large(self, noise: AssumedNoise) -> None:
-        pass
-
-    def _notice(self, function: str) -> str:
-        return ""
-
-
-def filters_of(
-    beliefs: Beliefs, system: System, noise_std: Level | SampledLevel | None, process_noise: Any
-) -> tuple[BeliefFilter, ...]:
-    """Return the filter of each belief: on the model or, where the plant may deviate from it, on
-    the model with these deviations as further states.
-
-    Args:
-        beliefs: the beliefs.
-        system: the model.
-        noise_std: the known output noise, as `BaseEstimator.noise_std`.
-        process_noise: the known process noise, as `BaseEstimator.process_noise`.
-
-    Raises:
-        ValueError: in one line, if the plant has nothing that may deviate.
-    """
-    filters = []
-    known = system.noise(noise_std, process_noise)
-    for noise, deviation, outliers in zip(
-        beliefs.assumed_noise.tolist(),
-        beliefs.deviation.tolist(),
-        beliefs.outliers.tolist(),
-        strict=True,
-    ):
-        plant: System | None = system
-        level = process_noise
-        if deviation:
-            plant = with_uncertain_plant(system, deviation)
-            if plant is None:
-                raise ValueError(f"{type(system).__name__} has nothing that may deviate")
-            L = np.zeros((plant.nx, known.L(0.0).shape[1]))
-            L[: system.nx] = known.L(0.0)[..., 0]
-            level = L.tolist()
-        law = {"outliers": outliers, "outlier_size": OUTLIER_SIZE} if outliers else {}
-        filters.append(BeliefFilter(plant, noise_std, level, assumed_noise=noise, **law))
-    return tuple(filters)
-
-
-def starts(beliefs: Beliefs, filters: tuple[BeliefFilter, ...], prior: Prior) -> list[Prior]:
+def starts(beliefs: Beliefs, systems: Sequence[System], prior: Prior) -> list[Prior]:
     """Return the prior of the hypotheses of each belief, of batch × hypotheses rows, those of an
     episode one after the other.
 
     Args:
         beliefs: the beliefs.
-        filters: their filters.
+        systems: the model of each, which may have further states.
         prior: the prior of the episodes.
     """
     L = cholesky(prior.cov.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1)
@@ -201,13 +147,13 @@ def starts(beliefs: Beliefs, filters: tuple[BeliefFilter, ...], prior: Prior) ->
     relative = np.einsum("bij,kjl,bml->bkim", L, beliefs.cov, L)
     cov = np.where(told[:, None, None], relative, beliefs.cov)
     found, nx = [], prior.mean.shape[1]
-    for i, each in enumerate(filters):
+    for i, system in enumerate(systems):
         rows = beliefs.belief == i
         own, P = mean[:, rows].reshape(-1, nx), cov[:, rows].reshape(-1, nx, nx)
-        if each.system.nx > nx:
-            more, spread = prior_moments(each.system, each.system.setups["benchmark"])
+        if system.nx > nx:
+            more, spread = prior_moments(system, system.setups["benchmark"])
             own = np.concatenate([own, np.tile(more[nx:], (len(own), 1))], axis=1)
-            larger = np.zeros((len(P), each.system.nx, each.system.nx))
+            larger = np.zeros((len(P), system.nx, system.nx))
             larger[:, :nx, :nx], larger[:, nx:, nx:] = P, spread[nx:, nx:]
             P = larger
         found.append(Prior(own, (P + P.swapaxes(1, 2)) / 2))
