@@ -12,12 +12,13 @@ import numpy as np
 import torch
 
 from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
-from pinnobs_gym.estimators.pinn_obs import Covariance
+from pinnobs_gym.estimators.pinn_obs import Covariance, TrainedNetwork
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.config import PinnObsConfig
 from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
-from trainers.pinn_obs.minimum import FIRST_STEP, Minimiser
+from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.passes import draw_layers, flattened, unflattened
 from trainers.pinn_obs.points import continuous, fast_frequencies, output_scale, points_of
@@ -42,7 +43,7 @@ _NOISY = 5
 """Factor of the number of samples if they are noisy."""
 
 
-class FastRecipe(Recipe):
+class FastRecipe(Recipe[Objective, QuasiNewton]):
     """Minimisation of the loss in scaled quantities by self-scaled Broyden steps.
 
     States are scaled by `System.scale`, or by their range in the guide if that is smaller, outputs
@@ -60,10 +61,9 @@ class FastRecipe(Recipe):
     without it, the gains towards zero.
     """
 
-    def __init__(
-        self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
-    ) -> None:
-        self.config, self.system, self.noise_std = config, system, noise_std
+    def __init__(self, system: System, config: PinnObsConfig, record: Record, noise: Noise) -> None:
+        self.config, self.system = config, system
+        self.noise_std = np.sqrt(np.einsum("iib->i", noise.R(0.0)))
         self.record = record = continuous(system, record)
         t = record.t
         noisy = bool(self.noise_std.any())
@@ -169,6 +169,9 @@ class FastRecipe(Recipe):
     def held_out(self, theta: np.ndarray) -> None:
         return None
 
+    def completed(self, trained: TrainedNetwork) -> TrainedNetwork:
+        return trained
+
     def covariance(self, theta: np.ndarray) -> Covariance | None:
         """Return the smoother's covariances plus the squared deviations of the network's estimates.
 
@@ -181,8 +184,7 @@ class FastRecipe(Recipe):
         away = evaluate(self.architecture, layers, t)[0] - self.guide.smoothed
         return Covariance(t, self.guide.P + away[:, :, None] * away[:, None, :])
 
-    def method_state(self, method: Minimiser) -> dict[str, Any]:
-        assert isinstance(method, QuasiNewton)
+    def method_state(self, method: QuasiNewton) -> dict[str, Any]:
         parts: dict[str, Any] = {"gradient": method.gradient, "direction": method.direction}
         if method.H is not None:
             parts |= {"H_scale": method.H.scale, "H_middle": method.H.middle}

@@ -24,7 +24,7 @@ QUIET = 1e-4
 """Least standard deviation of output noise, over the output's scale."""
 LEAVING = 0.5
 """Time constant with which x̂ leaves x̂₀ for the smoothed states, over the first interval."""
-_CAUTION = 0.2
+CAUTION = 0.2
 """Fraction of HPHᵀ that is added to the output noise of the filters."""
 _CLEAR = 1e-3
 """Least significant innovation, over the output's scale."""
@@ -80,8 +80,8 @@ def guide_of(
     # Smoothed states, and a filter linearised about them for the Riccati gain.
     known_noise = np.maximum(noise, QUIET * y_scale)
     with np.errstate(all="ignore"):
-        path = smooth(system, samples, known_noise, _CAUTION)
-        along = forward(system, samples, known_noise, about=path.xhat, caution=_CAUTION)
+        path = smooth(system, samples, known_noise, CAUTION)
+        along = forward(system, samples, known_noise, about=path.xhat, caution=CAUTION)
     if not all(np.isfinite(part).all() for part in (path.xhat, path.P, along.K)):
         return None
     smoothed, P = path.xhat[:, 0], path.P[..., 0]
@@ -94,7 +94,7 @@ def guide_of(
     if noise.any():  # the Riccati recursion again, from a part of the prior
         prior = Prior(samples.prior.mean, P[0] + _LEFT_OVER**2 * samples.prior.cov)
         with_prior = replace(samples, prior=prior)
-        along = forward(system, with_prior, known_noise, about=path.xhat, caution=_CAUTION)
+        along = forward(system, with_prior, known_noise, about=path.xhat, caution=CAUTION)
     L = on_lines(t, samples.t, observer_gain(samples.t, along))
     # x̂ moves exponentially from x̂₀ to the smoothed states.
     decay = np.exp((t[0] - t) / tau)[:, None]

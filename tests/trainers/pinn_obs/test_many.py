@@ -106,7 +106,8 @@ def test_nothing_leaves_the_device(name):
 @pytest.mark.parametrize("preset", PinnObsTrainer.presets)
 def test_without_a_gpu_it_is_one_after_another(preset):
     system, record, noise = records(batch=2)
-    small = {"depth": 2, "width": 8, "iterations": 4, "device": "cpu"}
+    sizes = {"width": 80} if preset == "posterior" else {"depth": 2, "width": 8, "iterations": 4}
+    small = {**sizes, "device": "cpu"}
     config = PinnObsTrainer.configured({"preset": preset, **small})
     many = train_rows(system, config, record=record, noise_std=noise)
     for i, trained in enumerate(many):
