@@ -64,10 +64,14 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
         "posterior": posterior,
     }
 
+    def __init__(self, *args: Any, recipe: Recipe[Any, Any] | None = None, **options: Any) -> None:
+        self._given = recipe  # one of many that were prepared at once
+        super().__init__(*args, **options)
+
     def start(self) -> None:
         _check(self.system, self.record, self.config)
-        recipe = _RECIPES[self.config.optimiser]
-        self.recipe = recipe(self.system, self.config, self.record, self.noise)
+        kind = _RECIPES[self.config.optimiser]
+        self.recipe = self._given or kind(self.system, self.config, self.record, self.noise)
         self._kept: BestIterate | None = None  # best of the failed attempts
         self._begin(attempt=0)
 
@@ -111,6 +115,12 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             if loss < (1 - self.config.improvement) * self.mark.loss:
                 self.mark = Mark(loss, self.iteration)
             self.best = BestIterate(loss, self.iteration, self.config.seed + self.attempt, theta)
+
+    def reached(self, iteration: int, best: BestIterate, mark: Mark, stuck: bool) -> None:
+        """Take the place of a minimisation elsewhere, of this attempt's weights, after so many
+        iterations; see `took` for its best iterate, whose seed is left out."""
+        self.iteration, self.mark, self.stuck = iteration, mark, stuck
+        self.best = replace(best, seed=self.config.seed + self.attempt)
 
     def _restart(self) -> None:
         """Keep the best weights, and restart from the next seed, or end after the third restart."""
@@ -248,12 +258,15 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             _check(system, row, config)
         device = _device(config)
 
-        def new_trainer(row: Record) -> PinnObsTrainer:
-            return cls(system, config, record=row, noise_std=noise_std, process_noise=process_noise)
+        def new_trainer(row: Record, recipe: FastRecipe | None = None) -> PinnObsTrainer:
+            noise = {"noise_std": noise_std, "process_noise": process_noise}
+            return cls(system, config, record=row, **noise, recipe=recipe)
 
         with deferred_interrupt() as interrupt:
             if folder is None and device != "cpu" and config.optimiser == "ssbroyden":
-                trainers = [new_trainer(row) for row in rows]
+                noise = system.noise(noise_std, process_noise)
+                recipes = FastRecipe.many(system, config, rows, noise)
+                trainers = [new_trainer(*pair) for pair in zip(rows, recipes, strict=True)]
                 advance(trainers, device, interrupt)
                 return [trainer.result() for trainer in trainers]
             if folder is None:
