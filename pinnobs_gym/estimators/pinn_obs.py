@@ -317,7 +317,10 @@ class PinnObs(OfflineEstimator):
 & + w_{\mathrm{ode}} \operatorname{mean}
 \bigl\| \dot{\hat x} - f(t, \hat x, u) - L\, (y - h(t, \hat x, u)) \bigr\|^2 \\
 & + w_{\mathrm{guide}} \operatorname{mean} \| \hat x - x^{\mathrm{smoother}} \|^2
-+ w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2
++ w_{\mathrm{gain}} \operatorname{mean} \| L - L^{\mathrm{Riccati}} \|^2 \\
+\text{or, preset posterior:} \; \min_\vartheta \; & \| \hat x(t_0) - \hat x_0 \|^2_{P_0^{-1}}
++ \textstyle\sum_k \| y_k - h(t_k, \hat x, u) \|^2_{R^{-1}}
++ \int \| \dot{\hat x} - f(t, \hat x, u) \|^2_{Q^{-1}} \, dt
 """
     exempt_from = {
         name: reason

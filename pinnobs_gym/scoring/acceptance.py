@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimation.estimator import BaseEstimator
+from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.scoring.metrics import DIVERGED
 from pinnobs_gym.scoring.playing import Played, play
 from pinnobs_gym.scoring.rows import Row
@@ -13,6 +16,10 @@ from pinnobs_gym.simulation.initial_set import prior_moments
 
 OTHER_SEEDS = (0, 1)
 """Seeds of the episodes with other initial states, where the setup draws these."""
+ELSEWHERE = 10
+"""Number of episodes of the set on which an estimator is judged, of the seeds from 0 on."""
+_WORTH = 0.5
+"""Median error over that of the model alone up to which an estimator is worth something."""
 SMALL_LOSS = 1e-5
 """Training loss below which a good observer would be expected."""
 
@@ -71,3 +78,49 @@ def warning(loss: float, own: Row) -> str | None:
         f"the loss of {loss:.2g} tells nothing here: between t0 and the first sample no residual "
         "is taken, x̂ jumps there to the trajectory, and the gain is arbitrary"
     )
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """What an estimator that was trained on one record is worth on others."""
+
+    nrmse: float
+    """Median NRMSE over the episodes; infinite if most are not finite."""
+    alone: float
+    """That of the model alone, from the same initial estimates."""
+    diverged: int
+    """Number of episodes in which the estimator diverged."""
+    episodes: int
+    """Number of episodes."""
+
+    @property
+    def worth(self) -> bool:
+        """Whether it diverges nowhere, and halves the error of the model alone."""
+        return self.diverged == 0 and self.nrmse <= _WORTH * self.alone
+
+    @property
+    def line(self) -> str:
+        """All of this in one line."""
+        verdict = "worth something" if self.worth else "worth nothing"
+        return (
+            f"{verdict} on other records: of {self.episodes} from the initial set {self.diverged} "
+            f"diverged, median NRMSE {self.nrmse:.3g}, the model alone {self.alone:.3g}"
+        )
+
+
+def elsewhere(estimator: BaseEstimator, game: Game) -> Elsewhere | None:
+    """Run an estimator on episodes of a game from initial states of its set, and the model alone.
+
+    If the setup has a single initial state, the states are those of the setup ``benchmark``; None
+    if this has a single one, too.
+    """
+    source, seeds, x0 = game.source, range(ELSEWHERE), None
+    if source.fixed_x0:
+        benchmark = Game.of(game.system, "benchmark")
+        if benchmark.source.fixed_x0:
+            return None
+        x0 = benchmark.episodes(seeds).x[0]
+    model = ESTIMATORS.resolve("open_loop").for_setup(source.system, source.setup)
+    own, alone = (play(game, one, seeds, x0).scores_alone for one in (estimator, model))
+    nrmse, of_model = (float(np.median(np.nan_to_num(s.nrmse, nan=np.inf))) for s in (own, alone))
+    return Elsewhere(nrmse, of_model, int(np.sum(own.diverged)), ELSEWHERE)

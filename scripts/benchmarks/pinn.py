@@ -1,5 +1,5 @@
 """PINN-Obs by three recipes on all six systems: the paper's, a fast one with the paper's loss, and
-the fast one guided by a Kalman smoother of the same record."""
+the fast one guided by a Kalman smoother of the same record; and its posterior beside a smoother."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from paper_case import Case
+from pinn_posterior import posteriors
 from plain_network import Network
 from three_recipes import GUIDED, SEEDS, paper_setup
 from three_recipes import readme_table as readme_table
@@ -44,6 +45,7 @@ def figures(repeats: int) -> Iterator[Figure]:
     yield from transfers(duffing)
     for name in SYSTEMS.classes():
         yield from paper_setup(name)
+    yield from posteriors()
 
 
 def iteration_seconds(case: Case, repeats: int) -> tuple[float, float]:

@@ -340,6 +340,9 @@ def test_train_evaluate_and_refuse_another_system(folder, capsys):
     printed = capsys.readouterr().out
     assert "after 20 iterations" in printed
     assert "pinn_obs_replay on own record" in printed
+    assert re.search(
+        "pinn_obs_replay is worth (some|no)thing on other records: of 10 from", printed
+    )
     (trained,) = (path for path in Path("tr").glob("*.pt") if "checkpoint" not in path.name)
     assert len(list(Path("tr").glob("*.png"))) == 4
     before = trained.read_bytes()

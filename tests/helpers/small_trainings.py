@@ -147,9 +147,10 @@ def network_of(trained):
     return network
 
 
-def train_pinn_obs(system, config, *, record, noise_std=0.0, **options):
+def train_pinn_obs(system, config, *, record, noise_std=0.0, process_noise=None, **options):
     """What `train` makes of a training of PINN-Obs; by default of outputs without noise."""
-    return train(PinnObsTrainer(system, config, record=record, noise_std=noise_std), **options)
+    told = {"noise_std": noise_std, "process_noise": process_noise}
+    return train(PinnObsTrainer(system, config, record=record, **told), **options)
 
 
 def same_weights(one, other):

@@ -97,8 +97,7 @@ def test_smoothed_trajectories_of_a_compass_are_explained():
 
 
 def recipe(system, record):
-    noise = np.array([0.05])
-    return FastRecipe(system, replace(guided(), points=60, width=6), record, noise)
+    return FastRecipe(system, replace(guided(), points=60, width=6), record, system.noise(0.05))
 
 
 def turning():

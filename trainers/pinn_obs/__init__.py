@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +23,13 @@ from pinnobs_gym.simulation.system import System
 from pinnobs_gym.training.log import Log
 from pinnobs_gym.training.loop import deferred_interrupt, train
 from pinnobs_gym.training.trainer import Trainer
-from trainers.pinn_obs.config import PinnObsConfig, guided, paper, plain, transfer
+from trainers.pinn_obs.config import PinnObsConfig, guided, paper, plain, posterior, transfer
 from trainers.pinn_obs.fast_recipe import FastRecipe
 from trainers.pinn_obs.minimum import BestIterate, Mark, Minimiser
 from trainers.pinn_obs.paper_recipe import PaperRecipe
 from trainers.pinn_obs.passes import unflattened
 from trainers.pinn_obs.pictures import figures
+from trainers.pinn_obs.posterior_recipe import PosteriorRecipe
 from trainers.pinn_obs.recipe import Recipe
 from trainers.pinn_obs.stacked import advance
 
@@ -37,7 +38,11 @@ if TYPE_CHECKING:
 
 MIN_SAMPLES = 10
 """Fewest samples of a record."""
-_RECIPES: dict[str, type[Recipe]] = {"adam": PaperRecipe, "ssbroyden": FastRecipe}
+_RECIPES: dict[str, type[Recipe[Any, Any]]] = {
+    "adam": PaperRecipe,
+    "ssbroyden": FastRecipe,
+    "levenberg_marquardt": PosteriorRecipe,
+}
 _RESTARTS = 3
 _TERMS = ("initial", "equation", "output")
 
@@ -51,12 +56,22 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
 
     name = "pinn_obs"
     takes = PinnObsReplay.takes
-    presets = {"guided": guided, "plain": plain, "transfer": transfer, "paper": paper}
+    presets = {
+        "guided": guided,
+        "plain": plain,
+        "transfer": transfer,
+        "paper": paper,
+        "posterior": posterior,
+    }
+
+    def __init__(self, *args: Any, recipe: Recipe[Any, Any] | None = None, **options: Any) -> None:
+        self._given = recipe  # one of many that were prepared at once
+        super().__init__(*args, **options)
 
     def start(self) -> None:
         _check(self.system, self.record, self.config)
-        recipe = _RECIPES[self.config.optimiser]
-        self.recipe = recipe(self.system, self.config, self.record, self.noise_std)
+        kind = _RECIPES[self.config.optimiser]
+        self.recipe = self._given or kind(self.system, self.config, self.record, self.noise)
         self._kept: BestIterate | None = None  # best of the failed attempts
         self._begin(attempt=0)
 
@@ -77,12 +92,12 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
 
     def step(self) -> None:
         """Make one iteration; the first one only evaluates the initial weights."""
-        lower = True
-        if self._method is None:
-            self._method = self.recipe.begin(self._first)
+        method, lower = self._method, True
+        if method is None:
+            method = self._method = self.recipe.begin(self._first)
         else:
-            lower = self._method.step(self.recipe.objective)
-        self.took(self._method.f, self._method.x, lower)
+            lower = method.step(self.recipe.objective)
+        self.took(method.f, method.x, lower)
 
     def took(self, loss: float, theta: np.ndarray, lower: bool = True) -> None:
         """Count an iteration, and keep its weights if their loss is the least.
@@ -100,6 +115,12 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             if loss < (1 - self.config.improvement) * self.mark.loss:
                 self.mark = Mark(loss, self.iteration)
             self.best = BestIterate(loss, self.iteration, self.config.seed + self.attempt, theta)
+
+    def reached(self, iteration: int, best: BestIterate, mark: Mark, stuck: bool) -> None:
+        """Take the place of a minimisation elsewhere, of this attempt's weights, after so many
+        iterations; see `took` for its best iterate, whose seed is left out."""
+        self.iteration, self.mark, self.stuck = iteration, mark, stuck
+        self.best = replace(best, seed=self.config.seed + self.attempt)
 
     def _restart(self) -> None:
         """Keep the best weights, and restart from the next seed, or end after the third restart."""
@@ -189,7 +210,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
                 f"the loss of PINN-Obs on {type(self.system).__name__} left the finite numbers from"
                 f" seed {self.config.seed} and the {self.attempt} after it{advice}"
             )
-        return TrainedNetwork(
+        trained = TrainedNetwork(
             **self.facts(loss=self._total(self._terms(best.theta)), seed=best.seed),
             architecture=self.recipe.architecture,
             layers=unflattened(self.recipe.architecture, best.theta),
@@ -199,6 +220,7 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             recipe=self.config.recipe,
             knows=self.config.knows,
         )
+        return replace(self.recipe.completed(trained), seconds=self.seconds)
 
     def figures(self, trained: TrainedNetwork) -> dict[str, Figure]:
         return figures(self.system, trained)
@@ -236,12 +258,15 @@ class PinnObsTrainer(Trainer[PinnObsConfig, TrainedNetwork]):
             _check(system, row, config)
         device = _device(config)
 
-        def new_trainer(row: Record) -> PinnObsTrainer:
-            return cls(system, config, record=row, noise_std=noise_std, process_noise=process_noise)
+        def new_trainer(row: Record, recipe: FastRecipe | None = None) -> PinnObsTrainer:
+            noise = {"noise_std": noise_std, "process_noise": process_noise}
+            return cls(system, config, record=row, **noise, recipe=recipe)
 
         with deferred_interrupt() as interrupt:
             if folder is None and device != "cpu" and config.optimiser == "ssbroyden":
-                trainers = [new_trainer(row) for row in rows]
+                noise = system.noise(noise_std, process_noise)
+                recipes = FastRecipe.many(system, config, rows, noise)
+                trainers = [new_trainer(*pair) for pair in zip(rows, recipes, strict=True)]
                 advance(trainers, device, interrupt)
                 return [trainer.result() for trainer in trainers]
             if folder is None:

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 from pinnobs_gym.estimation.learned.mlp import Activation, Architecture, Precision
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
-Optimiser: TypeAlias = Literal["adam", "ssbroyden"]
+Optimiser: TypeAlias = Literal["adam", "ssbroyden", "levenberg_marquardt"]
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 
@@ -33,17 +33,19 @@ class PinnObsConfig(TrainingConfig):
     """Weight of the outputs in the loss."""
     guide: float = 10.0
     """Weight of the scaled squared deviation of x̂ from the guide, a Kalman smoother's estimates of
-    the same record; 0 is the paper's loss without a guide, as Adam requires."""
+    the same record; 0 is the paper's loss without a guide, as Adam and the
+    posterior require."""
     transfer: bool = False
     """Whether the gain is meant for other records, too, so that x̂ leaves x̂₀ only as fast as the
     Riccati gain allows; needs the guide."""
     gain_penalty: float = 0.1
     """Weight of the scaled squared deviation of the gain from the guide's, or from zero without a
-    guide; 0 with Adam."""
+    guide; 0 with Adam and the posterior."""
     learning_rate: float = 1e-3
     """Constant step size of Adam."""
     optimiser: Optimiser = "ssbroyden"
-    """Minimiser of the loss: Adam (the paper's recipe), or self-scaled Broyden (the fast one)."""
+    """Minimiser of the loss: Adam (the paper's recipe), self-scaled Broyden (the fast one), or
+    Levenberg-Marquardt (the posterior)."""
     iterations: int = 3000
     """Largest number of iterations."""
     patience: int = 300
@@ -66,6 +68,8 @@ class PinnObsConfig(TrainingConfig):
 
     @property
     def recipe(self) -> str:
+        if self.optimiser == "levenberg_marquardt":
+            return "posterior"
         if self.guide:
             return "guided by a smoother"
         return "paper's recipe" if self.optimiser == "adam" else "paper's loss"
@@ -88,14 +92,26 @@ class PinnObsConfig(TrainingConfig):
         )
         check_setting(self, "train_fraction", "a number over 0 and at most 1", lambda v: 0 < v <= 1)
         check_whole(self, ("points",), least=10 if self.optimiser == "ssbroyden" else 0)
-        if self.optimiser == "ssbroyden":
-            check_setting(self, "dtype", "float64 with ssbroyden", lambda v: v == "float64")
-            check_setting(self, "train_fraction", "1.0 with ssbroyden", lambda v: v == 1)
+        if self.optimiser != "adam":
+            by = f"with {self.optimiser}"
+            check_setting(self, "dtype", f"float64 {by}", lambda v: v == "float64")
+            check_setting(self, "train_fraction", f"1.0 {by}", lambda v: v == 1)
         if not self.guide:
             check_setting(self, "transfer", "False without a guide", lambda v: v is False)
-        if self.optimiser == "adam":
+        if self.optimiser != "ssbroyden":
             for name in ("guide", "gain_penalty"):
-                check_setting(self, name, "0 with adam", lambda v: v == 0)
+                check_setting(self, name, f"0 with {self.optimiser}", lambda v: v == 0)
+        if self.optimiser == "levenberg_marquardt":
+            self._check_posterior()
+
+    def _check_posterior(self) -> None:
+        """Check the settings of the posterior, whose weights are those of a probability."""
+        by = f"with {self.optimiser}"
+        for name in ("w0", "w_ode", "w_y"):
+            check_setting(self, name, f"1 {by}, a probability", lambda v: v == 1)
+        check_setting(self, "depth", f"1 {by}", lambda v: v == 1)
+        check_setting(self, "activation", f"tanh {by}", lambda v: v == "tanh")
+        check_setting(self, "points", f"0 {by}", lambda v: v == 0)
 
 
 def guided() -> PinnObsConfig:
@@ -129,4 +145,21 @@ def paper() -> PinnObsConfig:
         dtype="float32",
         checkpoint_every=1000,
         log_every=100,
+    )
+
+
+def posterior() -> PinnObsConfig:
+    """The most probable path of a network, given the outputs, the prior and the noise, and its
+    covariance; no smoother."""
+    return PinnObsConfig(
+        depth=1,
+        width=200,
+        optimiser="levenberg_marquardt",
+        iterations=100,
+        patience=100,
+        points=0,
+        guide=0.0,
+        gain_penalty=0.0,
+        checkpoint_every=10,
+        log_every=1,
     )

@@ -5,19 +5,20 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
 from pinnobs_gym.estimation.learned.mlp import Architecture, evaluate
-from pinnobs_gym.estimators.pinn_obs import Covariance
-from pinnobs_gym.simulation.record import Record
+from pinnobs_gym.estimators.pinn_obs import Covariance, TrainedNetwork
+from pinnobs_gym.simulation.noise import Noise
+from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.config import PinnObsConfig
-from trainers.pinn_obs.guide import LEAVING, Guide, guide_of
-from trainers.pinn_obs.minimum import FIRST_STEP, Minimiser
+from trainers.pinn_obs.guide import LEAVING, Guide, Tracks, guide_of, least_noise, tracks_of
+from trainers.pinn_obs.minimum import FIRST_STEP
 from trainers.pinn_obs.objective import Lead, Objective, Weights
 from trainers.pinn_obs.passes import draw_layers, flattened, unflattened
 from trainers.pinn_obs.points import continuous, fast_frequencies, output_scale, points_of
@@ -42,7 +43,7 @@ _NOISY = 5
 """Factor of the number of samples if they are noisy."""
 
 
-class FastRecipe(Recipe):
+class FastRecipe(Recipe[Objective, QuasiNewton]):
     """Minimisation of the loss in scaled quantities by self-scaled Broyden steps.
 
     States are scaled by `System.scale`, or by their range in the guide if that is smaller, outputs
@@ -61,9 +62,15 @@ class FastRecipe(Recipe):
     """
 
     def __init__(
-        self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
+        self,
+        system: System,
+        config: PinnObsConfig,
+        record: Record,
+        noise: Noise,
+        tracks: Tracks | None = None,
     ) -> None:
-        self.config, self.system, self.noise_std = config, system, noise_std
+        self.config, self.system = config, system
+        self.noise_std = np.sqrt(np.einsum("iib->i", noise.R(0.0)))
         self.record = record = continuous(system, record)
         t = record.t
         noisy = bool(self.noise_std.any())
@@ -74,7 +81,7 @@ class FastRecipe(Recipe):
         length, interval = float(t[-1] - t[0]), float(t[1] - t[0])
         unit = length / UNITS
         y_scale = output_scale(system, self.record)
-        self.guide = self._guide_of(samples, y_scale)
+        self.guide = self._guide_of(samples, y_scale, tracks)
         x_scale = self._state_scale()
         per_gain = x_scale[:, None] / y_scale / unit
         quiet = np.minimum(1.0, (NOISE * y_scale / np.maximum(self.noise_std, 1e-100)) ** 2)
@@ -102,12 +109,42 @@ class FastRecipe(Recipe):
         )
         self.objective = Objective(self.architecture, system, self.points, weights, lead)
 
-    def _guide_of(self, samples: Record, y_scale: np.ndarray) -> Guide | None:
+    @classmethod
+    def many(
+        cls, system: System, config: PinnObsConfig, rows: Sequence[Record], noise: Noise
+    ) -> list[FastRecipe]:
+        """Return the recipes of records of one episode each, with the same sample times. The
+        filters of their guides are run on all of them at once."""
+        if not config.guide:
+            return [cls(system, config, row, noise) for row in rows]
+        std = np.sqrt(np.einsum("iib->i", noise.R(0.0)))
+        most = config.points * (_NOISY if std.any() else 1)
+        alike: dict[bytes, tuple[np.ndarray, dict[int, Record]]] = {}
+        for i, row in enumerate(rows):  # those with the same noise together
+            whole = continuous(system, row)
+            told = least_noise(std, output_scale(system, whole))
+            group = alike.setdefault(told.tobytes(), (told, {}))[1]
+            group[i] = points_of(system, whole, most)[1]
+        tracks: dict[int, Tracks] = {}
+        for told, group in alike.values():
+            parts = list(group.values())
+            y, u = (np.concatenate([getattr(p, name) for p in parts]) for name in ("y", "u"))
+            mean, cov = (
+                np.concatenate([getattr(p.prior, name) for p in parts]) for name in ("mean", "cov")
+            )
+            batch = Record(parts[0].t, y, u, Prior(mean, cov))
+            found = tracks_of(system, batch, told, bool(std.any()) and not config.transfer)
+            tracks |= {i: found.row(k) for k, i in enumerate(group)}
+        return [cls(system, config, row, noise, tracks[i]) for i, row in enumerate(rows)]
+
+    def _guide_of(
+        self, samples: Record, y_scale: np.ndarray, tracks: Tracks | None
+    ) -> Guide | None:
         """Return the guide at the points; None, with a warning, if no smoother stays finite."""
         if not self.config.guide:
             return None
         about = (self.system, samples, self.points, self.noise_std, y_scale)
-        guide = guide_of(*about, self.config.transfer)
+        guide = guide_of(*about, self.config.transfer, tracks)
         if guide is None:
             message = f"no smoother follows this record of {type(self.system).__name__}"
             warnings.warn(f"{message}; training has no guide", stacklevel=2)
@@ -169,6 +206,9 @@ class FastRecipe(Recipe):
     def held_out(self, theta: np.ndarray) -> None:
         return None
 
+    def completed(self, trained: TrainedNetwork) -> TrainedNetwork:
+        return trained
+
     def covariance(self, theta: np.ndarray) -> Covariance | None:
         """Return the smoother's covariances plus the squared deviations of the network's estimates.
 
@@ -181,8 +221,7 @@ class FastRecipe(Recipe):
         away = evaluate(self.architecture, layers, t)[0] - self.guide.smoothed
         return Covariance(t, self.guide.P + away[:, :, None] * away[:, None, :])
 
-    def method_state(self, method: Minimiser) -> dict[str, Any]:
-        assert isinstance(method, QuasiNewton)
+    def method_state(self, method: QuasiNewton) -> dict[str, Any]:
         parts: dict[str, Any] = {"gradient": method.gradient, "direction": method.direction}
         if method.H is not None:
             parts |= {"H_scale": method.H.scale, "H_middle": method.H.middle}

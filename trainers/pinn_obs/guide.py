@@ -10,21 +10,24 @@ trainings from different seeds reach the same minimum.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
-from pinnobs_gym.estimation.smoother import Filtered
+from pinnobs_gym.estimation.smoother import Filtered, Path
 from pinnobs_gym.simulation.record import Prior, Record
 from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.objective import Points
 from trainers.pinn_obs.points import on_lines
 from trainers.pinn_obs.smoother import forward, smooth
 
+PathT = TypeVar("PathT", bound=Path)
+
 QUIET = 1e-4
 """Least standard deviation of output noise, over the output's scale."""
 LEAVING = 0.5
 """Time constant with which x̂ leaves x̂₀ for the smoothed states, over the first interval."""
-_CAUTION = 0.2
+CAUTION = 0.2
 """Fraction of HPHᵀ that is added to the output noise of the filters."""
 _CLEAR = 1e-3
 """Least significant innovation, over the output's scale."""
@@ -52,6 +55,66 @@ class Guide:
     """Covariances of the smoothed states, shape (num_samples, nx, nx)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """What filters and smoothers find of the samples of a batch of records."""
+
+    path: Path
+    """The smoothed states and their covariances."""
+    along: Filtered
+    """A filter linearised about them."""
+    partly: Filtered | None
+    """The same from a part of the prior's covariance; None if that was not asked for."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether all of it is finite."""
+        parts = (self.path.xhat, self.path.P, self.along.K)
+        return all(np.isfinite(part).all() for part in parts)
+
+    def row(self, row: int) -> Tracks:
+        """Return those of one record."""
+
+        def of(path: PathT) -> PathT:
+            parts = {}
+            for name, part in vars(path).items():
+                if isinstance(part, Path):
+                    parts[name] = of(part)
+                else:
+                    at = (slice(None), [row]) if name == "xhat" else (..., [row])
+                    parts[name] = part[at]
+            return replace(path, **parts)
+
+        return Tracks(of(self.path), of(self.along), self.partly and of(self.partly))
+
+
+def least_noise(noise: np.ndarray, y_scale: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (ny,) of the output noise that the filters are told, given the
+    known ones and the scales of the outputs, (ny,) each."""
+    return np.maximum(noise, QUIET * y_scale)
+
+
+def tracks_of(system: System, samples: Record, told: np.ndarray, again: bool) -> Tracks:
+    """Run the filters and the smoother of the guide on the samples of a batch of records at once.
+
+    Args:
+        system: the model.
+        samples: the samples of the records.
+        told: see `least_noise`; the same for all records.
+        again: whether to run a filter from a part of the prior, too.
+    """
+    with np.errstate(all="ignore"):
+        path, partly = smooth(system, samples, told, CAUTION), None
+        along = forward(system, samples, told, about=path.xhat, caution=CAUTION)
+        if again:
+            cov = path.P[0].transpose(2, 0, 1) + _LEFT_OVER**2 * samples.prior.cov
+            finite = np.isfinite(cov).all(axis=(1, 2), keepdims=True)  # others have no guide
+            cov = np.where(finite, cov, samples.prior.cov)
+            part = replace(samples, prior=Prior(samples.prior.mean, cov))
+            partly = forward(system, part, told, about=path.xhat, caution=CAUTION)
+    return Tracks(path, along, partly)
+
+
 def guide_of(
     system: System,
     samples: Record,
@@ -59,6 +122,7 @@ def guide_of(
     noise: np.ndarray,
     y_scale: np.ndarray,
     transfer: bool = False,
+    tracks: Tracks | None = None,
 ) -> Guide | None:
     """Compute the guide of a record of one episode; None if the smoother does not stay finite.
 
@@ -76,25 +140,22 @@ def guide_of(
         noise: standard deviations of the output noise, shape (ny,), in output units.
         y_scale: scales of the outputs, shape (ny,).
         transfer: use the filter's estimate in any case, so that the gain is the Riccati gain alone.
+        tracks: see `tracks_of`, of this record; computed if None.
     """
     # Smoothed states, and a filter linearised about them for the Riccati gain.
-    known_noise = np.maximum(noise, QUIET * y_scale)
-    with np.errstate(all="ignore"):
-        path = smooth(system, samples, known_noise, _CAUTION)
-        along = forward(system, samples, known_noise, about=path.xhat, caution=_CAUTION)
-    if not all(np.isfinite(part).all() for part in (path.xhat, path.P, along.K)):
+    if tracks is None:
+        again = bool(noise.any()) and not transfer
+        tracks = tracks_of(system, samples, least_noise(noise, y_scale), again)
+    if not tracks.finite:
         return None
-    smoothed, P = path.xhat[:, 0], path.P[..., 0]
+    smoothed, P, along = tracks.path.xhat[:, 0], tracks.path.P[..., 0], tracks.along
     t, tau = points.t, LEAVING * (samples.t[1] - samples.t[0])
     first = system.output_residual(points.y[0], system.h(t[0], points.xhat0, points.u[0]))
     first = abs(first) * points.present[0]
     if transfer or not (first > _SIGNIFICANT * np.maximum(noise, _CLEAR * y_scale)).any():
         L = on_lines(t, samples.t, observer_gain(samples.t, along))
         return Guide(on_lines(t, samples.t, along.xhat[:, 0]), L, samples.t, smoothed, P)
-    if noise.any():  # the Riccati recursion again, from a part of the prior
-        prior = Prior(samples.prior.mean, P[0] + _LEFT_OVER**2 * samples.prior.cov)
-        with_prior = replace(samples, prior=prior)
-        along = forward(system, with_prior, known_noise, about=path.xhat, caution=_CAUTION)
+    along = tracks.partly or along  # the Riccati recursion from a part of the prior
     L = on_lines(t, samples.t, observer_gain(samples.t, along))
     # x̂ moves exponentially from x̂₀ to the smoothed states.
     decay = np.exp((t[0] - t) / tau)[:, None]

@@ -1,13 +1,11 @@
-"""The interface of minimisers, and the best iterate of a training."""
+"""The interfaces of losses and minimisers, and the best iterate of a training."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-
-from trainers.pinn_obs.objective import Objective
 
 FIRST_STEP = 0.3
 """First trial step of the line searches of self-scaled Broyden on this loss. Their minima lie near
@@ -36,6 +34,15 @@ class Mark:
     iteration: int
 
 
+class Loss(Protocol):
+    """What a recipe minimises, as a function of the weights of a network."""
+
+    def terms(self, theta: np.ndarray) -> np.ndarray:
+        """Return the terms of the loss (3,) at weights theta (n,): those of the initial estimate,
+        of the equation and of the outputs."""
+        ...
+
+
 class Minimiser(Protocol):
     """A minimisation in progress."""
 
@@ -44,6 +51,7 @@ class Minimiser(Protocol):
     f: float
     """The loss at x."""
 
-    def step(self, objective: Objective) -> bool:
-        """Make one iteration; return False if no lower loss is found."""
+    def step(self, objective: Any) -> bool:
+        """Make one iteration on the recipe's loss; return False if it is the last one, since no
+        lower loss is found."""
         ...

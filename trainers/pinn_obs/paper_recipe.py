@@ -9,18 +9,19 @@ import numpy as np
 import torch
 
 from pinnobs_gym.estimation.learned.mlp import Architecture
+from pinnobs_gym.estimators.pinn_obs import TrainedNetwork
+from pinnobs_gym.simulation.noise import Noise
 from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import System
 from trainers.pinn_obs.adam import Adam
 from trainers.pinn_obs.config import PinnObsConfig
-from trainers.pinn_obs.minimum import Minimiser
 from trainers.pinn_obs.objective import Objective, Weights
 from trainers.pinn_obs.passes import draw_layers, flattened
 from trainers.pinn_obs.points import samples_of
 from trainers.pinn_obs.recipe import Recipe
 
 
-class PaperRecipe(Recipe):
+class PaperRecipe(Recipe[Objective, Adam]):
     """Adam on all training samples at once, with the config's weights of the loss terms.
 
     The network's input is the time in s as in the paper, whose records begin at zero, but counted
@@ -28,9 +29,7 @@ class PaperRecipe(Recipe):
     saturated, and training would find nothing but a constant.
     """
 
-    def __init__(
-        self, system: System, config: PinnObsConfig, record: Record, noise_std: np.ndarray
-    ) -> None:
+    def __init__(self, system: System, config: PinnObsConfig, record: Record, noise: Noise) -> None:
         self.config, self.system, self.record = config, system, record
         sizes = (system.nx, system.ny, config.depth, config.width)
         start = float(record.t[0])
@@ -62,11 +61,13 @@ class PaperRecipe(Recipe):
         terms = self._held_out.terms(theta)
         return float(terms @ [config.w0, config.w_ode, config.w_y])
 
+    def completed(self, trained: TrainedNetwork) -> TrainedNetwork:
+        return trained
+
     def covariance(self, theta: np.ndarray) -> None:
         return None
 
-    def method_state(self, method: Minimiser) -> dict[str, Any]:
-        assert isinstance(method, Adam)
+    def method_state(self, method: Adam) -> dict[str, Any]:
         names = ("x", "f", "gradient", "mean", "square", "steps")
         return {name: getattr(method, name) for name in names}
 

@@ -57,10 +57,10 @@ def points_of(system: System, record: Record, most: int) -> tuple[Points, Record
     halves = np.diff(times) / (t[-1] - t[0]) / 2
     weights = np.append(halves, 0.0) + np.append(0.0, halves)
     output = weights[:, None] * present
-    u = _measured(system, times, record) if system.measured_input else system.input(times)
+    u = inputs_at(system, times, record)
     points = Points(
         times,
-        np.asarray(u),
+        u,
         np.where(present, y, 0.0),
         present.astype(float),
         weights,
@@ -93,9 +93,11 @@ def samples_of(system: System, record: Record, chosen: np.ndarray) -> Points:
     )
 
 
-def _measured(system: System, times: np.ndarray, record: Record) -> np.ndarray:
-    """Return measured inputs (num_times, nu) at times within a record of one episode, as
-    `System.input_hold` says."""
+def inputs_at(system: System, times: np.ndarray, record: Record) -> np.ndarray:
+    """Return the inputs (num_times, nu) at times within a record of one episode; measured ones are
+    between samples as `System.input_hold` says."""
+    if not system.measured_input:
+        return np.asarray(system.input(times))
     if system.input_hold == "linear":
         return on_lines(times, record.t, record.u[0])
     last = np.searchsorted(record.t, times, side="right") - 1

@@ -23,7 +23,7 @@ SUFFICIENT_DECREASE = 1e-4
 """c₁ of the strong Wolfe conditions."""
 CURVATURE = 0.9
 """c₂ of the strong Wolfe conditions."""
-_TRIALS = 25
+TRIALS = 25
 """Largest number of trials of a line search."""
 _APART = 16
 """Number of updates of the inverse Hessian that are added to the matrix at a time."""
@@ -110,7 +110,7 @@ def trials(f: float, slope: float, first: float, curvature: float) -> Search:
         return trial.f <= start.f + SUFFICIENT_DECREASE * trial.step * start.slope
 
     low, high, step = start, None, first
-    for _ in range(_TRIALS):
+    for _ in range(TRIALS):
         f, slope = yield step
         trial = Trial(step, f if math.isfinite(f) else math.inf, slope)
         # Shrink the bracket; low has the least f so far that satisfies the first condition.

@@ -223,6 +223,9 @@ def _report_training(
             f"last 25 % {row['nrmse_tail']:.4g}",
             highlight=False,
         )
-    if estimator.track == "online" and (message := acceptance.warning(loss, replays[0].scores)):
-        console.print(f"warning: {message}", style="yellow")
+    if estimator.track == "online":
+        if (found := acceptance.elsewhere(estimator, game)) is not None:
+            console.print(f"{label} is {found.line}", highlight=False, soft_wrap=True)
+        if message := acceptance.warning(loss, replays[0].scores):
+            console.print(f"warning: {message}", style="yellow")
     return replays[0].played

@@ -13,7 +13,10 @@ from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.training.loop import Interrupt
 from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
+from trainers.pinn_obs.fast_recipe import FastRecipe
 from trainers.pinn_obs.objective import Objective, Weights
+from trainers.pinn_obs.quasi_newton import CURVATURE, trials
+from trainers.pinn_obs.searches import Searches
 from trainers.pinn_obs.stacked import Minimisations, advance
 
 # few points make quick tests
@@ -82,14 +85,65 @@ def test_a_minimisation_without_a_way_down_ends():
     nothing = Weights(np.zeros(system.nx), np.zeros(system.nx), np.zeros(system.ny))
     lead = replace(second.lead, by_xhat=0 * second.lead.by_xhat, by_L=0 * second.lead.by_L)
     flat = Objective(second.architecture, system, second.points, nothing, lead)
-    state = Minimisations([first, flat], np.stack([run.theta for run in runs]), "cpu")
-    _, ended = state.round()
-    assert ended == [1]
-    before = state.x[1]
-    made = [state.round()[0] for _ in range(5)]
-    assert any(0 in rows for rows in made)
-    assert np.array_equal(state.x[1], before)
-    assert np.isfinite(state.x).all()
+    starts = np.stack([run.theta for run in runs])
+    state = Minimisations([first, flat], starts, [1, 1], "cpu", SMALL)
+    state.round()
+    assert state.progress.live.tolist() == [True, False]
+    for _ in range(5):
+        state.round()
+    (made, best, _, stuck), (ended, other, _, flat_stuck) = state.reached()
+    assert made > 1
+    assert (stuck, ended, flat_stuck) == (False, 2, True)
+    assert np.array_equal(other.theta, starts[1])
+    assert np.isfinite(best.theta).all()
+
+
+def test_no_number_is_read_back_within_a_round():
+    """On the meta device, which has none."""
+    system, record, noise = records(batch=2)
+    runs = runs_of(system, record, noise, replace(SMALL, guide=0.0))
+    objectives, starts = [r.recipe.objective for r in runs], np.stack([r.theta for r in runs])
+    state = Minimisations(objectives, starts, [1, 1], "meta", SMALL)
+    for _ in range(2):
+        state.round()
+    assert state.progress.best.device.type == "meta"
+
+
+def test_searches_at_once_are_those_one_by_one():
+    """On functions with several minima, without one, and not finite beyond a step."""
+    functions = [
+        lambda a: (np.cos(3 * a) - a, -3 * np.sin(3 * a) - 1),
+        lambda a: ((a - 5.0) ** 2, 2 * (a - 5.0)),
+        lambda a: (-a, -1.0),
+        lambda a: (a**4 - a, 4 * a**3 - 1) if a < 0.9 else (np.inf, np.nan),
+        lambda a: (abs(a - 1e-3), -1.0 if a < 1e-3 else 1.0),
+        lambda a: (1e3 * (a - 0.011) ** 2, 2e3 * (a - 0.011)),
+    ]
+    first = [0.3, 0.1, 1.0, 2.0, 1.0, 0.7]
+    starts = np.array([function(0.0) for function in functions])
+    singles = [trials(f, slope, a, CURVATURE) for (f, slope), a in zip(starts, first, strict=True)]
+    steps, found = [next(search) for search in singles], [None] * len(functions)
+    f, slope = torch.tensor(starts).T
+    together = Searches(len(functions), f)
+    together.begin(torch.ones(len(functions)) > 0, f, slope, torch.tensor(first, dtype=f.dtype))
+    for _ in range(30):
+        values = [
+            function(a) for function, a in zip(functions, together.step.tolist(), strict=True)
+        ]
+        for i, search in enumerate(singles):
+            if found[i] is None:
+                assert together.step[i].item() == pytest.approx(steps[i], rel=1e-9)
+                try:
+                    steps[i] = search.send(values[i])
+                except StopIteration as stop:
+                    found[i] = stop.value
+        accepted, failed = together.advance(*torch.tensor(values, dtype=f.dtype).T)
+        for i, (yes, no) in enumerate(zip(accepted.tolist(), failed.tolist(), strict=True)):
+            assert not yes or found[i] is True
+            assert not no or found[i] is False
+        assert together.active.tolist() == [value is None for value in found]
+    assert True in found
+    assert False in found
 
 
 @pytest.mark.parametrize("name", list(SYSTEMS.classes()))
@@ -106,7 +160,8 @@ def test_nothing_leaves_the_device(name):
 @pytest.mark.parametrize("preset", PinnObsTrainer.presets)
 def test_without_a_gpu_it_is_one_after_another(preset):
     system, record, noise = records(batch=2)
-    small = {"depth": 2, "width": 8, "iterations": 4, "device": "cpu"}
+    sizes = {"width": 80} if preset == "posterior" else {"depth": 2, "width": 8, "iterations": 4}
+    small = {**sizes, "device": "cpu"}
     config = PinnObsTrainer.configured({"preset": preset, **small})
     many = train_rows(system, config, record=record, noise_std=noise)
     for i, trained in enumerate(many):
@@ -148,3 +203,37 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch):
     with pytest.raises(ValueError, match="device='tpu'; expected auto, cpu or cuda"):
         PinnObsConfig(device="tpu")
     assert train_rows(system, SMALL, record=record, noise_std=noise)[0].iterations == 25
+
+
+@pytest.mark.parametrize("preset", ["guided", "transfer"])
+def test_guides_of_a_batch_are_those_of_single_records(preset):
+    """Also of one whose outputs make another noise, and of one with a gap."""
+    system, record, std = records("Satellite", batch=3)
+    record = record.first_samples(120)
+    record.y[1, 30:40] = np.nan
+    config = PinnObsTrainer.configured({"preset": preset, "depth": 1, "width": 4, "points": 40})
+    rows, noise = [record.rows(slice(i, i + 1)) for i in range(3)], system.noise(std)
+    for one, row in zip(FastRecipe.many(system, config, rows, noise), rows, strict=True):
+        alone = FastRecipe(system, config, row, noise)
+        for name in ("xhat", "L", "smoothed", "P"):
+            found, expected = (getattr(recipe.guide, name) for recipe in (one, alone))
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * abs(expected).max())
+
+
+def test_training_many_on_a_device_goes_by_the_batch(monkeypatch):
+    """With the CPU in place of a GPU."""
+    system, record, noise = records(batch=2)
+    monkeypatch.setattr("trainers.pinn_obs._device", lambda config: "cuda")
+    called = []
+
+    def on_cpu(trainers, device, interrupt):
+        called.append(device)
+        advance(trainers, "cpu", interrupt)
+
+    monkeypatch.setattr("trainers.pinn_obs.advance", on_cpu)
+    many = train_rows(system, SMALL, record=record, noise_std=noise)
+    assert called == ["cuda"]
+    for i, trained in enumerate(many):
+        alone = train_pinn_obs(system, SMALL, record=record.rows(slice(i, i + 1)), noise_std=noise)
+        assert trained.loss == pytest.approx(alone.loss, rel=1e-6)
+        assert (trained.iterations, trained.ending) == (alone.iterations, "finished")
