@@ -137,6 +137,9 @@ class RobustGain(LearnedEstimator, Estimator):
 
     Noise, prior and sample times are those that the estimator is told, which may differ from those
     of the training.
+
+    When to choose it: where the model may be wrong and nobody knows how, or outputs tell the state
+    only after a while, and a training of a minute and fifty times the time of `ukf` are no matter.
     """
 
     trained: TrainedBeliefs = field(kw_only=True, repr=False)
