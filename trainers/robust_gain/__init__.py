@@ -27,7 +27,7 @@ from pinnobs_gym.training.trainer import Trainer
 from trainers.robust_gain.conditions import draw_condition, model_is_right
 from trainers.robust_gain.config import RobustGainConfig
 from trainers.robust_gain.dictionary import RIGHT, dictionary, right
-from trainers.robust_gain.fitting import Evidence, fit
+from trainers.robust_gain.fitting import Evidence, fit, joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,25 +83,32 @@ class RobustGainTrainer(Trainer[RobustGainConfig, TrainedBeliefs]):
         rng = np.random.default_rng((self.config.seed, number))
         condition, game = draw_condition(rng, self.base.system), self.game.nominal
         source = EpisodeSource(game.system, game.name.setup, condition, **game.changes)
-        first = self.episode + number * self.config.per_condition
-        episodes = source.play(
-            source.draw(source.streams(range(first, first + self.config.per_condition)))
-        )
-        record = source.record(episodes)
-        truth = episodes.x[: record.num_samples].swapaxes(0, 1)
-        sound = np.isfinite(truth).all(axis=(1, 2)) & ~np.isinf(record.y).any(axis=(1, 2))
-        if sound.any():
-            rows = np.flatnonzero(sound)
-            self.evidence.append(self._look(source, record.rows(rows), truth[rows]))
+        first, size = self.episode + number * self.config.per_condition, self.config.per_condition
+        found = self._looks(source, list(range(first, first + size)))
+        if found:
+            self.evidence.append(joined(found))
             self.right.append(model_is_right(condition))
         self.iteration += 1
-        self.latest = float(sound.mean())
+        self.latest = float(sum(len(each.weight) for each in found))
         if self.iteration >= HELD_OUT and 2 * len(self.evidence) < self.iteration:
             lost = self.iteration - len(self.evidence)
             raise ValueError(
                 f"the states of {type(self.system).__name__} leave the finite numbers in all "
                 f"episodes of {lost} of {self.iteration} conditions; expected at most half"
             )
+
+    def _looks(self, source: EpisodeSource, seeds: list[int]) -> list[Evidence]:
+        """Return what the filters say of the episodes of these seeds: of all together or, if one
+        leaves the finite numbers, of each of the others."""
+        try:
+            episodes = source.play(source.draw(source.streams(seeds)))
+        except FloatingPointError:
+            if len(seeds) == 1:
+                return []
+            return [each for seed in seeds for each in self._looks(source, [seed])]
+        record = source.record(episodes)
+        truth = episodes.x[: record.num_samples].swapaxes(0, 1)
+        return [self._look(source, record, truth)]
 
     def _look(self, source: EpisodeSource, record: Record, truth: np.ndarray) -> Evidence:
         """Return what the filters say of a record with these true states (batch, num_samples,
@@ -150,11 +157,8 @@ class RobustGainTrainer(Trainer[RobustGainConfig, TrainedBeliefs]):
         if right.any() and not right.all():
             trust = self.config.trust
             weight = np.where(right, trust / right.mean(), (1 - trust) / (1 - right.mean()))
-        return Evidence(
-            np.concatenate([self.evidence[i].outputs for i in numbers]),
-            np.concatenate([self.evidence[i].states for i in numbers]),
-            weight,
-        )
+        parts = joined([self.evidence[i] for i in numbers])
+        return Evidence(parts.outputs, parts.states, weight)
 
     def finished(self) -> bool:
         return self.iteration >= self.config.iterations
@@ -166,7 +170,7 @@ class RobustGainTrainer(Trainer[RobustGainConfig, TrainedBeliefs]):
         return f"{self.iteration} conditions, {len(self.whole.weight)} beliefs"
 
     def curves(self) -> Mapping[str, float]:
-        return {"episodes/finite": self.latest}
+        return {"looks": self.latest}
 
     def result(self) -> TrainedBeliefs:
         """Return the beliefs that are left, with their probabilities.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +64,15 @@ class Evidence:
         if by_outputs:
             share = (share - np.exp(told - of_outputs[:, None])) * np.exp(value - floored)[:, None]
         return loss, -(scale @ share)
+
+
+def joined(parts: Sequence[Evidence]) -> Evidence:
+    """Return the looks of several pieces of evidence together."""
+    return Evidence(
+        np.concatenate([each.outputs for each in parts]),
+        np.concatenate([each.states for each in parts]),
+        np.concatenate([each.weight for each in parts]),
+    )
 
 
 def _log_sum(values: np.ndarray) -> np.ndarray:
