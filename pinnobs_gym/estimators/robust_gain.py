@@ -97,8 +97,9 @@ def filters_of(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedBeliefs(Trained):
-    """Learned beliefs. Their loss is the mean negative logarithm of the density of the true scaled
-    states at samples of held-out episodes or, if they were learned from outputs alone, of these."""
+    """Learned beliefs. Their loss is the mean negative logarithm of the density of the true states
+    at samples of held-out episodes, over that of the filter that is best there in hindsight; or
+    that of the outputs, if they were learned from outputs alone."""
 
     beliefs: Beliefs
     """The beliefs that were kept."""

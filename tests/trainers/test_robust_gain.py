@@ -152,7 +152,9 @@ def test_the_fit_finds_the_proportions_of_a_mixture():
 def replace_weights(weight):
     count = len(weight)
     return Beliefs(
-        *(np.zeros(count) for _ in range(3)),
+        assumed_noise=np.ones(count),
+        deviation=np.zeros(count),
+        outliers=np.tile([0.0, 0.1], count // 2),
         absolute=np.zeros(count, dtype=bool),
         weight=weight,
         belief=np.arange(count),

@@ -186,14 +186,17 @@ class RobustGainTrainer(Trainer[RobustGainConfig, TrainedBeliefs]):
                 f"(budget={self.config.budget}); expected at least {HELD_OUT}, one of them held out"
             )
         learned = self._gathered([i for i in range(number) if i not in held])
-        # One of the levels of process noise with which the model counts as right is kept.
-        weight = fit(self.whole, learned)
-        near = [weight[right(self.whole, level)].sum() for level in RIGHT]
-        least = [level for level in RIGHT if level != RIGHT[int(np.argmax(near))]]
-        kept = np.flatnonzero(~np.any([right(self.whole, level) for level in least], axis=0))
-        hypotheses = np.flatnonzero(np.isin(self.whole.belief, kept))
-        beliefs = self.whole.kept(kept, np.full(len(kept), 1 / len(kept)))
-        beliefs = self.whole.kept(kept, fit(beliefs, learned.of(hypotheses)))
+        # Of the levels of process noise with which the model counts as right, the best is kept.
+        found = []
+        for noise in RIGHT:
+            others = [right(self.whole, other) for other in RIGHT if other != noise]
+            kept = np.flatnonzero(~np.any(others, axis=0))
+            hypotheses = np.flatnonzero(np.isin(self.whole.belief, kept))
+            part = learned.of(hypotheses)
+            beliefs = self.whole.kept(kept, np.full(len(kept), 1 / len(kept)))
+            beliefs = self.whole.kept(kept, fit(beliefs, part))
+            found.append((part.loss(beliefs.log_prior)[0], beliefs, hypotheses))
+        _, beliefs, hypotheses = min(found, key=lambda each: each[0])
         loss, _ = self._gathered(held).of(hypotheses).loss(beliefs.log_prior)
         return self._trained(beliefs, loss)
 

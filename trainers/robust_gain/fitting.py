@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pinnobs_gym.estimation.learned.beliefs import Beliefs
+from pinnobs_gym.estimation.learned.beliefs import SMALL_NOISE, Beliefs
 
-FLOOR = -40.0
-"""Logarithm of the density below which an episode counts no more: no belief explains it."""
+FLOOR = -8.0
+"""Logarithm of the density, over that of the best filter in hindsight, below which it counts no
+more: few looks at which all likely filters are wrong would outweigh all others."""
 RIDGE = 1e-4
 """Weight of the squares of the logarithms of probabilities in the loss, which thus has one
 minimum."""
@@ -44,24 +45,26 @@ class Evidence:
     def loss(
         self, log_prior: np.ndarray, gradient: bool = False
     ) -> tuple[float, np.ndarray | None]:
-        """Return the mean negative logarithm of the density of states or, if they are not used, of
-        outputs, and its derivatives by the logarithms of the hypotheses' probabilities.
+        """Return the mean negative logarithm of the density of states, over that of the best filter
+        in hindsight, or, if states are not used, of the density of outputs; and its derivatives by
+        the logarithms of the hypotheses' probabilities.
 
         With w ∝ p₀·p(outputs), the density of the state is Σ w·p(state).
         """
         told = self.outputs + log_prior
         of_outputs = _log_sum(told)
-        by_outputs = self.states.any()
+        by_states = self.states.any()
         both = told + self.states
         of_both = _log_sum(both)
-        value = of_both - of_outputs if by_outputs else of_outputs
-        floored = np.logaddexp(value, FLOOR) if by_outputs else value
+        best = self.states.max(axis=1)
+        value = of_both - of_outputs - best if by_states else of_outputs
+        floored = np.logaddexp(value, FLOOR) if by_states else value
         scale = self.weight / self.weight.sum()
         loss = -float(scale @ floored)
         if not gradient:
             return loss, None
         share = np.exp(both - of_both[:, None])
-        if by_outputs:
+        if by_states:
             share = (share - np.exp(told - of_outputs[:, None])) * np.exp(value - floored)[:, None]
         return loss, -(scale @ share)
 
@@ -110,6 +113,9 @@ def fit(beliefs: Beliefs, evidence: Evidence) -> np.ndarray:
     # No probability is nearly zero, whatever the episodes say.
     kind = (1 - CAUTION) * kind + CAUTION / kinds
     kind = np.where(beliefs.deviation[::2] > 0, SCARCE * kind, kind)
+    # The prior that will be told may be better than the set of the training, or worse.
+    right = (beliefs.deviation == 0) & (beliefs.assumed_noise <= SMALL_NOISE) & ~beliefs.wide
+    kind[right[::2]] = kind[right[::2]].mean()
     kind = kind / kind.sum()
     outliers = (1 - CAUTION) * outliers + CAUTION / 2
     return (kind[:, None] * outliers).ravel()
