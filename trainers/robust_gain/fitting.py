@@ -115,7 +115,8 @@ def fit(beliefs: Beliefs, evidence: Evidence) -> np.ndarray:
     kind = np.where(beliefs.deviation[::2] > 0, SCARCE * kind, kind)
     # The prior that will be told may be better than the set of the training, or worse.
     right = (beliefs.deviation == 0) & (beliefs.assumed_noise <= SMALL_NOISE) & ~beliefs.wide
-    kind[right[::2]] = kind[right[::2]].mean()
+    if right.any():
+        kind[right[::2]] = kind[right[::2]].mean()
     kind = kind / kind.sum()
     outliers = (1 - CAUTION) * outliers + CAUTION / 2
     return (kind[:, None] * outliers).ravel()
