@@ -62,7 +62,7 @@ def help_text(name: str) -> str:
             contextlib.redirect_stderr(io.StringIO()),
         ):
             status = main(arguments)
-        if status == 0 and "--" in text.getvalue():
+        if status == 0 and "-h, " in text.getvalue():
             return text.getvalue()
     raise ValueError(f"pinnobs {name} --help prints no options")
 

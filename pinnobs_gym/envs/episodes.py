@@ -112,8 +112,8 @@ class EpisodeSource:
         self.system, chosen = cls.configured(setup, **changes)
         if self.system.draws_input:
             self.system = replace(self.system, measured_input=True)
-        named = parse_condition(condition) if isinstance(condition, str) else condition
-        self.condition: Condition = named
+        given = isinstance(condition, Condition)
+        self.condition: Condition = condition if given else parse_condition(condition)
         self.condition.plant(self.system, ())  # raises if the condition does not apply
         self.setup = self.condition.setup(self.system, chosen)
         self.fixed_x0 = self.setup.fixed_x0

@@ -122,5 +122,8 @@ def elsewhere(estimator: BaseEstimator, game: Game) -> Elsewhere | None:
         x0 = benchmark.episodes(seeds).x[0]
     model = ESTIMATORS.resolve("open_loop").for_setup(source.system, source.setup)
     own, alone = (play(game, one, seeds, x0).scores_alone for one in (estimator, model))
-    nrmse, of_model = (float(np.median(np.nan_to_num(s.nrmse, nan=np.inf))) for s in (own, alone))
+    with np.errstate(over="ignore"):  # errors of what diverges may be huge
+        nrmse, of_model = (
+            float(np.median(np.nan_to_num(each.nrmse, nan=np.inf))) for each in (own, alone)
+        )
     return Elsewhere(nrmse, of_model, int(np.sum(own.diverged)), ELSEWHERE)

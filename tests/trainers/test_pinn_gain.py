@@ -66,6 +66,9 @@ def test_a_network_that_changes_nothing_is_the_ekf(name):
     own = gain_of(source.system, noise_std=std).run(record)
     for field in fields(ekf):
         expected = getattr(ekf, field.name)
+        if expected is None:  # neither tells it
+            assert getattr(own, field.name) is None
+            continue
         np.testing.assert_allclose(
             getattr(own, field.name), expected, rtol=1e-11, atol=1e-11 * abs(expected).max()
         )

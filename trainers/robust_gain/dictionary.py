@@ -14,7 +14,7 @@ from pinnobs_gym.simulation.matrices import cholesky
 from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
 from trainers.robust_gain.config import RobustGainConfig
 
-RIGHT = (1e-5, 1e-4)
+RIGHT = (1e-5, 3e-5, 1e-4)
 """Process noise of the beliefs that the model is right, of which one is kept: with the smaller one,
 a plant that contracts may have a covariance below the error of the model's steps."""
 DEVIATING = 1e-4

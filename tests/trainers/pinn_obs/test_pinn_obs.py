@@ -602,14 +602,6 @@ def test_each_row_is_trained_on_alone(tmp_path):
     assert not np.array_equal(xhat[0], xhat[1])
 
 
-def test_the_bar_shows_where_training_stands(capsys):
-    system, record = duffing()
-    train_pinn_obs(system, SMALL, record=record, progress=True)
-    shown = capsys.readouterr().out
-    assert "60 iterations" in shown
-    assert "best" in shown
-
-
 @pytest.mark.parametrize("iterations", [30, 40])
 def test_a_loss_that_leaves_the_finite_numbers_late_costs_nothing_found_before(
     monkeypatch, iterations
