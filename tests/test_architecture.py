@@ -57,7 +57,7 @@ def test_importing_the_package_imports_no_system() -> None:
 
 
 def zoo_exceptions() -> list[str]:
-    """The imports within the zoos that the contract of imports allows, as "importer -> imported"."""
+    """The imports within the zoos that the contract allows, as "importer -> imported"."""
     settings = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))
     return settings["tool"]["importlinter"]["contracts"][2]["ignore_imports"]
 
