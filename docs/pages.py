@@ -261,7 +261,7 @@ def trainer_page(name: str, cls: type[Trainer[Any, Any]]) -> str:
         for label, _, meaning in _settings(config, {f.name for f in fields(config)})
     ]
     call = f"```sh\npinnobs train {name} --system ReverseDuffing\n```\n"
-    presets = [(f"`{preset}`", docstring(function)) for preset, function in cls.presets.items()]
+    presets = [(f"`{preset}`", first_line(function)) for preset, function in cls.presets.items()]
     return "\n".join(
         [
             f"# {name}\n",

@@ -25,7 +25,7 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import vector
 from pinnobs_gym.training.trainer import Trainer
 from trainers.robust_gain.conditions import draw_condition, model_is_right
-from trainers.robust_gain.config import RobustGainConfig
+from trainers.robust_gain.config import RobustGainConfig, from_outputs
 from trainers.robust_gain.dictionary import RIGHT, dictionary, right
 from trainers.robust_gain.fitting import Evidence, fit, joined
 
@@ -49,10 +49,7 @@ class RobustGainTrainer(Trainer[RobustGainConfig, TrainedBeliefs]):
     name = "robust_gain"
     takes = RobustGain.takes
     simulates = True
-    presets = {
-        "default": RobustGainConfig,
-        "outputs": lambda: RobustGainConfig(supervision="outputs"),
-    }
+    presets = {"default": RobustGainConfig, "outputs": from_outputs}
 
     def start(self) -> None:
         self.base = self.game.nominal.source

@@ -67,3 +67,8 @@ class RobustGainConfig(TrainingConfig):
 
 def _ascending(values: tuple[float, ...]) -> bool:
     return all(a < b for a, b in zip((0.0, *values), (*values, math.inf), strict=True))
+
+
+def from_outputs() -> RobustGainConfig:
+    """The beliefs that make simulated outputs most probable; no true state is used."""
+    return RobustGainConfig(supervision="outputs")
