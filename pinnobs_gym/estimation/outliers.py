@@ -40,12 +40,21 @@ class OutlierLaw:
             S: covariances of the innovations, shape (ny, ny, batch).
             R: covariance of the output noise, shape (ny, ny, batch or 1).
         """
-        own, noise = _variances(S), _variances(R)
+        factor = self.factors(innovation, _variances(S), _variances(R))
+        return R * np.sqrt(factor[:, None] * factor)
+
+    def factors(self, innovation: np.ndarray, own: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the factors, at least 1, of the variances of the output noise, shape (ny, ...).
+
+        Args:
+            innovation: y − ŷ, shape (ny, ...); zero where y is missing.
+            own: variances of the innovations, same shape.
+            noise: variances of the output noise, same shape or one that it can be repeated to.
+        """
         wide = own + (self.size**2 - 1) * noise
         probability = self._probability(innovation, own, wide)
         mean_inverse = (1 - probability) / own + probability / wide
-        factor = np.maximum((1 / mean_inverse - own) / noise + 1, 1)
-        return R * np.sqrt(factor[:, None] * factor)
+        return np.maximum((1 / mean_inverse - own) / noise + 1, 1)
 
     def _probability(self, innovation: np.ndarray, own: np.ndarray, wide: np.ndarray) -> np.ndarray:
         """Return the posterior probabilities of outliers, given the variances of the innovations

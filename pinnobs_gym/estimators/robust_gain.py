@@ -17,6 +17,7 @@ from pinnobs_gym.estimation.gaussian import checked
 from pinnobs_gym.estimation.learned.beliefs import OUTLIER_SIZE, Beliefs, starts
 from pinnobs_gym.estimation.learned.trained import LearnedEstimator, Trained
 from pinnobs_gym.estimation.learned.trained_file import check_same
+from pinnobs_gym.estimation.outliers import OutlierLaw
 from pinnobs_gym.estimation.sigma_points import SigmaPointMemory
 from pinnobs_gym.estimation.takes import EVERYTHING
 from pinnobs_gym.estimators.ukf import UKF
@@ -120,6 +121,19 @@ class RobustGainMemory:
     """Probabilities of the hypotheses, shape (hypotheses, batch)."""
     lost: np.ndarray
     """Which filters have diverged, bool, shape (hypotheses, batch)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """The noise with which samples were used, and the beliefs behind it."""
+
+    process_noise: np.ndarray
+    """Root mean square of the process noise, as `GaussianEstimator.assumed_noise`, shape (batch,
+    num_samples)."""
+    output_noise: np.ndarray
+    """Factor of each output's standard deviation, at least 1, shape (batch, num_samples, ny)."""
+    beliefs: np.ndarray
+    """Probabilities of the beliefs, shape (batch, num_samples, beliefs)."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +256,29 @@ P_k = \sum_i p_k^{(i)} \bigl( P_k^{(i)} + (\hat x_k^{(i)} - \hat x_k)(\cdot)^\to
         own = self.trained.beliefs
         sums = [probability[..., own.belief == i].sum(axis=-1) for i in range(len(own.weight))]
         return np.stack(sums, axis=-1)
+
+    def adaptation(self, record: Record) -> Adaptation:
+        """Return how a record makes the estimator adapt: the means, over the hypotheses with their
+        probabilities, of the noise with which they use each sample."""
+        beliefs, found = self.trained.beliefs, self.hypotheses(record)
+        assert found.innovation is not None
+        assert found.S is not None
+        probability = np.concatenate([part for _, part in self._blocks(record)])
+        belief, (batch, _, n, ny) = beliefs.belief, found.innovation.shape
+        factor = np.ones((batch, n, ny))
+        R = np.einsum("nii->ni", noise_at(self.noise, record.t)[..., 0])
+        for i in np.flatnonzero(beliefs.outliers):
+            law, rows = OutlierLaw(float(beliefs.outliers[i]), OUTLIER_SIZE), belief == i
+            with np.errstate(all="ignore"):
+                larger = law.factors(
+                    np.moveaxis(found.innovation[:, rows], -1, 0),
+                    np.moveaxis(np.einsum("bknii->bkni", found.S[:, rows]), -1, 0),
+                    np.broadcast_to(R, (n, ny)).T[:, None, None],
+                )
+            larger = np.moveaxis(np.where(np.isfinite(larger), larger, 1.0), 0, -1)
+            factor += np.einsum("bnk,bkni->bni", probability[..., rows], larger - 1)
+        variance = probability @ beliefs.assumed_noise[belief] ** 2
+        return Adaptation(np.sqrt(variance), np.sqrt(factor), self.beliefs(record))
 
     def hypotheses(self, record: Record) -> Estimates:
         """Return the estimates of the filter of each hypothesis, arrays (batch, hypotheses,

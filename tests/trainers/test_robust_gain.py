@@ -237,3 +237,23 @@ def test_its_beliefs_have_names():
     assert "process noise 0.1, outliers" in names
     assert "plant off by 10 %" in names
     assert "start of the training" in names
+
+
+def test_it_tells_the_noise_with_which_it_used_each_sample():
+    """An outlier is used with more noise, and a later model that is wrong with more process
+    noise."""
+    game = Game.of("ReverseDuffing")
+    record = game.record([0])
+    estimator = made("robust_gain")
+    beliefs = estimator.trained.beliefs
+    quiet = estimator.adaptation(record)
+    assert quiet.output_noise.min() >= 1
+    sums = quiet.beliefs.sum(axis=-1)
+    np.testing.assert_allclose(sums, 1, rtol=1e-12)
+    mean = np.sqrt(quiet.beliefs @ beliefs.assumed_noise**2)
+    np.testing.assert_allclose(quiet.process_noise, mean, rtol=1e-12)
+    y = record.y.copy()
+    y[0, 500] += 2.0  # 100 standard deviations
+    loud = estimator.adaptation(replace(record, y=y))
+    np.testing.assert_allclose(loud.output_noise[0, :500], quiet.output_noise[0, :500], rtol=1e-9)
+    assert loud.output_noise[0, 500, 0] > 10
