@@ -11,6 +11,7 @@ from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimation.learned.beliefs import Beliefs, Layout, divided
 from pinnobs_gym.simulation.initial_set import prior_moments
 from pinnobs_gym.simulation.matrices import cholesky
+from pinnobs_gym.simulation.system import vector
 from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
 from trainers.robust_gain.config import RobustGainConfig
 
@@ -39,7 +40,7 @@ class Kind(NamedTuple):
     deviation: float = 0.0
     """The standard deviation of what the plant deviates by."""
     absolute: bool = False
-    """Whether the hypotheses are in state units."""
+    """Whether the hypotheses are in scales of the states."""
 
 
 def dictionary(source: EpisodeSource, config: RobustGainConfig) -> Beliefs:
@@ -59,6 +60,8 @@ def dictionary(source: EpisodeSource, config: RobustGainConfig) -> Beliefs:
     wide = _scaled(divided(normal, config.wide, config.seed), config.spread)
     mean, cov = prior_moments(system, source.setup)
     L = cholesky(cov[..., None], semidefinite=True)[..., 0]
+    scale = vector(system.scale, system.nx, "scale")
+    L, mean = L / scale[:, None], mean / scale
     set_itself = Layout(near.share, mean + near.mean @ L.T, L @ near.cov @ L.T)
     kinds = [Kind(near, noise) for noise in RIGHT]
     kinds += [Kind(set_itself, DEVIATING, absolute=True), Kind(wide, DEVIATING)]

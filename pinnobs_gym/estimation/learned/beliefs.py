@@ -26,7 +26,7 @@ class Beliefs:
     A belief says how large the process noise is, whether parameters or rates of the plant deviate
     from those of the model, and whether outputs have outliers. Each of its hypotheses is a Gaussian
     law of the initial state, given for a prior of mean 0 and covariance I or, where a belief is
-    that the initial set is that of the training whatever the prior, in state units.
+    that the initial set is that of the training whatever the prior, in scales of the states.
     """
 
     assumed_noise: np.ndarray
@@ -37,7 +37,7 @@ class Beliefs:
     outliers: np.ndarray
     """Probability that an output is an outlier, shape (beliefs,); 0 for none."""
     absolute: np.ndarray
-    """Whether the initial laws of a belief are given in state units, bool, shape (beliefs,)."""
+    """Whether the initial laws of a belief are given in scales, bool, shape (beliefs,)."""
     weight: np.ndarray
     """Probability of each belief before the first sample, shape (beliefs,)."""
     belief: np.ndarray
@@ -143,10 +143,12 @@ def starts(beliefs: Beliefs, systems: Sequence[System], prior: Prior) -> list[Pr
     L = cholesky(prior.cov.transpose(1, 2, 0), semidefinite=True).transpose(2, 0, 1)
     told = ~beliefs.absolute[beliefs.belief]
     relative = prior.mean[:, None] + np.einsum("bij,kj->bki", L, beliefs.mean)
-    mean = np.where(told[:, None], relative, beliefs.mean)
+    nx = prior.mean.shape[1]
+    scale = np.array(systems[0].scale[:nx], dtype=float)
+    mean = np.where(told[:, None], relative, scale * beliefs.mean)
     relative = np.einsum("bij,kjl,bml->bkim", L, beliefs.cov, L)
-    cov = np.where(told[:, None, None], relative, beliefs.cov)
-    found, nx = [], prior.mean.shape[1]
+    cov = np.where(told[:, None, None], relative, scale[:, None] * beliefs.cov * scale)
+    found = []
     for i, system in enumerate(systems):
         rows = beliefs.belief == i
         own, P = mean[:, rows].reshape(-1, nx), cov[:, rows].reshape(-1, nx, nx)
