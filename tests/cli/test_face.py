@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import fields
 from importlib.metadata import version
 
 import pytest
@@ -11,7 +12,7 @@ from pinnobs_gym.cli import COMMANDS, main
 from pinnobs_gym.cli.commands.estimators import settings
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
-from pinnobs_gym.registry import did_you_mean
+from pinnobs_gym.registry import TRAINERS, did_you_mean
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.academic import Academic
 from pinnobs_gym.training.progress import in_terminal, shown_progress
@@ -29,6 +30,15 @@ def test_help_of_train_names_the_trainers_and_the_estimators_that_they_make(caps
     said = capsys.readouterr().out
     assert "pinn_obs_direct, pinn_obs_replay" in said
     assert "next: pinnobs train " in said
+
+
+@pytest.mark.parametrize("name", TRAINERS.sources)
+def test_every_trainer_has_help_with_its_settings(name, capsys):
+    """No setting has the name of an option of the command itself."""
+    assert main(["train", name, "--help"]) == 0
+    said = capsys.readouterr().out
+    for field in fields(TRAINERS.resolve(name).configured({})):
+        assert f"--{field.name.replace('_', '-')}" in said
 
 
 @pytest.mark.parametrize("spec", ["Academic", "pinnobs/Academic-v0", "Academic-v0"])

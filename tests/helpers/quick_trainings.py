@@ -13,7 +13,7 @@ GAIN = {"episodes": 10, "held_out": 3, "width": 6, "iterations": 3, "streams": 6
 AGENT = {"steps": 256, "rows": 4, "rollout": 16, "batch": 32, "epochs": 2, "width": 8}
 BANK = {
     **{"iterations": 4, "per_condition": 2, "near": 2, "wide": 2},
-    **{"process_noise": (0.1,), "deviation": (0.1,)},
+    **{"noise_levels": (0.1,), "deviation": (0.1,)},
 }
 QUICK = {
     "kkl_autoencoder": KKL,

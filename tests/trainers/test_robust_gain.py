@@ -2,11 +2,14 @@
 against derivatives, known proportions and a plant that escapes."""
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
+from angles import Compass
 from linear import H, Linear, process_covariance, runge_kutta_matrix
+from other_motions import Counted, Exact
+from pendulum import NoisyPendulum
 from quick_trainings import QUICK, made
 from scipy.stats import multivariate_normal
 
@@ -18,6 +21,7 @@ from pinnobs_gym.estimators.robust_gain import RobustGain, TrainedBeliefs
 from pinnobs_gym.registry import TRAINERS
 from pinnobs_gym.simulation.system import Setup, System, stack
 from pinnobs_gym.training.by_name import train_by_name, trainer_of
+from pinnobs_gym.training.checkpoint import save_checkpoint
 from trainers.robust_gain.conditions import draw_condition
 from trainers.robust_gain.fitting import Evidence, fit
 
@@ -122,6 +126,15 @@ def test_parts_of_a_law_have_its_mean_and_covariance():
         np.testing.assert_allclose(second, draws.T @ draws / len(draws), atol=1e-12)
 
 
+def test_a_law_of_a_few_states_has_a_part_for_each():
+    states = np.array([[0.0, 1.0], [2.0, -1.0], [4.0, 0.5]])
+    share, mean, cov = divided(np.repeat(states, [10, 30, 60], axis=0), 8, 0)
+    order = np.argsort(mean[:, 0])
+    np.testing.assert_allclose(mean[order], states)
+    np.testing.assert_allclose(share[order], [0.1, 0.3, 0.6])
+    np.testing.assert_allclose(cov, 0, atol=1e-15)
+
+
 def evidence_of(rng, states, looks=200, hypotheses=6):
     outputs = 3 * rng.standard_normal((looks, hypotheses))
     density = 2 * rng.standard_normal((looks, hypotheses)) if states else np.zeros_like(outputs)
@@ -210,7 +223,7 @@ def test_a_system_whose_simulations_escape_is_refused_in_a_line():
 
 
 def test_a_budget_without_a_held_out_look_is_refused_in_a_line():
-    config = TRAINERS.resolve("robust_gain").configured({**QUICK["robust_gain"], "iterations": 2})
+    config = TRAINERS.resolve("robust_gain").configured(QUICK["robust_gain"])
     trainer = trainer_of("robust_gain", config, Game.of("ReverseDuffing"))
     trainer.step()
     line = r"the training ended after 1 condition\(s\) \(budget=None\); expected at least 4, .*"
@@ -257,3 +270,39 @@ def test_it_tells_the_noise_with_which_it_used_each_sample():
     loud = estimator.adaptation(replace(record, y=y))
     np.testing.assert_allclose(loud.output_noise[0, :500], quiet.output_noise[0, :500], rtol=1e-9)
     assert loud.output_noise[0, 500, 0] > 10
+
+
+def test_a_resumed_training_learns_the_same_and_its_file_is_loaded(tmp_path):
+    config = TRAINERS.resolve("robust_gain").configured(QUICK["robust_gain"])
+    game, path = Game.of("ReverseDuffing"), tmp_path / "checkpoint.pt"
+    whole = train_by_name("robust_gain", config, game)
+    stopped = trainer_of("robust_gain", config, game)
+    stopped.step()
+    stopped.step()
+    save_checkpoint(stopped, path)
+    resumed = train_by_name("robust_gain", config, game, checkpoint=path, resume=True)
+    for field in fields(Beliefs):
+        own, other = (getattr(each.beliefs, field.name) for each in (whole, resumed))
+        np.testing.assert_array_equal(own, other)
+    resumed.save(tmp_path / "trained.pt")
+    loaded = RobustGain.load(tmp_path / "trained.pt", game.source.system)
+    record = game.record([0])
+    made_of = RobustGain(game.source.system, game.source.setup.noise_std, trained=whole)
+    np.testing.assert_array_equal(loaded.run(record).xhat, made_of.run(record).xhat)
+
+
+@pytest.mark.parametrize("plant", [Compass, Counted, Exact, NoisyPendulum])
+def test_it_trains_on_other_plants_and_runs_as_it_updates(plant):
+    game = Game.of(plant)
+    config = TRAINERS.resolve("robust_gain").configured(QUICK["robust_gain"])
+    trained = train_by_name("robust_gain", config, game)
+    setup, record = game.source.setup, game.record(range(2))
+    estimator = RobustGain(
+        game.source.system, setup.noise_std, setup.process_noise, trained=trained
+    )
+    found, state = estimator.run(record), estimator.reset(record.prior)
+    assert np.isfinite(found.xhat).all()
+    for k, t in enumerate(record.t):
+        state = estimator.update(state, float(t), record.y[:, k], record.u[:, k])
+        np.testing.assert_allclose(state.xhat, found.xhat[:, k], rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(state.P, found.P[:, k], rtol=1e-6, atol=1e-10)

@@ -25,15 +25,13 @@ from pinnobs_gym.simulation.record import Record
 from pinnobs_gym.simulation.system import vector
 from pinnobs_gym.training.trainer import Trainer
 from trainers.robust_gain.conditions import draw_condition, model_is_right
-from trainers.robust_gain.config import RobustGainConfig, from_outputs
+from trainers.robust_gain.config import HELD_OUT, RobustGainConfig, from_outputs
 from trainers.robust_gain.dictionary import RIGHT, dictionary, right
 from trainers.robust_gain.fitting import Evidence, fit, joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HELD_OUT = 4
-"""Every condition with a number divisible by this is held out."""
 MOST_LOOKS = 70
 """Largest number of samples of an episode at which the filters are asked."""
 _SMALL = 1e-14

@@ -8,6 +8,8 @@ from typing import Literal, TypeAlias
 
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
+HELD_OUT = 4
+"""Every condition with a number divisible by this is held out; a training has one at least."""
 Supervision: TypeAlias = Literal["states", "outputs"]
 
 
@@ -32,7 +34,7 @@ class RobustGainConfig(TrainingConfig):
     """Parts into which a Gaussian law about x̂₀ is divided, for initial states outside the set."""
     spread: float = 1.7
     """Standard deviation of that law, in those of the prior."""
-    process_noise: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)
+    noise_levels: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0)
     """Process noise of the beliefs, as `GaussianEstimator.assumed_noise`."""
     deviation: tuple[float, ...] = (0.1, 0.2)
     """Standard deviations of relative deviations of the plant from the model."""
@@ -55,12 +57,13 @@ class RobustGainConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         self.check_shared()
-        check_whole(self, ("iterations", "per_condition", "near", "wide"))
+        check_whole(self, ("per_condition", "near", "wide"))
+        check_whole(self, ("iterations",), least=HELD_OUT)
         check_setting(self, "spread", "a number of at least 1", lambda v: 1 <= v < math.inf)
         for name in ("trust", "outliers"):
             check_setting(self, name, "a number between 0 and 1", lambda v: 0 < v < 1)
         check_setting(self, "leak", "a number from 0 to below 1", lambda v: 0 <= v < 1)
-        for name in ("process_noise", "deviation"):
+        for name in ("noise_levels", "deviation"):
             expected = "ascending numbers above 0"
             check_setting(self, name, expected, lambda v: _ascending(v))
 

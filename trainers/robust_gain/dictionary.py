@@ -53,7 +53,8 @@ def dictionary(source: EpisodeSource, config: RobustGainConfig) -> Beliefs:
     system = source.system
     rng = np.random.default_rng(config.seed)
     normal = rng.standard_normal((_DRAWS, system.nx))
-    inside = _standard(source, rng)
+    # A single initial state would tell the filters where the truth begins.
+    inside = normal if source.fixed_x0 else _standard(source, rng)
     near = divided(inside, config.near, config.seed)
     half = divided(inside, max(1, config.near // 2), config.seed)
     few = _scaled(divided(normal, FEW, config.seed), WIDER)
@@ -65,7 +66,7 @@ def dictionary(source: EpisodeSource, config: RobustGainConfig) -> Beliefs:
     set_itself = Layout(near.share, mean + near.mean @ L.T, L @ near.cov @ L.T)
     kinds = [Kind(near, noise) for noise in RIGHT]
     kinds += [Kind(set_itself, DEVIATING, absolute=True), Kind(wide, DEVIATING)]
-    kinds += [Kind(few, noise) for noise in config.process_noise]
+    kinds += [Kind(few, noise) for noise in config.noise_levels]
     for deviation in config.deviation:
         larger = with_uncertain_plant(system, deviation)
         if larger is not None and larger.nx <= MOST_STATES:

@@ -185,6 +185,7 @@ def divided(draws: np.ndarray, number: int, seed: int) -> Layout:
     """
     from scipy.cluster.vq import kmeans2
 
+    number = min(number, len(np.unique(draws, axis=0)))  # of a law of a few states, one each
     if number == 1:
         labels = np.zeros(len(draws), dtype=int)
     else:
