@@ -154,7 +154,8 @@ class RobustGain(LearnedEstimator, Estimator):
     of the training.
 
     When to choose it: where the model may be wrong and nobody knows how, or outputs tell the state
-    only after a while, and a training of a minute and a hundred times the time of `ukf` are no matter.
+    only after a while, and a training of a minute and a hundred times the time of `ukf` do not
+    matter.
     """
 
     trained: TrainedBeliefs = field(kw_only=True, repr=False)
