@@ -169,7 +169,7 @@ def _again(plant: System, constants: tuple[Any, Any, Any, Any], values: dict[str
     return _class(plant, *constants)(**values)
 
 
-_OPTIONAL = ("input", "admissible", "f_jacobian", "h_jacobian", "flow")
+_OPTIONAL = ("input", "draw_input", "admissible", "f_jacobian", "h_jacobian", "flow")
 
 
 def _is_inherited(cls: type[System], name: str) -> bool:

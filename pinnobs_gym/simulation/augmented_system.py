@@ -107,6 +107,9 @@ class Augmented(System):
     def input(self, t: Array) -> Array:
         return self._known.input(t)
 
+    def draw_input(self, rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+        return self._known.draw_input(rng, times)
+
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
         """Return ∂f/∂x, (..., nx, nx), from the plant's own Jacobian (see `_jacobian`)."""
         if not isinstance(x, np.ndarray):

@@ -10,7 +10,9 @@ from pinnobs_gym.envs.env import EstimationEnv
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.scoring.cramer_rao import cramer_rao
+from pinnobs_gym.simulation.augmented import Unknown, augmented
 from pinnobs_gym.simulation.system import Setup, System
+from pinnobs_gym.systems.satellite import Satellite
 
 DT = 0.2
 
@@ -148,6 +150,18 @@ def test_an_env_observes_them():
         env.step(np.zeros(env.action_space.shape, np.float32))
     expected = exact(Driven, np.array([[0.5]]), episodes.u[:4, 3:4])[:, 0, 0]
     np.testing.assert_allclose(xhat, expected, rtol=0, atol=1e-4)  # by the Runge-Kutta step
+
+
+def test_they_are_drawn_for_the_plant_with_further_states():
+    plant = Driven()
+    further = augmented(plant, disturbance={plant.state_names[0]: Unknown(0.0, 0.1)})
+    assert further.draws_input
+    drawn = [
+        each.draw_input(np.random.default_rng(1), np.arange(21.0)) for each in (plant, further)
+    ]
+    assert np.array_equal(*drawn)
+    fixed = augmented(Satellite(), disturbance={"x1": Unknown(0.0, 0.1)})
+    assert not fixed.draws_input
 
 
 def test_the_reference_is_linearised_with_them():

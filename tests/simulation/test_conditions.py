@@ -1,5 +1,6 @@
 """Conditions against what they say: invariants, linear algebra, and the nominal episodes."""
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +17,7 @@ from pinnobs_gym.leaderboard.jobs.plan import jobs_of
 from pinnobs_gym.leaderboard.suites import Entry, Suite
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.simulation.conditions import CONDITIONS, canonical_name, fitting, parse_condition
+from pinnobs_gym.simulation.conditions.plant import uncertain_parameters
 from pinnobs_gym.systems import SYSTEMS
 from pinnobs_gym.systems.induction_motor import InductionMotor
 from pinnobs_gym.systems.satellite import Satellite
@@ -87,6 +89,17 @@ def test_mismatch_of_parameters():
     assert found.any(axis=1).all()
     assert not found.all(axis=1).any()
     assert (found.sum(axis=0) > 0).all()
+
+
+def test_mismatch_leaves_out_what_is_no_number():
+    @dataclass(frozen=True)
+    class Labelled(Satellite):
+        label: str = "bench 3"
+        table: tuple[str, ...] = ("a", "b")
+
+    source, episodes = played(Labelled, "mismatch10", batch=2)
+    assert uncertain_parameters(source.system) == ("a1", "a2", "a3")
+    assert np.isfinite(episodes.x).all()
 
 
 def test_mismatch_leaves_out_what_the_system_is_sure_of():

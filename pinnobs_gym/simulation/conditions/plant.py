@@ -17,11 +17,15 @@ from pinnobs_gym.simulation.system import Array, Setup, System, vector
 
 def uncertain_parameters(system: System) -> tuple[str, ...]:
     """Return the names of the parameters that `Mismatch` changes: those of `System.uncertain`, or
-    all but switches. If there are none, it changes the rates of change instead."""
+    all that are numbers but switches. If there are none, it changes the rates of change instead."""
     if system.uncertain is not None:
         return tuple(system.uncertain)
-    own = system.parameters.items()
-    return tuple(name for name, value in own if not isinstance(value, bool | np.bool_))
+    return tuple(name for name, value in system.parameters.items() if _is_number(value))
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a parameter is a number or an array of numbers."""
+    return np.asarray(value).dtype.kind in "iuf"
 
 
 @dataclass(frozen=True)
