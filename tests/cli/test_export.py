@@ -22,6 +22,17 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def motor(tmp_path_factory):
+    """A program that replays logs of the motor with measured inputs."""
+    folder = tmp_path_factory.mktemp("motor")
+    given = ("--system", "InductionMotor", "--measured-input", "--out", folder / "motor.c")
+    assert run("export", "ekf", *given) == 0
+    files = [folder / "motor.c", folder / "motor_replay.c"]
+    subprocess.run([COMPILER, *FLAGS, *files, "-lm", "-o", folder / "replay"], check=True)
+    return folder / "replay"
+
+
 @needs_c
 def test_its_files_compile_and_replay_a_log(folder, capsys):
     given = ("--system", "ReverseDuffing", "--noise-std", 0.2, "--xhat0", 0.5, -0.5)
@@ -36,6 +47,28 @@ def test_its_files_compile_and_replay_a_log(folder, capsys):
     own = EKF.for_setup(source.system, source.setup, assumed_noise=0.01)
     record.prior.mean[:] = 0.5, -0.5
     np.testing.assert_allclose(found[:, 1:3], own.run(record).xhat[0], atol=1e-12)
+
+
+@needs_c
+@pytest.mark.parametrize(
+    ("header", "says"),
+    [
+        ("t,y1,y2,u1,u2", ""),
+        ('\ufefft, y1 ,"y2",u1,u2\r', ""),
+        ("t,y2,y1,u1,u2", "line 1: column 2 is not named y1; expected"),
+        ("t,u1,u2,y1,y2", "line 1: column 2 is not named y1; expected"),
+        ("t,y1,y2,u1", "line 1: column 5 is not named u2; expected"),
+        ("0,1,2,3,4", "line 1: column 1 is not named t; expected"),
+        ("t,y1,y2,u1,u2,u3", "line 1: more than 5 columns; expected only"),
+        (None, "the file is empty; expected a line of names"),
+    ],
+)
+def test_the_program_reads_a_log_whose_columns_are_named_in_order(header, says, motor, folder):
+    text = "" if header is None else f"{header}\n0,1,2,3,4\n"
+    found = subprocess.run([motor], input=text, capture_output=True, text=True, check=False)
+    assert (says in found.stderr) if says else not found.stderr
+    assert found.returncode == bool(says)
+    assert len(found.stdout.splitlines()) == (not says)
 
 
 def test_measured_inputs(folder):

@@ -41,8 +41,23 @@ def places(estimator: BaseEstimator, found: Algorithm, name: str, real: str) -> 
         "P0": f", const {real} *P0" if has_P else "",
         "no_P0": ", NULL" if has_P else "",
         "print_std": std if has_P else "",
+        "columns": _columns(system, inputs),
         "intro": _intro(estimator),
     }
+
+
+def _columns(system: System, inputs: int) -> str:
+    """Return the names that each column of a record may have, as C: those of logs and,
+    where it is no other column's and has a plain text in C, the plant's own."""
+    pairs = [("t", "t")]
+    pairs += [(f"y{i}", name) for i, name in enumerate(system.output_names, 1)]
+    pairs += [(f"u{i}", name) for i, name in enumerate(system.input_names[:inputs], 1)]
+    taken = [name for pair in pairs for name in set(pair)]
+    rows = []
+    for given, own in pairs:
+        plain = own.isprintable() and not set(own) & set('"\\?,') and taken.count(own) == 1
+        rows.append(f'{{"{given}", "{own if plain else given}"}},')
+    return "\n    ".join(rows)
 
 
 def _listed(system: System, names: tuple[str, ...]) -> str:
