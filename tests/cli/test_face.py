@@ -97,6 +97,13 @@ def test_how_an_agents_file_is_named_is_told(name, capsys):
     assert "is given by policy:FILE.zip" in capsys.readouterr().err
 
 
+def test_the_training_that_an_estimator_needs_is_told_as_a_command(capsys):
+    assert main(["evaluate", "--system", "Academic", "--estimator", "kkl_pinn"]) == 2
+    command = capsys.readouterr().err.partition("trained first: pinnobs ")[2].partition(";")[0]
+    assert main([*command.split(), "--budget", "0"]) == 2  # all else of it is accepted
+    assert "budget=0.0; expected" in capsys.readouterr().err
+
+
 def test_what_is_like_nothing_has_no_guess():
     assert did_you_mean("dance", COMMANDS) == ""
     assert did_you_mean(3, COMMANDS) == ""

@@ -19,10 +19,12 @@ from pinnobs_gym.estimation.estimator import BaseEstimator
 from pinnobs_gym.estimators import ESTIMATORS, PREFIX, SUFFIX, policy_file
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.against import opponents
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.published import manifest
 from pinnobs_gym.leaderboard.published.manifest import Manifest
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
 from pinnobs_gym.leaderboard.published.trained import load_published
+from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring.evaluation import (
     Evaluated,
     Results,
@@ -101,6 +103,13 @@ class Evaluate:
         if self.normalization is not None:
             raise ValueError("--normalization without --estimator policy:FILE.zip")
         cls = ESTIMATORS.resolve(self.estimator)
+        if cls.needs_training is not None and self.trained is None:
+            trainer = TRAINERS.spec_of(trainer_class(cls))
+            raise ValueError(
+                f"estimator {self.estimator!r} has to be trained first: pinnobs train "
+                f"{quoted(trainer)} --system {quoted(self.system)}; then give its file, "
+                "--trained FILE"
+            )
         if self.log:
             return self._run_logs(cls)
         game, options = self._game(), settings_of(cls, self.set)

@@ -76,8 +76,12 @@ class Fit:
                 temporary.write_text(json.dumps(facts(made), indent=1) + "\n", encoding="utf-8")
             console.print(f"values: {self.out}", soft_wrap=True)
         columns = ["--columns", *self.columns] if self.columns else []
-        told = replace(self.model, **(noise_found(made) or {})).words()
-        print_next("estimate", "--system", self.system, "--log", *self.log, *columns, *told)
+        told = self.model
+        if (found := noise_found(made)) is not None:
+            process = found.process_noise or told.process_noise
+            told = replace(told, noise_std=found.noise_std, process_noise=process)
+        words = [*columns, *told.words()]
+        print_next("estimate", "--system", self.system, "--log", *self.log, *words)
         return 0
 
     def _check_files(self) -> None:
@@ -140,20 +144,20 @@ def to_paste(made: Fitted) -> list[str]:
         lines.append(f"in Python: {type(plant).__name__}({', '.join(named)})")
     options = noise_found(made)
     if options is not None:
-        lines.append(f"as options: {' '.join(ModelOptions(**options).words())}")
-        if "process_noise" not in options:
+        lines.append(f"as options: {' '.join(options.words())}")
+        if not options.process_noise:
             lines.append(f"Setup.process_noise: {np.round(_levels(made), 12).tolist()}")
     return lines
 
 
-def noise_found(made: Fitted) -> dict[str, tuple[float, ...]] | None:
+def noise_found(made: Fitted) -> ModelOptions | None:
     """Return what was found of the noise as options of the model, None if it was not asked for.
-    Process noise that is correlated between states is not one of them."""
+    Process noise that is correlated between states cannot be one of them, and is left out."""
     if made.noise is None:
         return None
-    found = {"noise_std": tuple(_rounded(value) for value in made.noise.noise_std)}
+    found = ModelOptions(noise_std=tuple(_rounded(value) for value in made.noise.noise_std))
     if made.noise.perhaps_none:
-        return found | {"process_noise": (0.0,)}
+        return replace(found, process_noise=(0.0,))
     L = _levels(made)
     if L.shape[0] != L.shape[1] or np.count_nonzero(L) != np.count_nonzero(np.diag(L)):
         return found
@@ -161,7 +165,7 @@ def noise_found(made: Fitted) -> dict[str, tuple[float, ...]] | None:
     known = [std.get(f"process noise of {name}", 0.0) for name in _plant(made).state_names]
     levels = zip(np.diag(L), known, strict=True)
     process = tuple(_rounded(value) if error < value else 0.0 for value, error in levels)
-    return found | {"process_noise": process}
+    return replace(found, process_noise=process)
 
 
 def _plant(made: Fitted) -> System:
