@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from pinnobs_gym.envs.actions import FORMS, PredictionForm
+from pinnobs_gym.envs.actions import FORMS, LARGEST_CORRECTION, PredictionForm
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.estimators.sb3 import Sb3
 from pinnobs_gym.leaderboard.grid import markdown_table
@@ -35,6 +35,7 @@ def for_agents(cls: type[System], env_id: str) -> str:
     lines = []
     for name, form in FORMS.items():
         what = " ".join((form.__doc__ or "").partition("\n\n")[0].split()).rstrip(".")
+        what = what.replace("`LARGEST_CORRECTION`", f"{LARGEST_CORRECTION:g}")
         actions = nx * ny if name == "gain" else nx
         features = own + (nx if issubclass(form, PredictionForm) else 0)
         lines.append((f"`{name}`", what, str(actions), str(features)))

@@ -40,6 +40,22 @@ class ModelOptions:
     as standard deviation), or NAME=mean,std of a parameter, bias_OUTPUT, disturbance_STATE or
     rate_STATE."""
 
+    def words(self) -> list[str]:
+        """Return what was given, as words of a command line."""
+        given = {
+            "--noise-std": self.noise_std,
+            "--process-noise": self.process_noise,
+            "--xhat0": self.xhat0,
+            "--P0-std": self.P0_std,
+            "--also": self.also,
+        }
+        return [
+            word
+            for option, values in given.items()
+            if values
+            for word in (option, *(v if isinstance(v, str) else f"{v:.15g}" for v in values))
+        ]
+
     def told(self, name: str) -> tuple[System, Setup]:
         """Return the system of a name or ``module:Class``, which is registered, and its benchmark
         setup, as told.

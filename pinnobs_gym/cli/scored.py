@@ -79,7 +79,8 @@ def report(
             console.print(note, style="yellow", soft_wrap=True)
     else:
         comparison = compare(evaluated.rows, others)
-        hint = f"pinnobs tables {quoted(str(rows))} {quoted(str(others.path))} -o FILE writes all"
+        files = dict.fromkeys(quoted(str(path)) for path in (rows, others.path))
+        hint = f"pinnobs tables {' '.join(files)} -o FILE writes all"
         print_table(standings_table.layouts(comparison.table), hint)
         console.print(comparison.summary + "\n", highlight=False)
     print_table([[by_state(game.source.system, evaluated.rows)]])

@@ -2,11 +2,15 @@
 trained estimators."""
 
 import csv
+import shlex
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from export_figures.built import COMPILER, replay
+from exported import needs_c
 from scipy.linalg import expm
 
 from pinnobs_gym.cli import main
@@ -301,3 +305,46 @@ def test_a_trained_file_that_does_not_fit_is_one_line(
     printed = capsys.readouterr().err
     assert message in printed
     assert len(printed.splitlines()) == 1
+
+
+def following(capsys):
+    """The arguments of the command that was named as the next one."""
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith("next: pinnobs ")
+    return shlex.split(line)[2:]
+
+
+@needs_c
+def test_the_next_command_exports_the_filter_that_was_run(folder, capsys):
+    """As C, which gives the estimates that were written."""
+    t, y, u = simulated(60)
+    write(Path("log.csv"), {"t": t, "place": y, "force": u})
+    told = ["--noise-std", 0.07, "--xhat0", 0.1, 0.2, "--P0-std", 0.5, 2, "--also", "k=4.2,0.5"]
+    given = [*told, "--set", "assumed_noise=0.02", "gate=0.999"]
+    assert run("estimate", *SYSTEM, "--log", "log.csv", *given) == 0
+    words = following(capsys)
+    assert words[0] == "export"
+    assert run(*words) == 0
+    build = [COMPILER, "-O1", "ekf.c", "ekf_replay.c", "-lm", "-o", "replay"]
+    subprocess.run(build, check=True)
+    found, said = replay(Path("replay").resolve(), Path("log.csv").read_text())
+    assert not said
+    expected = np.loadtxt("estimates.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(found, expected[:, : found.shape[1]], rtol=1e-6, atol=1e-9)
+
+
+def test_the_next_command_fits_with_what_was_told(folder, capsys):
+    """Where the log speaks against the noise; and the one after it estimates with what it found."""
+    t, y, u = simulated(300, k=4.0)
+    write(Path("log.csv"), {"ms": 1000 * t, "place": y, "force": u})
+    given = ["--columns", "t=ms*1e-3", "--noise-std", 0.01, "--process-noise", 0]
+    assert run("estimate", *SYSTEM, "--log", "log.csv", *given) == 0
+    words = following(capsys)
+    assert words[0] == "fit"
+    assert run(*words) == 0
+    words = following(capsys)
+    assert words[:2] == ["estimate", "--system"]
+    noise = float(words[words.index("--noise-std") + 1])
+    assert 0.045 < noise < 0.055  # that of the log, 0.05
+    assert run(*words) == 0
+    assert "warning" not in capsys.readouterr().out

@@ -10,6 +10,7 @@ import pytest
 
 from pinnobs_gym.cli import COMMANDS, main
 from pinnobs_gym.cli.commands.estimators import settings
+from pinnobs_gym.envs.actions import LARGEST_CORRECTION
 from pinnobs_gym.estimators import ESTIMATORS
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.registry import TRAINERS, did_you_mean
@@ -18,6 +19,22 @@ from pinnobs_gym.systems.academic import Academic
 from pinnobs_gym.training.progress import in_terminal, shown_progress
 
 pty = pytest.importorskip("pty")
+UNDESCRIBED = """
+from dataclasses import dataclass
+
+from pinnobs_gym import Estimator, State
+
+
+@dataclass(frozen=True)
+class Mine(Estimator):
+    rate: float = 60.0
+
+    def reset(self, prior):
+        return State(prior.mean)
+
+    def update(self, state, t, y, u):
+        return state
+"""
 
 
 def test_the_version(capsys):
@@ -74,6 +91,19 @@ def test_a_near_miss_is_told(arguments, meant, capsys):
     assert f"did you mean {meant!r}?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["policy:agent", "agent.zip", "policy:"])
+def test_how_an_agents_file_is_named_is_told(name, capsys):
+    assert main(["evaluate", "--system", "Academic", "--estimator", name]) == 2
+    assert "is given by policy:FILE.zip" in capsys.readouterr().err
+
+
+def test_the_training_that_an_estimator_needs_is_told_as_a_command(capsys):
+    assert main(["evaluate", "--system", "Academic", "--estimator", "kkl_pinn"]) == 2
+    command = capsys.readouterr().err.partition("trained first: pinnobs ")[2].partition(";")[0]
+    assert main([*command.split(), "--budget", "0"]) == 2  # all else of it is accepted
+    assert "budget=0.0; expected" in capsys.readouterr().err
+
+
 def test_what_is_like_nothing_has_no_guess():
     assert did_you_mean("dance", COMMANDS) == ""
     assert did_you_mean(3, COMMANDS) == ""
@@ -89,6 +119,38 @@ def test_settings_of_an_estimator_have_defaults_and_meanings(capsys):
             assert meaning
     assert main(["estimators", "open_loop"]) == 0
     assert "no settings" in capsys.readouterr().out
+
+
+def test_an_estimator_without_docstring_is_not_described_by_its_signature(tmp_path, capsys):
+    (tmp_path / "undescribed.py").write_text(UNDESCRIBED)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        assert main(["estimators", "undescribed:Mine"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:3] == ["(no docstring)", "", "track: online; knows: model, prior, noise"]
+    assert lines[-2:] == [
+        "  rate=60.0",
+        "next: pinnobs evaluate --system ReverseDuffing --estimator undescribed:Mine",
+    ]
+
+
+def test_texts_for_people_have_no_markup_of_code_and_no_names_of_constants(capsys):
+    assert main(["train", "--help"]) == 0
+    assert "`" not in capsys.readouterr().out
+    assert main(["systems", "Academic"]) == 0
+    assert f"over {LARGEST_CORRECTION:g} times the typical error" in capsys.readouterr().out
+
+
+def test_a_rows_file_is_named_once(tmp_path, monkeypatch, capsys):
+    """Where an estimator is shown among those of the file that it is written to."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pinnobs_gym.cli.console.table_width", lambda: 80)
+    command = ["evaluate", "--system", "Academic", "--episodes", "2", "--out", "ev"]
+    assert main(command) == 0
+    capsys.readouterr()
+    assert main([*command, "--estimator", "ukf", "--against", "ev/rows.jsonl"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "(pinnobs tables ev/rows.jsonl -o FILE writes all)" in said
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,9 @@ def test_the_video_shows_the_estimates_of_the_first_episode(folder, capsys):
     (folder / "clock_module.py").write_text(CLOCK)
     chosen = ["--estimator", "clock_module:Clock", "--condition", "noise5+dt0.5", "--seed", 3]
     assert evaluate(*chosen, "--video", "new/out.mp4") == 0
-    assert "video: new/out.mp4" in capsys.readouterr().out
+    *_, video, following = capsys.readouterr().out.splitlines()
+    assert video == "video: new/out.mp4"
+    assert following.startswith("next: pinnobs ")
     assert [path.name for path in (folder / "new").iterdir()] == ["out.mp4"]
     assert len(rows.read(folder / "ev" / "rows.jsonl")) == 2
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,10 +77,22 @@ class Estimate:
         for log, estimator, out in zip(logs, estimators, outs, strict=True):
             doubted |= _estimate(log, estimator, setup, out)
         if doubted or kind.exported is BaseEstimator.exported:
-            print_next("fit", "--system", self.system, "--log", *self.log, "--noise")
+            columns = ["--columns", *self.columns] if self.columns else []
+            told = [*columns, *self.model.words()]
+            print_next("fit", "--system", self.system, "--log", *self.log, *told, "--noise")
         else:
-            print_next("export", self.estimator, "--system", self.system)
+            measured = any(log.system.measured_input for log in logs)
+            print_next("export", self.estimator, *self._as_exported(kind, measured))
         return 1 if self.strict and doubted else 0
+
+    def _as_exported(self, kind: type[BaseEstimator], measured: bool) -> list[object]:
+        """Return the options by which `pinnobs export` writes the estimator that was run, on logs
+        with inputs if ``measured``."""
+        words: list[object] = ["--system", self.system, *self.model.words()]
+        words += [] if self.trained is None else ["--trained", self.trained]
+        words += ["--set", *self.set] if self.set else []
+        words += ["--measured-input"] if measured else []
+        return [*words, "-o", re.sub(r"\W", "_", ESTIMATORS.name_of(kind)) + ".c"]
 
     def _estimator(self, kind: type[BaseEstimator], log: Log, setup: Setup) -> BaseEstimator:
         """Return the estimator of a log."""

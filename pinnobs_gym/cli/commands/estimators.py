@@ -33,7 +33,7 @@ class Estimators:
             print_next("estimators", "ekf")
             return 0
         cls = ESTIMATORS.resolve(self.name)
-        console.print(inspect.getdoc(cls), markup=False)
+        console.print(_described(cls), markup=False)
         console.print(f"\ntrack: {cls.track}; knows: {', '.join(cls.knows)}", highlight=False)
         trainer = cls.needs_training or cls.trains_on_record
         if trainer is not None:
@@ -45,9 +45,9 @@ class Estimators:
         found = settings(cls)
         console.print("settings, each given by --set name=value:" if found else "no settings")
         for name, default, meaning in found:
-            lines = textwrap.wrap(meaning, console.width - 4) or [""]
             console.print(f"  {name}={default}", highlight=False, soft_wrap=True)
-            console.print("\n".join(f"    {line}" for line in lines), highlight=False)
+            for line in textwrap.wrap(meaning, console.width - 4):
+                console.print(f"    {line}", highlight=False)
         if cls.needs_training is None:
             few = ["--episodes", 2] if cls.trains_on_record else []  # each takes a training
             print_next("evaluate", "--system", "ReverseDuffing", "--estimator", self.name, *few)
@@ -63,9 +63,15 @@ def listing() -> Grid:
     columns = tuple(Column(name, numeric=False) for name in names)
     lines = []
     for name, cls in ESTIMATORS.classes().items():
-        first = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
+        first = _described(cls).partition("\n\n")[0].replace("\n", " ")
         lines.append((name, cls.track, ", ".join(cls.knows), first))
     return Grid("", columns, tuple(lines))
+
+
+def _described(cls: type[BaseEstimator]) -> str:
+    """Return the docstring of an estimator; a dataclass without one has its signature for it."""
+    text = inspect.getdoc(cls) or ""
+    return "(no docstring)" if not text or text.startswith(f"{cls.__name__}(") else text
 
 
 def settings(cls: type[BaseEstimator]) -> list[tuple[str, str, str]]:

@@ -16,13 +16,15 @@ from pinnobs_gym.cli.video import check_video, write_video
 from pinnobs_gym.envs.game import AnyGame, Game
 from pinnobs_gym.envs.policy import WARNING, Policy, load_policy
 from pinnobs_gym.estimation.estimator import BaseEstimator
-from pinnobs_gym.estimators import ESTIMATORS, policy_file
+from pinnobs_gym.estimators import ESTIMATORS, PREFIX, SUFFIX, policy_file
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.against import opponents
+from pinnobs_gym.leaderboard.escapes import quoted
 from pinnobs_gym.leaderboard.published import manifest
 from pinnobs_gym.leaderboard.published.manifest import Manifest
 from pinnobs_gym.leaderboard.published.reading import PUBLISHED, published_floors
 from pinnobs_gym.leaderboard.published.trained import load_published
+from pinnobs_gym.registry import TRAINERS, trainer_class
 from pinnobs_gym.scoring.evaluation import (
     Evaluated,
     Results,
@@ -32,6 +34,7 @@ from pinnobs_gym.scoring.evaluation import (
 )
 from pinnobs_gym.scoring.log_evaluation import run_logs
 from pinnobs_gym.scoring.log_game import LogGame
+from pinnobs_gym.scoring.provenance import game_hash
 from pinnobs_gym.training.by_name import check_times, load
 
 _SIMULATED = ("--setup", "--condition", "--episodes", "--seed", "--video", "--tuned")
@@ -53,7 +56,8 @@ class Evaluate:
     trained: Path | None = None
     """Trained estimator to load; published stands for the one that ships with the package."""
     set: tuple[str, ...] = ()
-    """Settings of the estimator, such as assumed_noise=0.1."""
+    """Settings of the estimator, such as assumed_noise=0.1; of a policy that of its training, such
+    as action_mode=gain."""
     tuned: bool = False
     """Use the settings that pinnobs tune --store has stored with the system."""
     setup: str = "benchmark"
@@ -91,9 +95,21 @@ class Evaluate:
             raise ValueError(f"--tuned and {other}; expected one of them")
         if (path := policy_file(self.estimator)) is not None:
             return self._run_policy(path)
+        if self.estimator.startswith(PREFIX) or self.estimator.endswith(SUFFIX):
+            raise ValueError(
+                f"estimator {self.estimator!r}; a model of Stable-Baselines3 is given by "
+                f"{PREFIX}FILE{SUFFIX}"
+            )
         if self.normalization is not None:
             raise ValueError("--normalization without --estimator policy:FILE.zip")
         cls = ESTIMATORS.resolve(self.estimator)
+        if cls.needs_training is not None and self.trained is None:
+            trainer = TRAINERS.spec_of(trainer_class(cls))
+            raise ValueError(
+                f"estimator {self.estimator!r} has to be trained first: pinnobs train "
+                f"{quoted(trainer)} --system {quoted(self.system)}; then give its file, "
+                "--trained FILE"
+            )
         if self.log:
             return self._run_logs(cls)
         game, options = self._game(), settings_of(cls, self.set)
@@ -133,6 +149,7 @@ class Evaluate:
         if self.video is not None:
             write_video(self.video, estimator, game, self.seed)
             console.print(f"video: {self.video}", soft_wrap=True)
+        self._say_next(game)
         return 0
 
     def _run_logs(self, cls: type[BaseEstimator]) -> int:
@@ -152,6 +169,7 @@ class Evaluate:
         estimator = make_estimator(trained or cls, game, settings_of(cls, self.set))
         score = partial(run_logs, game, estimator)
         self._report(game, tuple(game.logs), score, picture=True)
+        self._say_next(game)
         return 0
 
     def _report(
@@ -164,13 +182,14 @@ class Evaluate:
         run: Any = partial(score, Results(rows_file(self.out), fresh=self.fresh))
         evaluated = with_progress(len(seeds), run, phases=not self.log)
         report(game, evaluated, self.out, picture, others, shipped)
-        self._say_next(game)
 
     def _say_next(self, game: AnyGame) -> None:
-        """Print the command to type next: the same against what is published, or all tables."""
+        """Print the command to type next: the same against what is published, if that is of the
+        present code and can be compared; or all tables."""
         published = Manifest.read(manifest.FOLDER)
-        entries = [] if published is None else published.rows
-        if self.against is not None or not any(entry.game == game.name for entry in entries):
+        entries = [] if published is None or self.against is not None else published.rows
+        rows = [entry for entry in entries if entry.game == game.name and not entry.floor]
+        if not any(entry.game_hash == game_hash(game.source) for entry in rows):
             print_next("tables", rows_file(self.out))
             return
         chosen = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from pinnobs_gym.logs.reading import read_log
 from pinnobs_gym.logs.unknown import unknown_parameters
 from pinnobs_gym.simulation.augmented_system import Augmented
 from pinnobs_gym.simulation.record import Prior
+from pinnobs_gym.simulation.system import System
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,13 @@ class Fit:
             with replacing(self.out) as temporary:
                 temporary.write_text(json.dumps(facts(made), indent=1) + "\n", encoding="utf-8")
             console.print(f"values: {self.out}", soft_wrap=True)
-        print_next("estimate", "--system", self.system, "--log", *self.log)
+        columns = ["--columns", *self.columns] if self.columns else []
+        told = self.model
+        if (found := noise_found(made)) is not None:
+            process = found.process_noise or told.process_noise
+            told = replace(told, noise_std=found.noise_std, process_noise=process)
+        words = [*columns, *told.words()]
+        print_next("estimate", "--system", self.system, "--log", *self.log, *words)
         return 0
 
     def _check_files(self) -> None:
@@ -131,31 +138,55 @@ def table(found: Sequence[Found]) -> Grid:
 
 def to_paste(made: Fitted) -> list[str]:
     """Return lines with what was found, as code and as options of commands."""
-    lines, parameters, plant = [], made.system.parameters, made.system
-    while isinstance(plant, Augmented):
-        plant = plant.plant
+    lines, parameters, plant = [], made.system.parameters, _plant(made)
     named = [f"{each.name}={each.value:.8g}" for each in made.found if each.name in parameters]
     if named:
         lines.append(f"in Python: {type(plant).__name__}({', '.join(named)})")
-    if made.noise is not None:
-        told = " ".join(f"{value:.4g}" for value in made.noise.noise_std)
-        L = made.noise.process_noise[: plant.nx]  # that of the plant's own states
-        L = L if L[:, plant.nx :].any() else L[:, : plant.nx]
-        diagonal = L.shape[0] == L.shape[1] and np.count_nonzero(L) == np.count_nonzero(np.diag(L))
-        if made.noise.perhaps_none:
-            lines.append(f"as options: --noise-std {told} --process-noise 0")
-        elif diagonal:
-            std = {each.name: each.std for each in made.found}
-            known = [std.get(f"process noise of {name}", 0.0) for name in plant.state_names]
-            process = " ".join(
-                f"{value if error < value else 0:.4g}"
-                for value, error in zip(np.diag(L), known, strict=True)
-            )
-            lines.append(f"as options: --noise-std {told} --process-noise {process}")
-        else:
-            lines.append(f"as options: --noise-std {told}")
-            lines.append(f"Setup.process_noise: {np.round(L, 12).tolist()}")
+    options = noise_found(made)
+    if options is not None:
+        lines.append(f"as options: {' '.join(options.words())}")
+        if not options.process_noise:
+            lines.append(f"Setup.process_noise: {np.round(_levels(made), 12).tolist()}")
     return lines
+
+
+def noise_found(made: Fitted) -> ModelOptions | None:
+    """Return what was found of the noise as options of the model, None if it was not asked for.
+    Process noise that is correlated between states cannot be one of them, and is left out."""
+    if made.noise is None:
+        return None
+    found = ModelOptions(noise_std=tuple(_rounded(value) for value in made.noise.noise_std))
+    if made.noise.perhaps_none:
+        return replace(found, process_noise=(0.0,))
+    L = _levels(made)
+    if L.shape[0] != L.shape[1] or np.count_nonzero(L) != np.count_nonzero(np.diag(L)):
+        return found
+    std = {each.name: each.std for each in made.found}
+    known = [std.get(f"process noise of {name}", 0.0) for name in _plant(made).state_names]
+    levels = zip(np.diag(L), known, strict=True)
+    process = tuple(_rounded(value) if error < value else 0.0 for value, error in levels)
+    return replace(found, process_noise=process)
+
+
+def _plant(made: Fitted) -> System:
+    """Return the system of a fit without its unknown constants."""
+    plant = made.system
+    while isinstance(plant, Augmented):
+        plant = plant.plant
+    return plant
+
+
+def _levels(made: Fitted) -> np.ndarray:
+    """Return the process noise found, (nx, noises), that of the plant's own states."""
+    assert made.noise is not None
+    nx = _plant(made).nx
+    L = made.noise.process_noise[:nx]
+    return L if L[:, nx:].any() else L[:, :nx]
+
+
+def _rounded(value: float) -> float:
+    """Return a number with four digits."""
+    return float(f"{value:.4g}")
 
 
 def facts(made: Fitted) -> dict[str, object]:

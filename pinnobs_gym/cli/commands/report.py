@@ -32,7 +32,9 @@ class Report:
     def run(self) -> int:
         """Write the page."""
         if not self.rows:
-            raise ValueError("no rows file is given; such as runs/leaderboard/rows.jsonl")
+            raise ValueError(
+                "no rows file is given; expected one, such as runs/leaderboard/rows.jsonl"
+            )
         try:
             from pinnobs_gym.leaderboard.site.model import page_model
             from pinnobs_gym.leaderboard.site.page import draw

@@ -45,7 +45,9 @@ class Tables:
     def run(self) -> int:
         """Print or write the tables."""
         if not self.rows:
-            raise ValueError("no rows file is given; such as runs/leaderboard/rows.jsonl")
+            raise ValueError(
+                "no rows file is given; expected one, such as runs/leaderboard/rows.jsonl"
+            )
         stored = load_rows(self.rows)
         if not stored.rows and not stored.failures:
             raise ValueError(f"no scored episodes in {', '.join(map(str, self.rows))}")

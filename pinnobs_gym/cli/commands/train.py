@@ -113,6 +113,9 @@ def run(arguments: Sequence[str]) -> int:
     if checkpoint.exists():
         console.print(f"checkpoint: {checkpoint} (--resume continues it)", soft_wrap=True)
     console.print(f"TensorBoard: {chosen.out / 'tensorboard'}", soft_wrap=True)
+    if result.ending == "interrupted" and checkpoint.exists():
+        print_next("train", *(each for each in arguments if each != "--resume"), "--resume")
+        return 0
     online = [label for label, kind in estimators.items() if kind.track == "online"]
     if task.game is not None and online:
         setup, condition = task.game.name.setup, task.game.name.condition
@@ -128,7 +131,7 @@ def listing() -> Grid:
     columns = tuple(Column(each, numeric=False) for each in ("trainer", "trains", "what it does"))
     lines = []
     for name, cls in TRAINERS.classes().items():
-        what = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ")
+        what = (inspect.getdoc(cls) or "").partition("\n\n")[0].replace("\n", " ").replace("`", "")
         trained = ", ".join(_estimators_of(cls))
         lines.append((name, trained, what))
     return Grid("usage: pinnobs train TRAINER --system NAME ...", columns, tuple(lines))

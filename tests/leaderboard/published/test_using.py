@@ -8,6 +8,7 @@ from damage import damaged, is_one_line_about
 from made_published import KKL, SUITE
 
 import pinnobs_gym
+from pinnobs_gym.cli import main
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files.seal import sealed
 from pinnobs_gym.leaderboard.against import compare, opponents
@@ -256,3 +257,18 @@ def test_published_rows_are_read_where_a_rows_file_is(made, shipped):
     alone = reading.load_rows([reading.PUBLISHED])
     both = reading.load_rows([made.rows, reading.PUBLISHED])
     assert len(alone.rows) == len(both.rows) == len(rows.read(made.rows))
+
+
+def test_the_next_command_compares_with_what_is_published_only_if_it_can(shipped, tmp_path, capsys):
+    command = ["evaluate", "--system", "ReverseDuffing", "--episodes", "3", "--out", str(tmp_path)]
+    assert main(command) == 0
+    following = capsys.readouterr().out.splitlines()[-1]
+    assert following.startswith("next: pinnobs evaluate --system ReverseDuffing")
+    assert following.endswith(" --against published")
+    assert main([*following.split()[2:], "--episodes", "3"]) == 0
+    stale = Manifest.read(shipped)
+    assert stale is not None
+    replace(stale, rows=tuple(replace(each, game_hash="0" * 12) for each in stale.rows)).write()
+    capsys.readouterr()
+    assert main(command) == 0
+    assert capsys.readouterr().out.splitlines()[-1].startswith("next: pinnobs tables ")
