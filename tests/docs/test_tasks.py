@@ -68,6 +68,7 @@ def test_the_tasks_are_twenty_and_short():
     assert "\ntasks\n" in (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_tasks_work(tmp_path):
     for name in ("pandas", "altair", "optuna", "moviepy"):
         if importlib.util.find_spec(name) is None:
