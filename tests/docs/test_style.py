@@ -23,10 +23,11 @@ def made():
     sys.path.insert(0, str(ROOT / "docs"))
     try:
         import mathml
+        import moving
         import short_cells
     finally:
         sys.path.remove(str(ROOT / "docs"))
-    return mathml, short_cells
+    return mathml, short_cells, moving
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +123,11 @@ def test_long_names_of_the_index_end_within_the_page(shown):
         f'<table class="indextable genindextable"><tr><td>{entries}<td>{entries}</tr></table>', 900
     )
     assert page.evaluate("document.documentElement.scrollWidth") <= 900
+
+
+def test_the_legend_of_a_moving_picture_can_be_read(made):
+    """Its texts have the colours of the lines, on white; the contrast is that of WCAG 2, AA."""
+    for colour in (made[2].TRUE, made[2].ESTIMATE, made[2].MEASURED):
+        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in parts]
+        assert 1.05 / (0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2] + 0.05) > 4.5
