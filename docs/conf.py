@@ -12,6 +12,7 @@ os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.envir
 
 import api
 import pages
+import short_cells
 
 project = "pinnobs-gym"
 author = "the authors of pinnobs-gym"
@@ -45,3 +46,4 @@ def setup(app):
     """Write the pages that are made from the code before Sphinx looks for pages."""
     app.connect("builder-inited", lambda app: pages.write(Path(app.srcdir) / "reference"))
     app.connect("doctree-read", api.unlink_others)
+    app.connect("doctree-read", short_cells.mark)

@@ -17,7 +17,7 @@ from pinnobs_gym.scoring.playing import Played
 from pinnobs_gym.scoring.thinning import kept
 from pinnobs_gym.simulation.residual import nearest
 
-TRUE, ESTIMATE, MEASURED = "#222222", "#d1495b", "#7aa0c8"
+TRUE, ESTIMATE, MEASURED = "#222222", "#c43d50", "#3f72a6"
 WIDTH, PANEL, GAP, LEFT, TOP, BOTTOM = 480, 84, 12, 72, 50, 40
 """Sizes in pixels: of the picture, of a panel and between them, and of the margins."""
 POINTS = 240

@@ -106,10 +106,11 @@ def _floor_note(found: Sequence[Line]) -> str:
                 for game, particles in sorted(line.floor_games.items())
             )
             means.setdefault(", ".join(games), []).append(line.track)
-    parts = (f"{', '.join(dict.fromkeys(tracks))} {games}" for games, tracks in means.items())
+    parts = [f"{', '.join(dict.fromkeys(tracks))}: {games}" for games, tracks in means.items()]
+    over = "; ".join(parts) if len(parts) > 1 else next(iter(means))
     return (
         "/ Bayes: root mean square of the error over that of exact Bayes on the same episodes (see "
-        f"the games), geometric mean over games with this floor: {'; '.join(parts)}."
+        f"the games), geometric mean over the games with a floor ({over})."
     )
 
 

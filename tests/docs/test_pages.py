@@ -9,8 +9,10 @@ import sys
 from dataclasses import dataclass, fields, is_dataclass
 from xml.etree import ElementTree
 
+import nbformat
 import numpy as np
 import pytest
+from myst_nb.core.read import read_myst_markdown_notebook
 from snippets import ROOT, cells, run_cells, run_page
 from waiting import PATIENCE
 
@@ -37,6 +39,7 @@ GUIDES = sorted((DOCS / "guides").glob("*.md"))
 PLANTS = [path for path in GUIDES if any("%%writefile" in text for _, text in cells(path))]
 """Guides to a kind of plant and its log. Other pages with cells train networks in them, and are run
 only when the documentation is built."""
+EXECUTED = [path for path in (*WRITTEN, DOCS / "first_steps.ipynb") if cells(path)]
 
 
 @pytest.fixture(scope="module")
@@ -328,6 +331,28 @@ def test_the_cells_of_a_guide_run_and_take_few_lines(path, tmp_path):
     assert any("assert" in text for text in own)  # that the estimates are right
     assert any('Image("estimates.png"' in text for text in own)
     assert len([line for text in own for line in text.splitlines() if line.strip()]) < 60
+
+
+@pytest.mark.parametrize("path", EXECUTED, ids=lambda path: path.stem)
+def test_pictures_of_cells_have_an_alternative_text(path):
+    """Without one, myst-nb gives the name of a file, which says nothing to who cannot see it."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        notebook = nbformat.reads(text, as_version=4)
+    else:
+        notebook = read_myst_markdown_notebook(text)
+    drawing = ("Image(", ".figure(", "plt.subplots(", "plot(record", "shown(")
+    for cell in notebook.cells:
+        hidden = "hide-input" in cell.metadata.get("tags", [])  # which define and draw nothing
+        if cell.cell_type == "code" and not hidden and any(d in cell.source for d in drawing):
+            image = cell.metadata.get("mystnb", {}).get("image", {})
+            assert len(image.get("alt", "").split()) > 4, cell.source
+
+
+@pytest.mark.parametrize("path", EXECUTED, ids=lambda path: path.stem)
+def test_cells_print_whole_lines(path):
+    """Where myst-nb joins what a cell has printed, it begins a line at each flush."""
+    assert all("end=" not in text for _, text in cells(path))
 
 
 def test_the_first_steps_run_and_are_stripped(tmp_path):

@@ -259,7 +259,7 @@ def test_the_overview_has_the_geometric_mean_over_games_with_a_floor():
     assert ratios["ekf"] == {}
     grid = ranks_table.grid(part.lines, part.places.peer)
     assert grid.only(["estimator", "/ Bayes"]).lines == (("ukf", "2.8"), ("ekf", ""))
-    assert grid.note.endswith("over games with this floor: online X-v0, Y-v0.")
+    assert grid.note.endswith("over the games with a floor (X-v0, Y-v0).")
     plain = main_of(rows_of("ukf", [0.2] * 12))
     assert "/ Bayes" not in ranks_table.grid(plain.lines, "ukf").header
 

@@ -22,12 +22,14 @@ STEP = 21
 """Height of a line, in pixels, in charts with one line per estimator."""
 TALL_STEP = 27
 """The same of lines with two symbols, one below the other."""
+NAMES = 150
+"""Largest width of a name in a chart, in pixels; longer ones end with an ellipsis."""
 PLAIN_NAMES = alt.Axis(
     domain=False,
     ticks=False,
     grid=False,
     labelExpr="names[datum.value]",
-    labelLimit=150,
+    labelLimit=NAMES,
     labelPadding=8,
     minExtent=0,
 )
@@ -113,7 +115,7 @@ def over_floor(styled: Styled, order: Sequence[str], low: float, high: float) ->
     """Chart errors over the floor with their intervals, a line per estimator, on an axis from low
     to high: a filled symbol in the steady window, and below it a hollow one in the transient."""
     scale, axis = log_scale(low, high), log_axis(low, high)
-    x = alt.X("shown:Q", scale=scale, axis=axis, title="root mean square error / the floor's")
+    x = alt.X("shown:Q", scale=scale, axis=axis, title="RMS error / the floor's")
     base = (
         named("over_floor")
         .transform_calculate(shown=finite("ratio"), lower=finite("low"), upper=finite("high"))
@@ -156,6 +158,9 @@ def cost(
         .transform_calculate(upper=finite("high"))
         .encode(x=x, y=y, tooltip=[*tips, exact("low"), exact("high")])
     )
+    labels = base.transform_filter(f"datum.named_{field}").encode(text="name:N")
+    room = alt.expr(f"max(30, min({NAMES}, width - scale('x', datum.{field}) - 8))")
+    text = {"align": "left", "dx": 8, "dy": -7, "limit": room}  # names end within the chart
     return finished(
         level(scale, vertical=False),
         base.mark_rule(opacity=0.5).encode(
@@ -164,8 +169,7 @@ def cost(
         base.mark_point(filled=True, size=80, opacity=1).encode(
             color=styled.colour, shape=styled.shape
         ),
-        base.transform_filter(f"datum.named_{field}")
-        .mark_text(style="name", align="left", dx=8, dy=-7)
-        .encode(text="name:N"),
+        labels.mark_text(style="name_ground", **text),  # so that symbols do not strike through
+        labels.mark_text(style="name", **text),
         height=340,
     )

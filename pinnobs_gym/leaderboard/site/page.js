@@ -25,8 +25,9 @@
   };
 
   const theme = () => {
-    const [text, soft, line, others] = dark.matches
-      ? ["#e4e7eb", "#9ba4b0", "#2b3138", "#555d68"] : ["#1c2026", "#5b6470", "#e6e9ed", "#c3c9d1"];
+    const [ground, text, soft, line, others] = dark.matches
+      ? ["#14171b", "#e4e7eb", "#9ba4b0", "#2b3138", "#555d68"]
+      : ["#ffffff", "#1c2026", "#5b6470", "#e6e9ed", "#c3c9d1"];
     return {
       background: "transparent",
       font: 'system-ui, "Segoe UI", Roboto, Arial, sans-serif',
@@ -48,6 +49,7 @@
         level: { color: soft, strokeDash: [3, 3], strokeWidth: 1 },
         middle: { color: text, thickness: 2.5, size: 14 },
         name: { color: text, fontSize: 11 },
+        name_ground: { color: ground, stroke: ground, strokeWidth: 3, strokeJoin: "round", fontSize: 11 },
       },
     };
   };

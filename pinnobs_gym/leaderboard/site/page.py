@@ -27,6 +27,7 @@ from pinnobs_gym.leaderboard.site.across import Factors
 from pinnobs_gym.leaderboard.site.drawings import charts_of, embedded
 from pinnobs_gym.leaderboard.site.model import Page
 from pinnobs_gym.leaderboard.site.palette import styles
+from pinnobs_gym.leaderboard.tables import Table
 from pinnobs_gym.simulation.conditions import CONDITIONS
 
 
@@ -34,6 +35,8 @@ def draw(page: Page) -> str:
     """Render the page as HTML; computes nothing from rows."""
     drawn = styles(list(page.tracks), page.main.places.peer)
     charts = charts_of(page, drawn)
+    parts = filter(None, (page.main, page.on_record))
+    facts = standings_table.facts_of(line.knows for part in parts for line in part.lines)
     scripts = _bundle(), _text("page.js")
     environment = jinja2.Environment(
         autoescape=True,
@@ -46,10 +49,10 @@ def draw(page: Page) -> str:
     environment.filters |= {"breakable": _breakable}
     return environment.from_string(_text("page.html")).render(
         page=page,
-        overview=_overview,
+        overview=lambda part: _overview(part, facts),
         note=ranks_table.NOTE,
         on_record=ON_RECORD,
-        grid=standings_table.grid,
+        grid=_standings,
         heat=[_heat(each, page.main.knows) for each in page.factors],
         styles=drawn,
         charts=charts.charts,
@@ -61,12 +64,29 @@ def draw(page: Page) -> str:
     )
 
 
-def _overview(part: Part) -> Grid:
+def _overview(part: Part, facts: Sequence[str]) -> Grid:
     """Return the overview of a part with a column per game, and letters for what estimators know,
-    so that it fits a window of usual width."""
+    so that it fits a window of usual width.
+
+    Args:
+        part: the part.
+        facts: what the letters stand for, the same in all parts of a page.
+    """
     known = [line.knows for line in part.lines]
     whole = ranks_table.grid(part.lines, part.places.peer)
-    return standings_table.with_letters(whole, known, standings_table.facts_of(known))
+    return standings_table.with_letters(whole, known, facts)
+
+
+def _standings(table: Table) -> Grid:
+    """Return the table of a game with intervals, without columns that may be dropped and have no
+    text in any line: a heading over nothing takes the room of numbers."""
+    whole = standings_table.grid(table)
+    names = [
+        column.name
+        for i, column in enumerate(whole.columns)
+        if not column.priority or any(line[i] for line in whole.lines)
+    ]
+    return whole.only(names)
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,7 @@ def test_a_floor_is_shown_but_is_no_contender():
     assert "<b>Error over exact Bayes.</b>" in text
     assert '"over_floor1"' in text
     assert "--estimators ekf ukf --episodes" in text  # no command names it
-    methods = tables_of(text)[-1]
+    methods = tables_of(text)[-1].replace("<wbr>", "")
     assert "exact_bayes" in methods
     assert "Error over exact Bayes" not in alone
 
@@ -185,7 +185,7 @@ def test_a_floor_is_shown_but_is_no_contender():
 def test_a_page_of_a_floor_alone_is_no_error():
     facts = {"track": "floor", "game_hash": "game", **COMMON}
     text = draw(page_model(Stored(rows_of("exact_bayes", [0.05] * 60, **facts), []), []))
-    assert "exact_bayes" in text
+    assert "exact_bayes" in text.replace("<wbr>", "")
 
 
 def test_a_condition_names_the_systems_that_are_left_out_of_it():
@@ -453,6 +453,70 @@ def test_nothing_is_wider_than_a_phone(opened):
     for each in ("nav", "#picker"):  # so does a line of links or of chips
         right = page.locator(each).evaluate("each => each.getBoundingClientRect().right")
         assert right <= 391
+
+
+def test_a_phone_shows_numbers_beside_the_names_that_stay(opened):
+    """The column of names stands still when a table is scrolled."""
+    page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+    draw_all(page)
+    page.eval_on_selector_all(
+        ":is(.scores, .methods) tbody th[scope=row]",
+        "all => all.forEach(each => { each.append(' (guided by a long name), 45 s') })",
+    )
+    widths = page.eval_on_selector_all(
+        ":is(.scores, .methods) tbody th[scope=row]",
+        "all => all.map(each => each.offsetWidth / each.closest('.box').clientWidth)",
+    )
+    assert len(widths) > 10
+    assert max(widths) < 0.6
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_titles_and_names_of_charts_end_within_them(opened, tmp_path, width):
+    made = rows_of("ukf", [0.1] * 60, **COMMON)
+    for i, name in enumerate(("first", "a name of a recipe that takes much room")):
+        own = {"us_per_step": 10.0 ** (i + 1), **COMMON}
+        made += rows_of(name, [0.05 * (1 - i / 2)] * 60, **own)
+        floor = {"track": "floor", "effective_sample_size": 900.0, **COMMON}
+        made += rows_of("exact_bayes", [0.02] * 60, **floor) if not i else []
+    path = tmp_path / "index.html"
+    path.write_text(draw(page_model(Stored(made, []), [])), encoding="utf-8")
+    page = opened(path, viewport={"width": width, "height": 900})
+    draw_all(page)
+    outside = """() => [...document.querySelectorAll("[data-chart] svg text")].filter((text) => {
+        const [own, svg] = [text, text.ownerSVGElement].map((e) => e.getBoundingClientRect());
+        return own.width && (own.right > svg.right + 1 || own.left < svg.left - 1);
+    }).map((text) => text.textContent)"""
+    assert page.locator("[data-chart=over_floor0]").count() == 1
+    assert page.locator("[data-chart=us] text", has_text="first").count() == 2  # on its ground
+    assert page.evaluate(outside) == []
+
+
+def test_no_heading_stands_over_an_empty_column():
+    text = drawn()  # without covariances, a reference and a floor
+    for table in tables_of(text):
+        if "<tfoot" in table or 'class="sortable methods"' in table:
+            continue
+        names = re.findall(r"<th><button[^>]*>(.*?)</button>", table)
+        lines = re.findall(r"<tr[^>]*>((?:(?!</tr>).)*<td.*?)</tr>", table, re.DOTALL)
+        cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", line, re.DOTALL) for line in lines]
+        assert cells
+        for i, name in enumerate(names):
+            assert name == "rank" or any(line[i].strip() for line in cells), name
+
+
+def test_letters_stand_for_the_same_in_all_overviews():
+    own = {"training": {"per_record": True, "seconds": 1.0}, "track": "offline"}
+    more = rows_of("pinn", [0.1] * 4, **own, **COMMON | {"knows": ["noise", "model"]})
+    other = {"env_id": "pinnobs/Y-v0", "knows": ["model", "states"], **COMMON}
+    more += rows_of("kkl", [0.1] * 60, **other)  # not where the other one has played
+    text = drawn(*more).partition("<script")[0]
+    legends = re.findall(r"knows: ([^.]*)\.", text)
+    assert len(legends) == 2
+    meant = [dict(part.split(" ", 1) for part in legend.split(", ")) for legend in legends]
+    for letter in meant[0].keys() & meant[1].keys():
+        assert meant[0][letter] == meant[1][letter]
+    assert len(meant[0] | meant[1]) == len({*meant[0].values(), *meant[1].values()})
 
 
 def test_on_a_phone_scores_come_first(opened):
