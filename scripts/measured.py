@@ -14,6 +14,8 @@ from machine import processor
 from pinnobs_gym.leaderboard.grid import markdown_table
 
 HEADER = ("figure", "measured", "asked")
+SHOWN = 3
+"""Number of missed bounds that a summary names."""
 
 
 def read(folder: Path) -> dict[str, list[dict[str, Any]]]:
@@ -51,8 +53,9 @@ def readme_section(groups: dict[str, list[dict[str, Any]]]) -> str:
     for group, figures in groups.items():
         asked = [figure for figure in figures if figure["holds"] is not None]
         missed = [figure for figure in asked if not figure["holds"]]
-        names = "; ".join(f"{name}: {value}, asked {bound}" for name, value, bound in cells(missed))
-        names = names.replace(" **missed**", "")
+        rows = [f"{name}: {value}, asked {bound}" for name, value, bound in cells(missed)]
+        more = [f"and {len(rows) - SHOWN} more"] if len(rows) > SHOWN else []
+        names = "; ".join(rows[:SHOWN] + more).replace(" **missed**", "")
         held = f"{len(asked) - len(missed)} of {len(asked)}"
         lines.append((f"`{group}`", held, names))
         table = getattr(_module(group), "readme_table", None)

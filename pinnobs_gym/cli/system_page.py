@@ -169,7 +169,7 @@ def _setups(cls: type[System]) -> str:
             f"- `{name}`: {start}; x̂₀ = {xhat0}, P₀ = {P0}; output "
             f"noise {_rounded(noise.tolist())}"
             + (f"; process noise {_rounded(process.tolist())} per {time}" if process.any() else "")
-            + (f"; {dict(setup.parameters)}" if setup.parameters else "")
+            + "".join(f"; `{name}` = {value:g}" for name, value in setup.parameters.items())
         )
         if setup.poor_prior is not None:
             poor = setup.poor_prior

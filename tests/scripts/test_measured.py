@@ -36,6 +36,14 @@ def test_the_readme_says_what_holds_and_what_is_missed(groups):
     assert "Measured on 2026-01-01 to 2026-01-02 by" in section
 
 
+def test_of_many_missed_bounds_the_first_three_are_named(groups):
+    (figure,) = (each for each in groups["core"] if each["holds"] is False)
+    groups["core"] = [{**figure, "figure": f"missed {i}"} for i in range(5)]
+    section = measured.readme_section(groups)
+    assert "missed 2: 2 x, asked >= 3; and 2 more |" in section
+    assert "missed 3" not in section
+
+
 def test_the_page_has_every_figure(groups):
     page = measured.page(groups)
     assert "| missed | 2 x | >= 3 **missed** |" in page
