@@ -20,6 +20,7 @@ from pinnobs_gym.estimators.robust_gain import RobustGain, TrainedBeliefs
 from pinnobs_gym.leaderboard.published.reading import published_floors
 from pinnobs_gym.scoring.floor import run_floor
 from pinnobs_gym.scoring.identifiability import identifiability
+from pinnobs_gym.scoring.row_format import FLOOR
 from pinnobs_gym.scoring.rows import Row
 from pinnobs_gym.simulation.conditions import fitting
 from pinnobs_gym.systems import SYSTEMS
@@ -210,11 +211,11 @@ def floor_rows(name: str, condition: str) -> tuple[Row, ...]:
     if system.nx > 3 or condition.startswith("process_noise"):
         return ()
     game = Game.of(name, condition=condition)
-    shipped = [row for row in published_floors([game.name]) if row["track"] == "online"]
+    shipped = [row for row in published_floors([game.name]) if row["track"] == FLOOR]
     if not shipped:
         with tempfile.TemporaryDirectory() as folder:
             rows = run_floor(game, range(FLOOR_EPISODES), Path(folder) / "rows.jsonl")
-        shipped = [row for row in rows if row["track"] == "online"]
+        shipped = [row for row in rows if row["track"] == FLOOR]
     return tuple(shipped)
 
 
