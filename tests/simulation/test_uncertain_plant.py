@@ -114,6 +114,12 @@ class Named(Linear):
     kind: str = "soft"
 
 
+class Sure(Named):
+    """It is named as what is uncertain."""
+
+    uncertain = ("kind",)
+
+
 def test_nothing_to_estimate_is_none():
     assert with_uncertain_plant(Moved(), 0.1) is None
     assert with_uncertain_plant(MovedByK(k=0.0), 0.1) is None
@@ -128,6 +134,8 @@ def test_a_deviation_is_a_number_above_0(deviation):
         with_uncertain_plant(Linear(), deviation)
 
 
-def test_a_parameter_that_is_no_number_is_refused():
-    with pytest.raises(ValueError, match="parameter kind='soft' of Named; expected a number"):
-        with_uncertain_plant(Named(), 0.1)
+def test_a_parameter_that_is_no_number_is_left_out_unless_it_is_named():
+    rates = with_uncertain_plant(Named(), 0.1)
+    assert rates.state_names == with_uncertain_plant(Linear(), 0.1).state_names
+    with pytest.raises(ValueError, match="parameter kind='soft' of Sure; expected a number"):
+        with_uncertain_plant(Sure(), 0.1)

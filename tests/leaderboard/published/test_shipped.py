@@ -49,7 +49,7 @@ def test_rows_of_a_game_and_its_floor_are_read(shipped):
     found = rows_in(shipped, [entry])
     assert len(found) == entry.rows
     seeds = {row["training_seed"] for row in found if row["estimator"] == "kkl_pinn"}
-    assert seeds == set(shipped.training_seeds) == {0, 1, 2, 3, 4}
+    assert seeds == set(shipped.training_seeds) >= {0, 1, 2}
 
 
 def test_a_trained_estimator_is_loaded_by_name(shipped):
