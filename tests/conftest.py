@@ -84,3 +84,21 @@ def ticking(monkeypatch):
     """CPU time goes on by 0.01 s whenever it is looked at, on a machine of any speed."""
     ticks = itertools.count()
     monkeypatch.setattr(time, "process_time", lambda: next(ticks) / 100)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A browser without a screen; tests of pages are left out where there is none."""
+    from playwright.sync_api import sync_playwright
+    from waiting import PATIENCE
+
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium here")
+    switches = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
+    switches += ["--disable-background-networking", "--disable-component-update"]
+    with sync_playwright() as playwright:
+        launch = playwright.chromium.launch
+        browser = launch(executable_path=chromium, args=switches, timeout=1000 * PATIENCE)
+        yield browser
+        browser.close()

@@ -1,19 +1,14 @@
 """The documentation's style sheet on that of its theme, in a browser, and the classes it uses."""
 
-import shutil
 import sys
 from importlib import resources
 
 import pytest
 from docutils.core import publish_doctree
 from docutils.nodes import entry
-from playwright.sync_api import sync_playwright
 from snippets import ROOT
 from waiting import PATIENCE
 
-CHROMIUM = shutil.which("chromium")
-ARGUMENTS = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
-ARGUMENTS += ["--disable-background-networking", "--disable-component-update"]
 NAME = "pinnobs_gym.leaderboard.site.over_samples.a_name_that_is_longer_than_half_of_a_window()"
 
 
@@ -28,17 +23,6 @@ def made():
     finally:
         sys.path.remove(str(ROOT / "docs"))
     return mathml, short_cells, moving
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no chromium here")
-    with sync_playwright() as playwright:
-        launch = playwright.chromium.launch
-        browser = launch(executable_path=CHROMIUM, args=ARGUMENTS, timeout=1000 * PATIENCE)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

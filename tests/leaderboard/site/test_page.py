@@ -2,14 +2,12 @@
 
 import json
 import re
-import shutil
 import sys
 from functools import cache
 
 import altair as alt
 import pytest
 from made_rows import rows_of
-from playwright.sync_api import sync_playwright
 from waiting import PATIENCE, until
 
 from pinnobs_gym import evaluate
@@ -25,9 +23,6 @@ from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.rows import Stored
 from pinnobs_gym.systems import SYSTEMS
 
-CHROMIUM = shutil.which("chromium")
-ARGUMENTS = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]
-ARGUMENTS += ["--disable-background-networking", "--disable-component-update"]
 DUFFING, MOTOR = "pinnobs/ReverseDuffing-v0", "pinnobs/InductionMotor-v0"
 
 
@@ -262,17 +257,6 @@ def test_charts_are_valid():
         cost(styled, "us", "µs", (0.1, 10.0), (0.5, 20.0)),
     ):
         alt.LayerChart.from_dict(spec)  # validates
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no chromium here")
-    with sync_playwright() as playwright:
-        launch = playwright.chromium.launch
-        browser = launch(executable_path=CHROMIUM, args=ARGUMENTS, timeout=1000 * PATIENCE)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
