@@ -69,7 +69,7 @@ def pack(
             f"{len(stored.failures)} job(s) failed, such as {row['estimator']} on "
             f"{', '.join(game_of(row))}: {row['error']}; nothing is published"
         )
-    rows_files = list(_rows_files(stored, {job.game.name for job in jobs}))
+    rows_files = list(_rows_files(stored, {job.game.name for job in jobs}, seeds))
     floors = {file.entry.game for file in rows_files if file.entry.floor}
     curves_files = list(_curves_files(stored, floors, jobs[0].folder))
     files = [*rows_files, *_trained_files(jobs, seeds[0]), *curves_files]
@@ -95,15 +95,18 @@ def pack(
     return manifest
 
 
-def _rows_files(stored: Stored, games: set[GameName]) -> Iterator[_Packed]:
+def _rows_files(stored: Stored, games: set[GameName], seeds: Sequence[int]) -> Iterator[_Packed]:
     """Yield a file for each game, and one for its floor: a line per run, of its number of rows and
     its packed columns.
 
-    Floors of other games are published, too.
+    Floors of other games are published, too. Rows of other training seeds are not: some of them
+    may be there for some games only, and no number of trainings would then be that of all.
     """
     last_use = LastUse.of([*stored.rows, *stored.uses])
     runs: dict[GameName, dict[Any, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in stored.rows:
+        if row.get("training_seed") not in (None, *seeds):
+            continue
         run = row["game_hash"], row["estimator"], row["estimator_hash"]
         runs[game_of(row)][run].append(row)
     for game in sorted(runs):

@@ -77,6 +77,17 @@ def test_packing_again_changes_no_file_but_the_date(made, tmp_path):
     assert (again.rows, again.trained) == (made.manifest.rows, made.manifest.trained)
 
 
+def test_rows_of_other_training_seeds_are_not_published(made, tmp_path):
+    stored = rows.load(made.rows)
+    few = pack(made.jobs, stored, tmp_path, (0,))
+    published = {rows.key(row) for row in rows_in(few, few.rows)}
+    untrained = [row for row in stored.rows if row.get("training_seed") is None]
+    first = [row for row in stored.rows if row.get("training_seed") == 0]
+    assert untrained
+    assert 0 < len(first) < len(stored.rows) - len(untrained)
+    assert published == {rows.key(row) for row in [*untrained, *first]}
+
+
 def test_a_failed_job_is_not_published(made, copy):
     before = sorted(path.read_bytes() for path in copy.rglob("*.*"))
     failure = {"env_id": "pinnobs/X-v0", "setup": "benchmark", "condition": "nominal"}
