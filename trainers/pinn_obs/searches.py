@@ -11,7 +11,7 @@ from torch import Tensor
 from trainers.pinn_obs.quasi_newton import CURVATURE, SUFFICIENT_DECREASE, TRIALS
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Trials:
     """A trial of each search: a step, and the function and its slope at that step; (batch,) each.
     See `trainers.pinn_obs.quasi_newton.Trial`."""
@@ -40,23 +40,16 @@ class Searches:
         """The trial steps, shape (batch,); zero where no search is active."""
         self.active = zero > 0
         """Where a search is in progress, bool (batch,)."""
-        self._start = self._low = self._high = Trials(zero, zero, zero)
+        self.start, self.low, self.high = (Trials(zero, zero, zero) for _ in range(3))
+        """The start of each search, and the ends of its bracket."""
         self._bracketed, self._count = zero > 0, zero
-
-    def keep(self, rows: Tensor) -> None:
-        """Keep only the searches of these indices."""
-        for name in ("step", "active", "_bracketed", "_count"):
-            setattr(self, name, getattr(self, name)[rows])
-        for name in ("_start", "_low", "_high"):
-            parts = vars(getattr(self, name)).values()
-            setattr(self, name, Trials(*(part[rows] for part in parts)))
 
     def begin(self, mask: Tensor, f: Tensor, slope: Tensor, first: Tensor) -> None:
         """Begin a search where the mask (batch,) is true, from the function, its slope and the
         first trial step, (batch,) each."""
         start = Trials(torch.zeros_like(f), f, slope)
-        self._start = start.where(mask, self._start)
-        self._low = start.where(mask, self._low)
+        self.start = start.where(mask, self.start)
+        self.low = start.where(mask, self.low)
         self._bracketed = self._bracketed & ~mask
         self._count = torch.where(mask, 0.0, self._count)
         self.step = torch.where(mask, first, self.step)
@@ -69,7 +62,7 @@ class Searches:
             Where the step is accepted, and where a search failed, bool (batch,) each; these are no
             longer active.
         """
-        start, low, high = self._start, self._low, self._high
+        start, low, high = self.start, self.low, self.high
         trial = Trials(self.step, torch.where(f.isfinite(), f, torch.inf), slope)
         least = start.f + SUFFICIENT_DECREASE * trial.step * start.slope
         above = ~(trial.f <= least) | (trial.f >= low.f)
@@ -77,8 +70,8 @@ class Searches:
         # Shrink the bracket; see `trials`.
         width = torch.where(self._bracketed, high.step - low.step, 1.0)
         turned = ~above & (slope * width >= 0)
-        self._high = high = trial.where(above, low.where(turned, high))
-        self._low = low = low.where(above, trial)
+        self.high = high = trial.where(above, low.where(turned, high))
+        self.low = low = low.where(above, trial)
         self._bracketed = self._bracketed | above | turned
         size = torch.maximum(low.step.abs(), high.step.abs())
         closed = self._bracketed & ((high.step - low.step).abs() <= 1e-14 * size)

@@ -2,9 +2,10 @@
 
 Each round evaluates one trial point of every record in one batch. Line searches, updates and ends
 of trainings are operations on tensors with masks, and Python reads numbers back only every
-`ROUNDS`. On a CPU this is slower than one record after another, whose arrays then stay in the
-cache. The tests run the same code on a CPU, where the results agree with those of single
-trainings, and on torch's meta device, which has no numbers that could be read.
+`ROUNDS`. On a GPU one round is recorded as a CUDA graph, whose replays need no Python. On a CPU
+all this is slower than one record after another, whose arrays then stay in the cache. The tests run
+the same code on a CPU, where the results agree with those of single trainings, and on torch's meta
+device, which has no numbers that could be read.
 """
 
 from __future__ import annotations
@@ -39,13 +40,11 @@ def advance(trainers: Sequence[PinnObsTrainer], device: str, interrupt: Interrup
     """
     batches: dict[tuple, list[PinnObsTrainer]] = {}
     for trainer in trainers:
-        # The first iteration of each, with restarts if its loss is not finite.
-        while not trainer.finished() and trainer.best is None:
-            trainer.step()
         recipe = trainer.recipe
         sizes = (*recipe.architecture.shapes, len(recipe.objective.points.t))
         batches.setdefault(sizes, []).append(trainer)
     for batch in batches.values():
+        evaluate_first(batch, device)
         live = [trainer for trainer in batch if not ended_now(trainer, interrupt)]
         state: Minimisations | None = None
         while live:
@@ -54,14 +53,24 @@ def advance(trainers: Sequence[PinnObsTrainer], device: str, interrupt: Interrup
                 thetas = np.stack([trainer.theta for trainer in live])
                 made = [trainer.iteration for trainer in live]
                 state = Minimisations(objectives, thetas, made, device, live[0].config)
-            for _ in range(ROUNDS):
-                state.round()
+            state.rounds(ROUNDS)
             for trainer, reached in zip(live, state.reached(), strict=True):
                 trainer.reached(*reached)
             left = [i for i, trainer in enumerate(live) if not ended_now(trainer, interrupt)]
             if len(left) < len(live):
                 live = [live[i] for i in left]
                 state.keep(left)
+
+
+def evaluate_first(trainers: Sequence[PinnObsTrainer], device: str) -> None:
+    """Make the first iteration of trainers with networks of one shape, which evaluates the initial
+    weights; again from the next seed where the loss is not finite, as `PinnObsTrainer.took` says.
+    """
+    while begun := [run for run in trainers if run.best is None and not run.finished()]:
+        objective = Objective.stacked([run.recipe.objective for run in begun], device)
+        thetas = torch.as_tensor(np.stack([run.theta for run in begun]), device=device)
+        for run, loss in zip(begun, objective.values(thetas)[0].tolist(), strict=True):
+            run.took(loss, run.theta)
 
 
 @dataclass(eq=False)
@@ -105,7 +114,11 @@ class Minimisations:
     """Self-scaled Broyden minimisations in progress, one per objective, after the iteration that
     evaluates the initial points.
 
-    They are a batched version of `trainers.pinn_obs.quasi_newton.QuasiNewton`.
+    They are a batched version of `trainers.pinn_obs.quasi_newton.QuasiNewton`. The estimates H of
+    the inverse Hessians take most of the memory, and their updates most of the time. So a factor
+    of each is kept apart, as is the identity that a fresh H is: a fresh row has zeros, to which its
+    first update is added. A row whose H is dropped, since a search along its direction failed,
+    waits for the end of the `rounds`, where its H is set to zero.
 
     Args:
         objectives: objectives of networks of one shape, with equally many points.
@@ -130,15 +143,21 @@ class Minimisations:
         self._direction = -self._gradient
         batch, n = starts.shape
         self._H = torch.zeros((batch, n, n), dtype=self._x.dtype, device=device)
-        self._fresh = torch.ones(
-            batch, dtype=torch.bool, device=device
-        )  # whether H is the identity
+        self._factor = torch.ones_like(self._f)
+        """Factor of each H, shape (batch,)."""
+        self._fresh = torch.ones(batch, dtype=torch.bool, device=device)
+        """Whether H is the identity, and its place zero, bool (batch,)."""
+        self.waiting = ~self._fresh
+        """Whether H is to be dropped, bool (batch,)."""
         self._slope = torch.zeros_like(self._f)
         self._searches = Searches(batch, self._f)
         made = torch.as_tensor(list(iterations), device=device)
         self.progress = Progress(
             self._fresh, ~self._fresh, made, self._f, made, self._x, self._f, made
         )
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._recordable = self._x.is_cuda
+        self._part()
 
     def reached(self) -> list[tuple[int, BestIterate, Mark, bool]]:
         """Return the iteration, the best iterate (of seed −1), the mark and whether it is stuck, of
@@ -157,46 +176,109 @@ class Minimisations:
         if not rows:
             return
         index = torch.as_tensor(list(rows), device=self._x.device)
-        for name in ("_x", "_f", "_gradient", "_direction", "_H", "_fresh", "_slope"):
-            setattr(self, name, getattr(self, name)[index])
-        self.progress = Progress(*(part[index] for part in vars(self.progress).values()))
-        self._searches.keep(index)
+        for owner, name in self._places():
+            setattr(owner, name, getattr(owner, name)[index])
         self._objectives = [self._objectives[i] for i in rows]
         self._objective = Objective.stacked(self._objectives, str(self._x.device))
+        self._graph = None
 
-    def round(self) -> None:
+    def rounds(self, number: int) -> None:
+        """Evaluate so many trials of every row that goes on.
+
+        On a GPU the first is made as it is written, and recorded for the others. A round that
+        cannot be recorded, since the model reads numbers back, is made as it is written each time.
+        """
+        self._settle()
+        for _ in range(number):
+            if self._graph is not None:
+                self._graph.replay()
+                continue
+            self._round_in_place()
+            if self._recordable:
+                self._record()
+
+    def _record(self) -> None:
+        """Record a round, without making it."""
+        places = [getattr(owner, name) for owner, name in self._places()]
+        graph = torch.cuda.CUDAGraph()
+        try:
+            with torch.cuda.graph(graph):
+                self._round_in_place()
+            self._graph = graph
+        except RuntimeError:
+            self._recordable = False
+            for (owner, name), place in zip(self._places(), places, strict=True):
+                setattr(owner, name, place)
+
+    def _places(self) -> list[tuple[object, str]]:
+        """Return the attributes that hold tensors of the minimisations, with their owners."""
+        searches = self._searches
+        ends = (searches.start, searches.low, searches.high)
+        owners = (self, self.progress, searches, *ends)
+        return [(o, n) for o in owners for n, part in vars(o).items() if isinstance(part, Tensor)]
+
+    def _part(self) -> None:
+        """Give each tensor memory of its own, for `_round_in_place`."""
+        seen: set[int] = set()
+        for owner, name in self._places():
+            part = getattr(owner, name)
+            if id(part) in seen:
+                setattr(owner, name, part.clone())
+            seen.add(id(part))
+
+    def _round_in_place(self) -> None:
+        """Make a round whose results take the memory of what they replace, as a graph needs it."""
+        before = [getattr(owner, name) for owner, name in self._places()]
+        self._round()
+        for (owner, name), place in zip(self._places(), before, strict=True):
+            now = getattr(owner, name)
+            if now is not place:
+                place.copy_(now)
+                setattr(owner, name, place)
+
+    def _settle(self) -> None:
+        """Drop the H of the rows that wait, and multiply those of the others by their factors,
+        whose products would leave the finite numbers."""
+        self._H.mul_(self._factor[:, None, None])
+        self._H.masked_fill_(self.waiting[:, None, None], 0.0)
+        self._factor.fill_(1.0)
+        self.waiting.fill_(False)
+
+    def _round(self) -> None:
         """Evaluate one trial of every row that goes on."""
         searches = self._searches
-        ended = self._begin(self.progress.live & ~searches.active)
+        ended = self._begin(self.progress.live & ~searches.active & ~self.waiting)
         trial = self._x + searches.step[:, None] * self._direction
         step = searches.step
         loss, gradient = self._objective.values(trial)
         made, failed = searches.advance(loss, (gradient * self._direction).sum(-1))
         ended = ended | (failed & self._fresh)
-        self._fresh = self._fresh | failed  # then the next search is along the steepest descent
+        dropped = failed & ~self._fresh  # then the next search is along the steepest descent
+        self._fresh, self.waiting = self._fresh | dropped, self.waiting | dropped
         self._update(made, step, trial, gradient)
         self._f = torch.where(made, loss, self._f)
         self.progress.took(made, ended, self._f, self._x, self._config)
 
     def _times(self, vectors: Tensor) -> Tensor:
         """Return the products of H with vectors (batch, n)."""
-        product = (self._H @ vectors[..., None])[..., 0]
+        product = (self._H @ vectors[..., None])[..., 0] * self._factor[:, None]
         return torch.where(self._fresh[:, None], vectors, product)
 
     def _begin(self, rows: Tensor) -> Tensor:
-        """Begin the line searches of these rows (batch,); return those without a descent."""
+        """Begin the line searches of these rows (batch,), but for those whose H is dropped; return
+        those without a descent."""
         direction = -self._times(self._gradient)
         slope = (self._gradient * direction).sum(-1)
-        uphill = rows & ~(slope < 0)  # steepest descent instead
-        self._fresh = self._fresh | uphill
-        direction = torch.where(uphill[:, None], -self._gradient, direction)
-        slope = (self._gradient * direction).sum(-1)
+        uphill = rows & ~(slope < 0)
+        ended = uphill & self._fresh
+        dropped = uphill & ~self._fresh  # steepest descent instead
+        self._fresh, self.waiting = self._fresh | dropped, self.waiting | dropped
+        rows = rows & ~uphill
         self._direction = torch.where(rows[:, None], direction, self._direction)
         self._slope = torch.where(rows, slope, self._slope)
-        ended = rows & ~(slope < 0)
         first = (1 / (-slope).clamp(min=1e-300).sqrt()).clamp(max=1.0)
         first = torch.where(self._fresh, first, FIRST_STEP)
-        self._searches.begin(rows & ~ended, self._f, slope, first)
+        self._searches.begin(rows, self._f, slope, first)
         return ended
 
     def _update(self, made: Tensor, step: Tensor, trial: Tensor, gradient: Tensor) -> None:
@@ -210,17 +292,18 @@ class Minimisations:
         size = torch.where(self._fresh, sy / yy, 1.0)  # of the identity, before its first update
         sBs = torch.where(self._fresh, ss / size, -step * self._slope * step)
         weights = update_weights(sBs, size * yw, sy, s.shape[-1])
-        # Rows without an update keep H: τ and the size are one there, and the other weights zero.
-        size = torch.where(curved, size, 1.0)[:, None]
-        tau = torch.where(curved, weights[0], 1.0)[:, None]
+        # Rows without an update keep H: their factor stays, and what is added is zero.
+        grown = torch.where(curved, size / weights[0], 1.0)
         by_ss, by_sw, by_ww = (torch.where(curved, a, 0.0)[:, None] for a in weights[1:])
-        w = size * w
+        w = torch.where(curved, size, 0.0)[:, None] * w
+        # H' = grown·H + [s w] M [s w]ᵀ, and H is factor·_H, or the identity.
+        factor = torch.where(self._fresh, 1.0, self._factor * grown)
+        self._factor = torch.where(curved, factor, self._factor)
         left = torch.stack([s, w], dim=-1)
         right = torch.stack([by_ss * s + by_sw * w, by_sw * s + by_ww * w], dim=-1)
-        fresh = self._fresh[:, None]
-        kept = torch.where(fresh, 0.0, size / tau)
-        self._H.mul_(kept[..., None]).baddbmm_(left, right.mT)
-        self._H.diagonal(dim1=-2, dim2=-1).add_(torch.where(fresh, size / tau, 0.0))
+        self._H.baddbmm_(left / self._factor[:, None, None], right.mT)
+        new = torch.where(curved & self._fresh, grown, 0.0)[:, None]
+        self._H.diagonal(dim1=-2, dim2=-1).add_(new)
         self._fresh = self._fresh & ~curved
         self._x = torch.where(moved, trial, self._x)
         self._gradient = torch.where(moved, gradient, self._gradient)

@@ -11,18 +11,20 @@ from small_trainings import same_weights, train_pinn_obs
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.pinn_obs import PinnObs
 from pinnobs_gym.systems import SYSTEMS
+from pinnobs_gym.systems.reverse_duffing import ReverseDuffing
 from pinnobs_gym.training.loop import Interrupt
 from trainers.pinn_obs import PinnObsConfig, PinnObsTrainer
 from trainers.pinn_obs.fast_recipe import FastRecipe
 from trainers.pinn_obs.objective import Objective, Weights
 from trainers.pinn_obs.quasi_newton import CURVATURE, trials
 from trainers.pinn_obs.searches import Searches
-from trainers.pinn_obs.stacked import Minimisations, advance
+from trainers.pinn_obs.stacked import Minimisations, advance, evaluate_first
 
 # few points make quick tests
 pytestmark = pytest.mark.filterwarnings("ignore:points=40 do not resolve")
 
 train_rows = PinnObsTrainer.train_rows
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SMALL = PinnObsConfig(depth=2, width=8, iterations=25, points=40)
 
 
@@ -38,11 +40,12 @@ def runs_of(system, record, noise, config=SMALL):
     return [PinnObsTrainer(system, config, record=row, noise_std=noise) for row in rows]
 
 
-def test_a_batch_finds_what_single_trainings_find():
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_batch_finds_what_single_trainings_find(device):
     system, record, noise = records()
     record.y[1, 30:40] = np.nan
     together = runs_of(system, record, noise)
-    advance(together, "cpu", Interrupt())
+    advance(together, device, Interrupt())
     for run, alone in zip(together, runs_of(system, record, noise), strict=True):
         while not alone.finished():
             alone.step()
@@ -53,11 +56,12 @@ def test_a_batch_finds_what_single_trainings_find():
         np.testing.assert_allclose(ours.gain(record.t), theirs.gain(record.t), atol=1e-4)
 
 
-def test_each_record_of_a_batch_ends_when_it_would_alone():
+@pytest.mark.parametrize("device", DEVICES)
+def test_each_record_of_a_batch_ends_when_it_would_alone(device):
     system, record, noise = records(batch=4)
     config = replace(SMALL, iterations=60, patience=8, improvement=0.3)
     together = runs_of(system, record, noise, config)
-    advance(together, "cpu", Interrupt())
+    advance(together, device, Interrupt())
     alone = runs_of(system, record, noise, config)
     for run in alone:
         while not run.finished():
@@ -87,15 +91,54 @@ def test_a_minimisation_without_a_way_down_ends():
     flat = Objective(second.architecture, system, second.points, nothing, lead)
     starts = np.stack([run.theta for run in runs])
     state = Minimisations([first, flat], starts, [1, 1], "cpu", SMALL)
-    state.round()
+    state.rounds(1)
     assert state.progress.live.tolist() == [True, False]
     for _ in range(5):
-        state.round()
+        state.rounds(1)
     (made, best, _, stuck), (ended, other, _, flat_stuck) = state.reached()
     assert made > 1
     assert (stuck, ended, flat_stuck) == (False, 2, True)
     assert np.array_equal(other.theta, starts[1])
     assert np.isfinite(best.theta).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_after_a_search_that_fails_the_next_is_along_the_steepest_descent(device):
+    """As it is in single trainings, here of networks that are too small for the record."""
+    system, record, noise = records(batch=3)
+    config = PinnObsConfig(depth=1, width=2, iterations=400, patience=400, points=40)
+    runs = runs_of(system, record, noise, config)
+    evaluate_first(runs, device)
+    objectives, starts = [r.recipe.objective for r in runs], np.stack([r.theta for r in runs])
+    state, waited = Minimisations(objectives, starts, [1] * 3, device, config), 0
+    for _ in range(40):
+        state.rounds(20)
+        waited += int(state.waiting.sum())
+    assert waited > 0
+    for (_, best, _, _), alone in zip(
+        state.reached(), runs_of(system, record, noise, config), strict=True
+    ):
+        while not alone.finished():
+            alone.step()
+        assert best.loss == pytest.approx(alone.best.loss, rel=1e-3)
+
+
+class Asking(ReverseDuffing):
+    """A model that reads numbers back."""
+
+    def f(self, t, x, u):
+        return super().f(t, x, u) if bool(abs(x).max() < 1e9) else 0 * x
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_model_that_reads_numbers_back_is_trained_too(device):
+    _, record, noise = records(batch=2)
+    together = runs_of(Asking(), record, noise)
+    advance(together, device, Interrupt())
+    for run, alone in zip(together, runs_of(Asking(), record, noise), strict=True):
+        while not alone.finished():
+            alone.step()
+        assert run.result().loss == pytest.approx(alone.result().loss, rel=1e-6)
 
 
 def test_no_number_is_read_back_within_a_round():
@@ -105,7 +148,7 @@ def test_no_number_is_read_back_within_a_round():
     objectives, starts = [r.recipe.objective for r in runs], np.stack([r.theta for r in runs])
     state = Minimisations(objectives, starts, [1, 1], "meta", SMALL)
     for _ in range(2):
-        state.round()
+        state.rounds(1)
     assert state.progress.best.device.type == "meta"
 
 
