@@ -19,7 +19,7 @@ from pinnobs_gym.cli.console import console
 from pinnobs_gym.cli.options import parse
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files import check_writable
-from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs
+from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs, left
 from pinnobs_gym.leaderboard.jobs.job import Job
 from pinnobs_gym.leaderboard.jobs.trainings import training_of
 from pinnobs_gym.leaderboard.published import manifest
@@ -58,7 +58,8 @@ class Publish:
             out=self.out,
         )
         jobs = [job for job in leaderboard.planned() if self._is_wanted(job)]
-        failed = compute(self._floors(jobs), leaderboard.jobs or PROCESSES)
+        floors = left(self._floors(jobs), rows.load(self.out / "rows.jsonl"))
+        failed = compute(floors, leaderboard.jobs or PROCESSES)
         status = 1 if failed else leaderboard.play(jobs)
         if status:
             console.print("nothing is published: not all jobs are done", style="red")

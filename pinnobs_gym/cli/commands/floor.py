@@ -14,7 +14,7 @@ from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files import check_writable
 from pinnobs_gym.leaderboard.floor import is_floor
 from pinnobs_gym.leaderboard.jobs.engine import Engine, Workers
-from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs
+from pinnobs_gym.leaderboard.jobs.floor_job import FloorJob, floor_jobs, left
 from pinnobs_gym.leaderboard.jobs.stopping import stoppable
 from pinnobs_gym.scoring import rows
 from pinnobs_gym.scoring.evaluation import seeds_of
@@ -60,9 +60,10 @@ class FloorCommand:
             floors_of(game)  # raises for a game without a floor, before anything is computed
         check_writable(self.out)
         path = self.out / "rows.jsonl"
-        earlier = {rows.key(row): row["date"] for row in rows.read(path)}  # reject a damaged file
+        stored = rows.load(path)  # reject a damaged file
+        earlier = {rows.key(row): row["date"] for row in stored.rows}
         jobs = list(floor_jobs(games, seeds, self.out.absolute(), self.fresh))
-        failed = compute(jobs, self.jobs)
+        failed = compute(left(jobs, stored), self.jobs)
         wanted = {game.name for game in games}
         found = [row for row in rows.read(path) if rows.game_of(row) in wanted and is_floor(row)]
         taken = sum(earlier.get(rows.key(row)) == row["date"] for row in found)
@@ -91,6 +92,8 @@ class FloorCommand:
 
 def compute(jobs: Sequence[FloorJob], processes: int) -> int:
     """Compute the floors of some jobs, show the progress, and return how many jobs failed."""
+    if not jobs:
+        return 0
     engine = Engine(Workers(processes))
     kinds = {job.name: Kind("floors", " ".join(job.game.name)) for job in jobs}
     with (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -10,7 +10,10 @@ from typing import Self
 from pinnobs_gym.envs.game import Game
 from pinnobs_gym.files import noticing_full_disks
 from pinnobs_gym.leaderboard.jobs.time_limit import TIME_LIMIT
-from pinnobs_gym.scoring.floor import run_floor
+from pinnobs_gym.scoring import rows
+from pinnobs_gym.scoring.evaluation import estimator_fields, game_fields
+from pinnobs_gym.scoring.floor import floors_of, run_floor
+from pinnobs_gym.scoring.recency import LastUse
 
 EPISODES = 10
 """Number of episodes of a job; an interrupted one is computed again."""
@@ -70,3 +73,27 @@ def floor_jobs(
         for first in range(seeds.start, seeds.stop, EPISODES):
             count = min(EPISODES, seeds.stop - first)
             yield FloorJob(game, first, count, folder, fresh)
+
+
+def left(jobs: Sequence[FloorJob], stored: rows.Stored) -> list[FloorJob]:
+    """Return the jobs with work left: an episode of which a floor is not stored, or code that was
+    not the last to be used.
+
+    A job looks itself, but each reads the whole file.
+    """
+    present = {rows.key(row) for row in stored.rows}
+    last_use = LastUse.of([*stored.rows, *stored.uses])
+    floors = {}
+    for game in {job.game.name: job.game for job in jobs}.values():
+        of_game = game_fields(game)
+        floors[game.name] = [{**of_game, **estimator_fields(f, game)} for f in floors_of(game)]
+
+    def is_done(job: FloorJob) -> bool:
+        episodes = [rows.episode_of(job.seed + i) for i in range(job.episodes)]
+        return not job.fresh and all(
+            all(rows.key({**common, "episode": each}) in present for each in episodes)
+            and last_use.is_last(common)
+            for common in floors[job.game.name]
+        )
+
+    return [job for job in jobs if not is_done(job)]
