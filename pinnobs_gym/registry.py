@@ -22,6 +22,9 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 T = TypeVar("T")
+_ALIKE = 0.66
+"""Least likeness of a name that is suggested: that of two names of three letters with two of them
+exchanged."""
 
 
 class NameSource(NamedTuple):
@@ -152,7 +155,8 @@ class Registry(Generic[T]):
                     f"as {self._package}"
                 )
             guess = did_you_mean(spec, {*self._known, *self.sources})
-            raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}{guess}")
+            own = f"; one of your own is given as module:{self._kind.title()}"
+            raise ValueError(f"unknown {self._kind} {spec!r}; known are {known}{guess or own}")
         return self._known[spec]
 
     def beside(self, cls: type) -> dict[str, type[T]]:
@@ -160,6 +164,8 @@ class Registry(Generic[T]):
         that its module, or the module of one of its bases, defines or imports."""
         found: dict[str, type[T]] = {}
         for name in dict.fromkeys(base.__module__ for base in cls.__mro__):
+            if name.partition(".")[0] in sys.stdlib_module_names:
+                continue  # names of typing warn when they are looked at
             module = sys.modules.get(name)
             for value in () if module is None else tuple(vars(module).values()):
                 if self._is_concrete(value):
@@ -213,7 +219,25 @@ class Registry(Generic[T]):
                     "a function, a notebook or the main guard has defined; expected a class at "
                     "the top level of a module"
                 ) from None
-            raise ValueError(f"cannot load {self._kind} {spec!r}: {error_line(error)}") from error
+            advice = self._advice(module, name)
+            raise ValueError(
+                f"cannot load {self._kind} {spec!r}: {error_line(error)}{advice}"
+            ) from error
+
+    def _advice(self, module: str, name: str) -> str:
+        """Return what may have been meant by ``module:Class`` that cannot be loaded, as the end of
+        a message; empty if nothing is known."""
+        if module.endswith(".py") or "/" in module or "\\" in module:
+            dotted = ".".join(Path(module).with_suffix("").parts)
+            return f"; a module is named without .py and with dots: {dotted}:{name}"
+        found = sys.modules.get(module)
+        own = [] if found is None else [v for v in vars(found).values() if self._is_concrete(v)]
+        if not own or any(cls.__name__ == name for cls in own):
+            return ""
+        names = [cls.__name__ for cls in own if cls.__module__ == module]
+        return did_you_mean(name, names) or (
+            f"; it has {', '.join(sorted(names))}" if names else ""
+        )
 
     def _owner(self, name: str) -> tuple[str, str] | None:
         """Return the module and qualified name of the class with this name, or None."""
@@ -278,7 +302,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return the known name that an unknown one is most like, as the end of a message; empty if it
     is like none."""
     by_letters = {each.casefold(): each for each in known}
-    near = difflib.get_close_matches(str(name).casefold(), by_letters, n=1, cutoff=0.7)
+    near = difflib.get_close_matches(str(name).casefold(), by_letters, n=1, cutoff=_ALIKE)
     return "".join(f"; did you mean {by_letters[each]!r}?" for each in near)
 
 

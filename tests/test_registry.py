@@ -1,5 +1,7 @@
+import re
 import sys
-from typing import ClassVar
+import typing
+from typing import ClassVar, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -205,6 +207,31 @@ def test_unknown_names_list_the_known_ones():
         ESTIMATORS.resolve("kf")
     with pytest.raises(ValueError, match="cannot load system 'nowhere:X': ModuleNotFound"):
         SYSTEMS.resolve("nowhere:X")
+
+
+@pytest.mark.parametrize(
+    ("spec", "advice"),
+    [
+        ("efk", "did you mean 'ekf'?"),
+        ("none of all these", "one of your own is given as module:Estimator"),
+        ("pinnobs_gym.estimators.ekf:Ekf", "did you mean 'EKF'?"),
+        ("pinnobs_gym.estimators.ekf:Mine", "it has EKF"),
+        ("plug/mine.py:Mine", "a module is named without .py and with dots: plug.mine:Mine"),
+    ],
+)
+def test_unknown_names_end_with_what_may_have_been_meant(spec, advice):
+    with pytest.raises(ValueError, match=rf"; {re.escape(advice)}$"):
+        ESTIMATORS.resolve(spec)
+
+
+def test_what_lies_beside_a_class_is_not_looked_for_in_the_standard_library(monkeypatch):
+    """Of the names of typing, some warn when they are looked at."""
+    monkeypatch.setattr(typing, "looked_at", ESTIMATORS.resolve("ukf"), raising=False)
+
+    class Own(Generic[TypeVar("T")]):
+        pass
+
+    assert "ukf" not in ESTIMATORS.beside(Own)
 
 
 def test_register_refuses_what_is_incomplete_or_taken():

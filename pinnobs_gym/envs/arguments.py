@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from pinnobs_gym.envs.episodes import EpisodeSource
+from pinnobs_gym.envs.episodes import Changes, EpisodeSource
+from pinnobs_gym.registry import did_you_mean
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.system import System
 from pinnobs_gym.simulation.values import check_seed, is_whole, real_array, shortly
 
 NOT_FINITE_REWARD = -1e4
 """Reward of an action that is not finite, which ends the episode."""
+_MADE_BY_MAKE = ("system", "num_envs", "changes")
+"""Parameters of envs that the id gives, or that are no arguments of their own."""
 
 
 def reward_weights(system: System) -> np.ndarray:
@@ -43,6 +47,26 @@ def seeds_of(rng: np.random.Generator) -> np.random.SeedSequence:
     if not isinstance(seeds, np.random.SeedSequence):
         raise TypeError(f"np_random was made from {type(seeds).__name__}; expected SeedSequence")
     return seeds
+
+
+def check_arguments(env: Callable[..., Any], given: Iterable[str]) -> None:
+    """Check the names of arguments that an env does not declare itself.
+
+    Args:
+        env: class of the env.
+        given: names of its further arguments, see `Changes`.
+
+    Raises:
+        ValueError: in one line, listing the known arguments.
+    """
+    declared = [each for each in inspect.signature(env).parameters if each not in _MADE_BY_MAKE]
+    known = [*declared, *Changes.__annotations__]
+    for name in given:
+        if name not in known:
+            listed = ", ".join(known)
+            raise ValueError(
+                f"unknown argument {name!r}; known are {listed}{did_you_mean(name, known)}"
+            )
 
 
 def check_render_mode(mode: str | None, known: Sequence[str]) -> None:

@@ -13,6 +13,7 @@ from pinnobs_gym.envs.agent_side import AgentSide
 from pinnobs_gym.envs.arguments import (
     NOT_FINITE_REWARD,
     action_array,
+    check_arguments,
     check_options,
     check_render_mode,
     errors_of,
@@ -77,6 +78,7 @@ class EstimationEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
+        check_arguments(type(self), changes)
         check_render_mode(render_mode, type(self).metadata["render_modes"])
         self.render_mode = render_mode
         self.source = EpisodeSource(system, setup, condition, **changes)

@@ -191,7 +191,8 @@ def policy_of(
     if len(modes) > 1:
         raise ValueError(
             f"the spaces of {name} are those of several action modes of {kind}; expected "
-            f"action_mode {' or '.join(map(repr, modes))}, that of its training"
+            f"action_mode {' or '.join(map(repr, modes))}, that of its training (on the command "
+            f"line --set action_mode={modes[0]})"
         )
     return Policy(
         system,

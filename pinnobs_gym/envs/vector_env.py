@@ -16,6 +16,7 @@ from pinnobs_gym.envs.agent_side import AgentSide
 from pinnobs_gym.envs.arguments import (
     NOT_FINITE_REWARD,
     action_array,
+    check_arguments,
     check_num_envs,
     check_options,
     check_render_mode,
@@ -61,6 +62,7 @@ class EstimationVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         render_mode: str | None = None,
         **changes: Unpack[Changes],
     ) -> None:
+        check_arguments(type(self), changes)
         num_envs = check_num_envs(num_envs)
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.num_envs = num_envs

@@ -20,6 +20,8 @@ ELSEWHERE = 10
 """Number of episodes of the set on which an estimator is judged, of the seeds from 0 on."""
 _WORTH = 0.5
 """Median error over that of the model alone up to which an estimator is worth something."""
+_BETTER = 0.95
+"""The same, up to which it is worth little; above, it is worth nothing."""
 SMALL_LOSS = 1e-5
 """Training loss below which a good observer would be expected."""
 
@@ -101,10 +103,12 @@ class Elsewhere:
     @property
     def line(self) -> str:
         """All of this in one line."""
-        verdict = "worth something" if self.worth else "worth nothing"
+        better = self.diverged == 0 and self.nrmse <= _BETTER * self.alone
+        verdict = "something" if self.worth else "little" if better else "nothing"
         return (
-            f"{verdict} on other records: of {self.episodes} from the initial set {self.diverged} "
-            f"diverged, median NRMSE {self.nrmse:.3g}, the model alone {self.alone:.3g}"
+            f"worth {verdict} on other records: of {self.episodes} from the initial set "
+            f"{self.diverged} diverged, median NRMSE {self.nrmse:.3g}, the model alone "
+            f"{self.alone:.3g}"
         )
 
 

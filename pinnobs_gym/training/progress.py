@@ -13,6 +13,8 @@ Show: TypeAlias = Callable[[float, str], None]
 """Called with the finished fraction and a few words."""
 EVERY = 10.0
 """Shortest time in s between two lines outside a terminal."""
+_BAR_WIDTH = 50
+"""Number of characters of a bar before its words."""
 
 
 def in_terminal() -> bool:
@@ -49,16 +51,27 @@ def _bar() -> Iterator[Show]:
     """Show a bar, and yield the function that updates it."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.progress import TimeRemainingColumn as TimeLeft
+    from rich.table import Column
+
+    def wide(width: int) -> Column:
+        """Return a column that keeps its width."""
+        return Column(min_width=width, no_wrap=True)
 
     columns = (
-        BarColumn(bar_width=20),
-        TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("so far,"),
-        TimeLeft(),
-        TextColumn("left"),
+        BarColumn(bar_width=12, table_column=wide(12)),
+        TextColumn("{task.percentage:3.0f} %", table_column=wide(5)),
+        TimeElapsedColumn(table_column=wide(7)),
+        TextColumn("so far,", table_column=wide(7)),
+        TimeLeft(table_column=wide(7)),
+        TextColumn("left", table_column=wide(4)),
         TextColumn("{task.description}", markup=False),
     )
     with Progress(*columns) as progress:
         task = progress.add_task("", total=1.0)
-        yield lambda part, words: progress.update(task, completed=part, description=words)
+
+        def show(part: float, words: str) -> None:
+            room = max(progress.console.width - _BAR_WIDTH, 0)  # rich would cut all columns
+            shown = words if len(words) <= room else words[: max(room - 1, 0)] + "…"
+            progress.update(task, completed=part, description=shown)
+
+        yield show

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -19,6 +20,7 @@ from pinnobs_gym.envs.env import EstimationEnv
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.envs.figures import measured_states
 from pinnobs_gym.envs.game import Game
+from pinnobs_gym.envs.simulated import simulate
 from pinnobs_gym.envs.vector_env import EstimationVectorEnv
 from pinnobs_gym.estimators.ukf import UKF
 from pinnobs_gym.simulation.system import output_scale
@@ -707,9 +709,17 @@ def test_conditions_take_the_benchmarks_noise_where_the_setup_has_none() -> None
         assert np.max(np.abs(off)) > 0.1, condition
 
 
-def test_unknown_arguments_list_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="unknown argument 'foo'; known are setup, condition, dt"):
-        gymnasium.make("pinnobs/Academic-v0", foo=1)
+@pytest.mark.parametrize("make", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
+def test_unknown_arguments_list_the_known_ones(make) -> None:
+    env = "reward, stack_outputs, render_mode"
+    known = f"setup, condition, action_mode, {env}, dt, duration, noise_std, parameters"
+    with pytest.raises(ValueError, match=f"^unknown argument 'foo'; known are {known}$"):
+        make("pinnobs/Academic-v0", foo=1)
+    with pytest.raises(ValueError, match=r"'noise'.*; did you mean 'noise_std'\?"):
+        make("pinnobs/Academic-v0", noise=0.1)
+    known = "setup, condition, dt, duration, noise_std, parameters"
+    with pytest.raises(ValueError, match=f"^unknown argument 'noise'; known are {known}$"):
+        simulate("Academic", 0, noise=0.1)
 
 
 def test_an_episode_ended_early_is_drawn_no_further_than_it_went() -> None:

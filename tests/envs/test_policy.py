@@ -155,7 +155,8 @@ def test_what_does_not_fit_is_refused():
 def test_a_model_without_its_env_needs_its_action_mode(tmp_path):
     untrained(action_mode="gain").save(tmp_path / "model.zip")
     model = PPO.load(tmp_path / "model.zip", device="cpu")
-    with pytest.raises(ValueError, match="expected action_mode 'gain' or 'correction'"):
+    told = r"expected action_mode 'gain' or 'correction'.* --set action_mode=gain\)$"
+    with pytest.raises(ValueError, match=told):
         evaluate(model, NAME, episodes=1)
     assert len(evaluate(model, NAME, episodes=1, options={"action_mode": "gain"})) == 1
 

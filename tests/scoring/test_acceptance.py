@@ -40,6 +40,15 @@ def test_one_that_diverges_somewhere_is_worth_nothing():
     assert not Elsewhere(np.inf, np.inf, 10, 10).worth
 
 
+@pytest.mark.parametrize(
+    ("nrmse", "diverged", "verdict"),
+    [(0.5, 0, "something"), (0.6, 0, "little"), (0.99, 0, "nothing"), (0.1, 1, "nothing")],
+)
+def test_the_verdict_is_no_harsher_than_the_figures(nrmse, diverged, verdict):
+    line = Elsewhere(nrmse, 1.0, diverged, 10).line
+    assert line.startswith(f"worth {verdict} on other records: of 10 from the initial set")
+
+
 def test_a_set_of_one_state_has_no_elsewhere():
     game = Game.of(Spring)
     replay = PinnObsReplay(

@@ -10,6 +10,7 @@ from pinnobs_gym import stack
 from pinnobs_gym.envs.episodes import EpisodeSource
 from pinnobs_gym.estimators.ekf import EKF
 from pinnobs_gym.simulation.augmented import with_constants
+from pinnobs_gym.simulation.conditions.plant import uncertain_parameters
 from pinnobs_gym.simulation.record import Prior
 from pinnobs_gym.simulation.uncertain_plant import with_uncertain_plant
 from pinnobs_gym.systems import SYSTEMS
@@ -139,3 +140,17 @@ def test_a_parameter_that_is_no_number_is_left_out_unless_it_is_named():
     assert rates.state_names == with_uncertain_plant(Linear(), 0.1).state_names
     with pytest.raises(ValueError, match="parameter kind='soft' of Sure; expected a number"):
         with_uncertain_plant(Sure(), 0.1)
+
+
+def test_parameters_that_are_no_numbers_do_not_change():
+    """Texts, and nested tuples of different lengths, which are no array."""
+
+    @dataclass(frozen=True)
+    class Tables(Linear):
+        a: float = 1.0
+        label: str = "mine"
+        levels: tuple = ((1.0, 2.0), (3.0,))
+        gains: tuple = (1.0, 2.0)
+
+    assert set(uncertain_parameters(Tables())) >= {"a", "gains"}
+    assert not {"label", "levels"} & set(uncertain_parameters(Tables()))

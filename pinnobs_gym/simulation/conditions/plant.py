@@ -24,8 +24,12 @@ def uncertain_parameters(system: System) -> tuple[str, ...]:
 
 
 def _is_number(value: object) -> bool:
-    """Return whether a parameter is a number or an array of numbers."""
-    return np.asarray(value).dtype.kind in "iuf"
+    """Return whether a parameter is a number or an array of numbers. Nested tuples of different
+    lengths, which are no array, are none."""
+    try:
+        return np.asarray(value).dtype.kind in "iuf"
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True)
