@@ -44,7 +44,8 @@ def compiled(system: System) -> str:
         reason = why_not(system, template)
         how = f"computed in NumPy: {reason}" if reason else "compiled"
         lines.append(f"- {', '.join(f'`{name}`' for name in names)}: {how}")
-    return "\n".join(["Compiled code:\n", *lines, "- all others: computed in NumPy"])
+    rest = "- all others: computed in NumPy, but for filters of these kinds within them"
+    return "\n".join(["Compiled code:\n", *lines, rest])
 
 
 def told(system: System, setup: Setup) -> str:
