@@ -24,7 +24,7 @@ from pinnobs_gym.leaderboard.grid import markdown_table
 PACKAGE = Path(pinnobs_gym.__file__).parent
 ROOTS = (PACKAGE, PACKAGE.parent / "trainers")
 """The folders whose modules have entries."""
-BESIDE = "beside"
+BESIDE = "package"
 """The page of the modules that are in no room."""
 
 
@@ -46,6 +46,16 @@ class Module:
             for each in node.names
         }
         return found | {name: f"{self.name}.{name}" for name in public(self)}
+
+    def home(self, name: str) -> str:
+        """Return the full name that a name of this module has where it is defined; empty if it is
+        none of these packages'."""
+        full, seen = self.scope.get(name, ""), set[str]()
+        while full and full not in names() and full not in seen:  # it is exported again
+            seen.add(full)
+            module, _, own = full.rpartition(".")
+            full = _scopes().get(module, {}).get(own, "")
+        return full
 
 
 def api_pages() -> dict[str, str]:
@@ -70,6 +80,11 @@ def modules() -> list[Module]:
             room = own[0] if root == PACKAGE else root.name
             found.append(Module(name, room, ast.parse(path.read_text(encoding="utf-8"))))
     return found
+
+
+@lru_cache(maxsize=1)
+def _scopes() -> dict[str, dict[str, str]]:
+    return {module.name: module.scope for module in modules()}
 
 
 @lru_cache(maxsize=1)
@@ -146,13 +161,17 @@ def _index(rooms: dict[str, list[Module]]) -> str:
 
 def _about_room(room: str) -> str:
     told = {module.name: ast.get_docstring(module.tree) for module in modules()}
-    return told.get(f"pinnobs_gym.{room}") or told.get(room) or "The modules that are in no room."
+    return (
+        told.get(f"pinnobs_gym.{room}")
+        or told.get(room)
+        or ("What `pinnobs_gym` itself has, and how classes are found by their names.")
+    )
 
 
 def _room(room: str, those: list[Module]) -> str:
     parts = ["---\ntocdepth: 2\n---\n", f"# {room}\n"]
     for module in those:
-        scope = Entries(module.scope)
+        scope = Entries({name: module.home(name) for name in _scopes()[module.name]})
         entries = [scope.of(name, node, module.tree.body) for name, node in public(module).items()]
         about = ast.get_docstring(module.tree) or ""
         if not (entries or about):
@@ -168,7 +187,7 @@ class Entries:
     """The entries of a module's names."""
 
     scope: Mapping[str, str]
-    """`Module.scope`, by which the types in signatures become links."""
+    """`Module.home` of its names, by which the types in signatures become links."""
 
     def of(self, name: str, node: ast.stmt, body: Sequence[ast.stmt], fence: int = 6) -> str:
         """Return the entry of a name: its signature, its docstring and, of a class, its members.
@@ -208,7 +227,7 @@ class Entries:
 
     def _method(self, name: str, node: ast.FunctionDef, told: str, fence: int) -> str:
         if _is_marked(node, "property") or _is_marked(node, "cached_property"):
-            options = f":type: {self._linked(node.returns)}" if node.returns else ""
+            options = f":type: {_quoted(self._linked(node.returns))}" if node.returns else ""
             return _directive("py:property", name, told, fence, options)
         marks = [f":{mark}:" for mark in ("staticmethod", "classmethod") if _is_marked(node, mark)]
         call = self._call(node, method=True)
@@ -228,11 +247,11 @@ class Entries:
     def _typed(self, node: ast.stmt) -> str:
         """Return the options of a constant or an attribute: its type and its value."""
         annotated = isinstance(node, ast.AnnAssign)
-        options = [f":type: {self._linked(node.annotation)}"] if annotated else []
+        options = [f":type: {_quoted(self._linked(node.annotation))}"] if annotated else []
         value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
-        shown = "" if value is None else ast.unparse(value)
-        if shown and len(shown) < 80 and "\n" not in shown:
-            options.append(f":value: {shown}")
+        shown = "" if value is None else ast.unparse(_default(value))
+        if shown and shown != "{}" and len(shown) < 80 and "\n" not in shown:
+            options.append(f":value: {_quoted(shown)}")
         return "\n".join(options)
 
     def _linked(self, annotation: ast.expr) -> str:
@@ -249,6 +268,8 @@ class Entries:
 
     def _full(self, annotation: ast.expr) -> ast.expr:
         annotation = copy.deepcopy(annotation)
+        if isinstance(annotation, ast.Subscript) and ast.unparse(annotation.value) == "Annotated":
+            annotation = annotation.slice.elts[0]  # type: ignore[attr-defined]
         for node in ast.walk(annotation):
             if isinstance(node, ast.Name) and self.scope.get(node.id) in names():
                 node.id = self.scope[node.id]
@@ -258,6 +279,20 @@ class Entries:
 def _directive(kind: str, signature: str, body: str, fence: int, options: str = "") -> str:
     ticks = "`" * fence
     return f"{ticks}{{{kind}}} {signature}\n{options}\n\n{body}\n{ticks}\n"
+
+
+def _quoted(option: str) -> str:
+    """Return the value of an option as YAML, which would else take quotes for its own."""
+    return "'" + option.replace("'", "''") + "'"
+
+
+def _default(value: ast.expr) -> ast.expr:
+    """Return the default of a dataclass's field, or what makes it; other values as they are."""
+    if not (isinstance(value, ast.Call) and ast.unparse(value.func) == "field"):
+        return value
+    given = {each.arg: each.value for each in value.keywords}
+    made = given.get("default_factory")
+    return given.get("default") or (ast.Call(made, [], []) if made else ast.Name(""))
 
 
 def _is_marked(node: ast.FunctionDef | ast.AsyncFunctionDef, decorator: str) -> bool:
@@ -273,6 +308,8 @@ def _first(told: str) -> str:
 def in_markdown(told: str) -> str:
     """Return a docstring in Markdown, in which full names of this package are links."""
     told = re.sub(r"::\n\n(?=    )", ":\n\n", told)
+    # What looks like a tag of HTML would not be shown; code has no tags.
+    told = re.sub(r"(`[^`]*`|^    .*$)|<(?=[A-Za-z/!])", _without_tag, told, flags=re.MULTILINE)
     parts = re.split(r"^(Args|Returns|Raises|Yields):\n", told, flags=re.MULTILINE)
     found = [parts[0]]
     for title, body in zip(parts[1::2], parts[2::2], strict=True):
@@ -285,6 +322,10 @@ def in_markdown(told: str) -> str:
     return linked.sub(
         lambda each: f"{{py:obj}}`~{each[1]}`" if each[1] in names() else each[0], "\n".join(found)
     )
+
+
+def _without_tag(found: re.Match[str]) -> str:
+    return found[1] or "\\<"
 
 
 def unlink_others(app: Any, tree: nodes.document) -> None:

@@ -102,7 +102,7 @@ def _equations(cls: type[System]) -> str:
         *zip(rates(found), found.f.flat(), strict=True),
         *zip(outputs, found.h.flat(), strict=True),
     ]
-    parts = ["## Equations\n", "Run on symbols, the code that is simulated says:\n", _math(whole)]
+    parts = ["## Equations\n", "The code that is simulated, run on symbols, gives\n", _math(whole)]
     if found.definitions:
         parts += ["where\n", _math((latex(s), e) for s, e in found.definitions.items())]
     if found.u:
@@ -157,7 +157,7 @@ def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
     if choice:
         parts.append(f"\n## When to choose it\n\n{choice}\n")
     if cls.equations:
-        parts += ["\n## Equations\n", _math(cls.equations), _NOTATION]
+        parts += ["\n## Equations\n", _math(cls.equations), _notation(cls.equations)]
     base = {f.name for f in fields(BaseEstimator)}
     lines = _settings(cls, {f.name for f in fields(cls) if f.name not in base and f.repr})
     if lines:
@@ -168,7 +168,7 @@ def estimator_page(name: str, cls: type[BaseEstimator]) -> str:
         parts.append(markdown_table(("name", "default", "meaning"), lines))
     if cls.tunable:
         ranges = [(f"`{n}`", f"{r.low:g} to {r.high:g}") for n, r in cls.tunable.items()]
-        parts += [f"\n`pinnobs tune {name}` searches\n", markdown_table(("name", "range"), ranges)]
+        parts += [f"\n`pinnobs tune {name}` searches:\n", markdown_table(("name", "range"), ranges)]
         parts += _tuned(name)
     parts.append(scores_of_estimator(name))
     return "\n".join(parts) + "\n"
@@ -207,17 +207,29 @@ def _tuned(name: str) -> list[str]:
     ]
     said = (
         "\nTuned settings (`pinnobs evaluate --tuned`), with the geometric mean NRMSE over both "
-        "ranked windows and the episodes of the search, which are never scored\n"
+        "ranked windows and the episodes of the search, which are never scored:\n"
     )
     return [said, markdown_table(header, lines)]
 
 
 _TRACKS = {"online": "x̂(k|k) from y₀..y_k", "offline": "sees the whole record first"}
 _NOTATION = (
-    "\n$\\varphi$ is the flow of the model from the sample before ($\\varphi_k$: from the first "
-    "state of the record or window), a raised minus marks what comes before $y_k$, $R$ is the "
-    "covariance of the output noise, $\\|v\\|_M^2 = v^\\top M v$."
+    (
+        r"\\varphi",
+        r"$\varphi$ is the flow of the model from the sample before ($\varphi_k$: from the first "
+        "state of the record or window)",
+    ),
+    (r"\^-|\^\{-\}", "a raised minus marks what comes before $y_k$"),
+    (r"(?<![A-Za-z])R(?![A-Za-z])", "$R$ is the covariance of the output noise"),
+    (r"\\\|_|\\[bB]ig\w*\\\|_|\\\|\^2_", r"$\|v\|_M^2 = v^\top M v$"),
 )
+"""What signs in the equations of estimators stand for, each with what finds them."""
+
+
+def _notation(equations: str) -> str:
+    """Return a sentence about those of the signs that equations have."""
+    found = [told for sign, told in _NOTATION if re.search(sign, equations)]
+    return f"\nHere {'; '.join(found)}.\n" if found else ""
 
 
 def _settings(cls: type, names: Iterable[str]) -> list[tuple[str, str, str]]:
@@ -233,7 +245,9 @@ def _settings(cls: type, names: Iterable[str]) -> list[tuple[str, str, str]]:
 def _default(field: Any) -> str:
     if field.default is not MISSING:
         return _shown(field.default)
-    return "" if field.default_factory is MISSING else f"`{field.default_factory.__name__}()`"
+    if field.default_factory is MISSING or "<" in field.default_factory.__name__:
+        return ""
+    return f"`{field.default_factory.__name__}()`"
 
 
 def _shown(value: Any) -> str:
@@ -286,7 +300,8 @@ def _systems(systems: Mapping[str, type[System]]) -> str:
         for name, cls in systems.items()
     ]
     header = ("system", "env id", "states", "measured", "inputs", "what it is")
-    return _index("Systems", header, lines, systems)
+    about = "The systems of the paper, each an env; `pinnobs systems NAME` prints its page."
+    return _index("Systems", about, header, lines, systems)
 
 
 def _sizes(system: System) -> tuple[str, str, str]:
@@ -300,7 +315,11 @@ def _estimators(estimators: Mapping[str, type[BaseEstimator]]) -> str:
         (f"[{name}]({name}.md)", cls.track, ", ".join(cls.knows), first_line(cls))
         for name, cls in estimators.items()
     ]
-    return _index("Estimators", ("name", "track", "knows", "what it is"), lines, estimators)
+    about = (
+        "What `--estimator` takes, and `evaluate` in Python. Each page says when to choose it; "
+        "[one of your own](../../guides/add_estimator.md) is a class."
+    )
+    return _index("Estimators", about, ("name", "track", "knows", "what it is"), lines, estimators)
 
 
 def _trainers(trainers: Mapping[str, type[Trainer[Any, Any]]]) -> str:
@@ -308,14 +327,19 @@ def _trainers(trainers: Mapping[str, type[Trainer[Any, Any]]]) -> str:
         (f"[{name}]({name}.md)", first_line(sys.modules[cls.__module__]))
         for name, cls in trainers.items()
     ]
-    return _index("Trainers", ("name", "what it is"), lines, trainers)
+    about = "What `pinnobs train NAME` runs; the estimators that need it load its files."
+    return _index("Trainers", about, ("name", "what it is"), lines, trainers)
 
 
 def _index(
-    title: str, header: Sequence[str], lines: list[tuple[str, ...]], names: Iterable[str]
+    title: str,
+    about: str,
+    header: Sequence[str],
+    lines: list[tuple[str, ...]],
+    names: Iterable[str],
 ) -> str:
     tree = "\n".join(["```{toctree}", ":hidden:", "", *(f"{n} <{n}>" for n in names), "```"])
-    return f"# {title}\n\n{markdown_table(header, lines)}\n\n{tree}\n"
+    return f"# {title}\n\n{about}\n\n{markdown_table(header, lines)}\n\n{tree}\n"
 
 
 def _conditions() -> str:
@@ -329,7 +353,7 @@ def _conditions() -> str:
         [
             "# Conditions\n",
             "How episodes depart from their setup: `gym.make(id, condition=...)` and `--condition`;"
-            " `a+b` is both.\n",
+            " `a+b` combines two.\n",
             markdown_table(header, lines),
             *(f"\n## {kind.__name__}\n\n{docstring(kind)}" for kind in kinds),
             "",
@@ -343,12 +367,22 @@ def _metrics() -> str:
         (f"`{n}`", f"{getattr(metrics, n):g}", _line(docs[n])) for n in ("DIVERGED", "SETTLED")
     ]
     optional = ", ".join(f"`{name}`" for name in metrics.OPTIONAL_SCORES)
+    errors = (inspect.getdoc(metrics.error_scores) or "").partition("Returns:\n")[2]
     return "\n".join(
         [
             "# Metrics\n",
-            f"{docstring(metrics.error_scores)}\n",
+            "What each scored episode has, in its row. "
+            "[How scores are made](../guides/scores.md) says what tables make of it: windows, "
+            "medians, intervals and ranks. Their µs/step are CPU time per sample and episode, in "
+            "batches as they were run.\n",
+            "## Errors\n",
+            "Infinite where an estimate is not finite:\n",
+            in_markdown(inspect.cleandoc(errors).partition("\n\n")[2]),
+            "",
             markdown_table(("limit", "value", "meaning"), limits),
-            f"\n## Where they apply\n\n{optional}\n\n{docs['OPTIONAL_SCORES']}\n",
+            "\n## Consistency\n",
+            f"{optional} exist where the estimator gives covariances and innovations, and where "
+            "there is a Cramér-Rao reference (`pinnobs_gym.scoring.cramer_rao`).\n",
             docstring(consistency.consistency),
             "",
         ]
@@ -373,7 +407,7 @@ def _suites() -> str:
             markdown_table(
                 ("key", "default", "meaning"), _settings(suites.Entry, _names(suites.Entry))
             ),
-            "\n## Those of the package\n",
+            "\n## The suites of the package\n",
             *(f"`{name}`:\n\n```toml\n{text}```\n" for name, text in shown.items()),
         ]
     )

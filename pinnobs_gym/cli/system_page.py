@@ -77,8 +77,7 @@ def page(cls: type[System], env_id: str) -> str:
         "## Arguments\n",
         f'`gym.make("{env_id}", setup="benchmark", condition="nominal", action_mode="estimate", '
         'reward="error", stack_outputs=1, dt=None, duration=None, noise_std=None, '
-        "parameters=None, render_mode=None)`. Reset options: `x0`, `xhat0`. "
-        "Parameters:\n",
+        "parameters=None, render_mode=None)`. Reset options: `x0`, `xhat0`.\n",
         _parameters(cls),
         "\n## Conditions\n",
         "Names for `condition`, joined by `+`; `known to estimators` is what is known of it.\n",
@@ -183,15 +182,23 @@ def _parameters(cls: type[System]) -> str:
     system = cls()
     described = field_docs(cls)
     rows = [
-        (name, f"{value}", " ".join(described.get(name, "").split()))
+        (
+            name,
+            f"{value:.6g}" if type(value) in (int, float) else f"{value}",
+            " ".join(described.get(name, "").split()),
+        )
         for name, value in system.parameters.items()
     ]
-    return _table(("name", "default", "meaning"), rows) if rows else "none."
+    if not rows:
+        return "The plant has no parameters."
+    return "Parameters:\n\n" + _table(("name", "default", "meaning"), rows)
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table in Markdown, of cells in Markdown."""
-    return markdown_table(header, ([str(cell) for cell in row] for row in rows))
+    """Return a table in Markdown, of cells in Markdown, without columns of units that are empty."""
+    lines = [[str(cell) for cell in row] for row in rows]
+    kept = [i for i, name in enumerate(header) if name != "unit" or any(line[i] for line in lines)]
+    return markdown_table([header[i] for i in kept], [[line[i] for i in kept] for line in lines])
 
 
 def field_docs(cls: type) -> dict[str, str]:

@@ -63,6 +63,8 @@ def told(system: System, setup: Setup) -> str:
         )
     ]
     header = ("state", "unit", "standard deviation of the prior", "what the outputs leave of it")
+    if not any(units):
+        header, rows = (header[0], *header[2:]), [(row[0], *row[2:]) for row in rows]
     return "\n".join([markdown_table(header, rows), "", _sentences(system, found, left)])
 
 
@@ -86,7 +88,7 @@ def _sentences(system: System, found: Observability, left: np.ndarray) -> str:
     ]
     if len(full):
         median, worst = np.median(full), full.max()
-        parts[0] += f", and the condition number {median:.1e} (at worst {worst:.1e})"
+        parts[0] += f", and the condition number {median:.2g} (at worst {worst:.2g})"
     parts[0] += " in scaled states."
     if found.unseen:
         parts.append(f"The outputs never see {_listed(found.unseen)}.")

@@ -57,11 +57,12 @@ class AgentMemory:
     missing."""
 
     def rows(self, rows: np.ndarray) -> AgentMemory:
-        """Return the memory of some rows."""
+        """Return the memory of the rows that indices or a mask select."""
         return AgentMemory(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def with_rows(self, rows: np.ndarray, other: AgentMemory) -> AgentMemory:
-        """Return the memory with some rows replaced."""
+        """Return the memory in which those of another replace the rows that indices or a mask
+        select."""
         merged = {}
         for f in fields(self):
             merged[f.name] = getattr(self, f.name).copy()
@@ -286,6 +287,11 @@ class PredictionForm(Form):
         At each sample the best gain is the same as for −mean(((x̂ − x)/scale)²), because the
         subtracted and dividing terms do not depend on the action. The rewards of all samples have a
         similar size, however, while squared errors span six powers of ten.
+
+        Args:
+            memory: the memory before the correction.
+            xhat: the corrected estimates, shape (batch, nx).
+            x: the true states, shape (batch, nx).
         """
         nis = (memory.surprise**2).sum(axis=1) / self.system.ny
         with np.errstate(all="ignore"):

@@ -283,7 +283,12 @@ class EpisodeSource:
 
     def record(self, episodes: Episodes, xhat0: object = None) -> Record:
         """Return the record of the episodes, which estimators are given: the samples up to that of
-        the last action."""
+        the last action.
+
+        Args:
+            episodes: the episodes.
+            xhat0: initial estimates (nx,) or (batch, nx) in place of the prior's mean, if given.
+        """
         batch, last = episodes.y.shape[1], self.setup.num_steps
         u = episodes.u[:last].swapaxes(0, 1).copy()
         prior = Prior.of(self.system, self.setup, batch, xhat0)

@@ -35,7 +35,8 @@ def simulate(
     condition: str = "nominal",
     **changes: Unpack[Changes],
 ) -> tuple[SimulatedRecord, np.ndarray]:
-    """Simulate episodes, those of seeds seed, seed + 1, ... that `evaluate` scores.
+    """Simulate episodes: the ones that `pinnobs_gym.scoring.evaluation.evaluate` scores, of the
+    given seed and those that follow it.
 
     Args:
         system: name, env id, ``module:Class`` or class of the system.

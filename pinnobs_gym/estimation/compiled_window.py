@@ -77,7 +77,8 @@ class CompiledWindow:
         raise NotImplementedError
 
     def fits(self, batch: int) -> bool:
-        """Return whether the numbers of the model are those of a batch."""
+        """Return whether the parameters and the noise of the model fit a batch of this size: there
+        is one of each for all rows, or one for each row."""
         return self._rows in (1, batch)
 
     def slide(
@@ -87,7 +88,8 @@ class CompiledWindow:
 
         Args:
             samples: the samples, with the new one.
-            before: the fields ``mean``, ``P`` and ``start`` of ``struct window``.
+            before: the mean and the covariance at the start of the windows, and where the start of
+                each search lies, with the batch last.
             start_after: shape of the field ``start_after`` without the batch.
 
         Returns:
@@ -122,7 +124,9 @@ class CompiledWindow:
     def state(
         self, sample: tuple[float, np.ndarray, np.ndarray], parts: Sequence[np.ndarray], memory: Any
     ) -> State:
-        """Return the state after a sample, given the last four results and the memory."""
+        """Return the state after a sample (t in s, y and u with the batch first), given the
+        estimate, its covariance, the innovation and its covariance, with the batch last, and the
+        memory."""
         x, P, e, S = parts
         t, _, u = sample
         return State(x.T, t, u, P.transpose(2, 0, 1), e.T, S.transpose(2, 0, 1), memory)
@@ -134,8 +138,17 @@ class CompiledWindow:
         rows: np.ndarray,
         memory: Any,
     ) -> State:
-        """Set the rows of a state after a sample that are left to NumPy, given the memory before it
-        of these, and return the state after it of these."""
+        """Process a sample in NumPy for some rows, and set these rows in the state after it.
+
+        Args:
+            after: the state after the sample, of all rows; it is changed.
+            sample: t in s, and y and u of all rows.
+            rows: numbers of the rows.
+            memory: the memory before the sample, of these rows.
+
+        Returns:
+            The state after the sample, of these rows.
+        """
         t, y, u = sample
         if self.sizes[2]:  # the inputs may be others than the model uses
             check_use(self.estimator.system, np.array([t], dtype=float), np.asarray(u)[:, None])

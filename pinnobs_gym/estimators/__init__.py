@@ -22,8 +22,8 @@ def policy_file(spec: str) -> Path | None:
 
 
 class Estimators(Registry["BaseEstimator"]):
-    """The estimators by name. None of them is a model in a file that can hold code: only a person
-    who was told so has it loaded, by ``pinnobs evaluate``."""
+    """The estimators by name. A model in a file that can hold code has no name here: it is loaded
+    by ``pinnobs evaluate`` alone, which says so first."""
 
     def resolve(
         self, spec: str | type[BaseEstimator], near: type | None = None

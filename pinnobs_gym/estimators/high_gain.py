@@ -66,7 +66,8 @@ class HighGain(RecursiveEstimator, GaussianEstimator):
     """
 
     assumed_noise: float = 0.0
-    """As in `GaussianEstimator`; forgetting takes its place."""
+    """Standard deviation of process noise that is assumed beyond the known one, over each state's
+    scale and the benchmark's duration; by default none, as forgetting takes its place."""
     theta: float | None = None
     """Forgetting rate θ in 1/s; 20 time constants per benchmark episode if None."""
 

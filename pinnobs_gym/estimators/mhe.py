@@ -65,7 +65,8 @@ class MHE(Estimator, GaussianEstimator):
     """
 
     assumed_noise: float = 6e-4
-    """As in `GaussianEstimator`."""
+    """Standard deviation of process noise that is assumed beyond the known one, over each state's
+    scale and the benchmark's duration; with an exact model it is added when the window moves."""
     window: int = 10
     """Number of samples in the window."""
     steps: int = 1

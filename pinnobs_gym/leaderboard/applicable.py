@@ -21,7 +21,7 @@ def applies(cls: type[BaseEstimator], game: Game) -> bool:
 
 def cell_without_scores(estimator: str, game: GameName) -> str:
     """Return the cell of an estimator without scores in a game: `NOT_APPLICABLE` if it does not
-    take the game's system, and empty otherwise, or if this process knows one of them not.
+    take the game's system; empty if it does, and if this process does not know both.
 
     Args:
         estimator: its name in rows.

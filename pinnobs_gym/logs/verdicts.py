@@ -41,15 +41,15 @@ class OutputTests:
     """The tests of one output."""
 
     name: str
-    """Its name."""
+    """Name of the output."""
     size: Size
-    """That of its innovations or residuals."""
+    """Size of its values: innovations or residuals."""
     correlation: Correlation
-    """That of each with the next."""
+    """Correlation of each value with the next."""
     drift: Drift
-    """That of means of blocks."""
+    """Drift of the means of blocks of values."""
     outliers: Outliers
-    """Those among them."""
+    """Outliers among the values."""
     when: tuple[str, ...]
     """Times of the first, the last and the largest outlier."""
     driven: Driven
@@ -67,8 +67,8 @@ class OutputTests:
 
     def verdict(self, chance: float) -> str:
         """Return what is wrong, a key of `pinnobs_gym.logs.meanings.MEANINGS`; an empty text if
-        nothing is. It is "early", no fault of the log, where a model or a filter fails, but not in
-        the least in the second half.
+        nothing is. It is "early", which is no fault of the log, where a model or a filter fails in
+        the whole, but the second half of the values passes every test.
 
         Args:
             chance: probability below which something is not taken for chance.

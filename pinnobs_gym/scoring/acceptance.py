@@ -89,7 +89,7 @@ class Elsewhere:
     nrmse: float
     """Median NRMSE over the episodes; infinite if most are not finite."""
     alone: float
-    """That of the model alone, from the same initial estimates."""
+    """Median NRMSE of the model alone, from the same initial estimates."""
     diverged: int
     """Number of episodes in which the estimator diverged."""
     episodes: int

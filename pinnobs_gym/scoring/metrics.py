@@ -217,8 +217,8 @@ def error_scores(
           ``nrmse_tail``: root mean square of (x̂ − x)/scale over the whole episode, its first
           sample, the transient and the steady window, the last 75 % and the last 25 %; see
           `windows`.
-        - ``settling``: the time in s after which the NRMSE of every sample stays below 5 %;
-          infinite if that of the last sample is above.
+        - ``settling``: the time in s after which the NRMSE of every sample is at most 5 %;
+          infinite if that of the last sample is more.
         - ``peak``: the largest NRMSE of a sample.
         - ``nrmse_modulo``, ``nrmse_steady_modulo``, ``nrmse_tail_modulo``: as above, with each
           sample's error relative to the nearest of x and its alternatives.

@@ -96,7 +96,8 @@ class Augmented(System):
         return _followed(own, x) if self.discrete else _joined(x, own, 0.0)
 
     def flow(self, t0: Array, t1: Array, x: Array, u: Array) -> Array:
-        """Return the plant's own flow, with the constants as they are."""
+        """Return the states (..., nx) at t1 in s by the plant's own flow from x at t0, with the
+        constants as they are."""
         plant, state = self._parts(x)
         return _followed(plant.flow(t0, t1, state, u), x)
 
@@ -111,7 +112,8 @@ class Augmented(System):
         return self._known.draw_input(rng, times)
 
     def f_jacobian(self, t: Array, x: Array, u: Array) -> Array:
-        """Return ∂f/∂x, (..., nx, nx), from the plant's own Jacobian (see `_jacobian`)."""
+        """Return ∂f/∂x, (..., nx, nx), from the plant's own Jacobian and, by
+        parameters that are states, central differences."""
         if not isinstance(x, np.ndarray):
             return super().f_jacobian(t, x, u)
         plant, state = self._parts(x)
@@ -136,7 +138,8 @@ class Augmented(System):
         return F
 
     def h_jacobian(self, t: Array, x: Array, u: Array) -> Array:
-        """Return ∂h/∂x, (..., ny, nx), from the plant's own Jacobian (see `_jacobian`)."""
+        """Return ∂h/∂x, (..., ny, nx), from the plant's own Jacobian and, by
+        parameters that are states, central differences."""
         if not isinstance(x, np.ndarray):
             return super().h_jacobian(t, x, u)
         plant, state = self._parts(x)
@@ -175,7 +178,7 @@ class Augmented(System):
         return plant.admissible(state)
 
     def distances(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Those of the plant; constants are at distance 0 from every output."""
+        """Return the distances of the plant; constants are at distance 0 from every output."""
         own = self.plant.distances()
         if own is None:
             return None
@@ -183,17 +186,19 @@ class Augmented(System):
         return np.concatenate([np.asarray(own[0], dtype=float), constants]), own[1]
 
     def observable(self, x: Array) -> Array:
-        """The plant's components as the plant says, and all constants."""
+        """Return whether each component is observable, bool of the shape of x: the plant's as the
+        plant says, and all constants."""
         plant, state = self._parts(x)
         return _joined(x, plant.observable(state), True)
 
     def invariants(self, x: Array) -> Array | None:
-        """Those of the plant, if its rates are its own."""
+        """Return the invariants of the plant, if its rates are its own."""
         plant, state = self._parts(x)
         return None if self._other_rates else plant.invariants(state)
 
     def indistinguishable(self, x: Array) -> tuple[Array, ...]:
-        """Those of the plant with the same constants, if its rates are its own."""
+        """Return the states that the plant's outputs do not tell from x, with the same constants,
+        if its rates are its own."""
         if self._other_rates:
             return ()
         plant, state = self._parts(x)

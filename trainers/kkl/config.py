@@ -24,8 +24,11 @@ from trainers.kkl.fitting import FitMethod
 from trainers.kkl.labels import drives, frequency
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
+"""Device of the training; ``auto`` takes a GPU if there is one."""
 Precision: TypeAlias = Literal["float32", "float64"]
+"""Precision of the networks."""
 Sweep: TypeAlias = Literal["none", "cutoff"]
+"""Whether several time constants of z are tried."""
 
 _CYCLES = 4.0
 """Fewest periods of the default cut-off in a benchmark episode."""

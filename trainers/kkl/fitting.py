@@ -14,6 +14,7 @@ from pinnobs_gym.estimation.learned.kkl_maps import Mlp
 from trainers.adam import Adam
 
 FitMethod: TypeAlias = Literal["gauss_newton", "adam"]
+"""How networks are fitted."""
 
 AVERAGE = 0.9
 """Weight of the past in the averaged Gauss-Newton matrix."""

@@ -40,6 +40,7 @@ class Samples:
         noise_std: standard deviation of the output noise, shape (ny,).
         gap: number of samples between the two of each kept pair; 0 without pairs.
         labelled: whether networks are fitted to the simulated z, and not to T's own.
+        poles: poles of z in 1/s, in place of those of the settings.
 
     Raises:
         ValueError: in one line, if the settings give no observer of the system.
@@ -163,7 +164,7 @@ class Samples:
         self.parts = torch.arange(len(data.t)) * (_PARTS if clocked else 1) // len(data.t)
 
     def tensor(self, array: np.ndarray) -> Tensor:
-        """Return a tensor of the training's precision on its device."""
+        """Return a tensor of the array's shape, of the training's precision and on its device."""
         return torch.tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
 
     def draw(
@@ -192,13 +193,14 @@ class Samples:
         return np.asarray(self.system.h(self.t[self.kept][:, None], self.data.x, self.data.u))
 
     def encoded(self, k: Tensor, i: Tensor) -> Tensor:
-        """Return the scaled inputs of T at samples k of episodes i."""
+        """Return the scaled inputs of T, (count, inputs), at kept samples k of episodes i, (count,)
+        each."""
         x = self.x[k, i]
         return torch.cat([x, self.clocked(k, i)], dim=-1) if self.driven else x
 
     def clocked(self, k: Tensor, i: Tensor) -> Tensor:
-        """Return the scaled clock's inputs at samples k of episodes i, which are the same in all
-        episodes unless inputs are drawn."""
+        """Return the scaled clock's inputs, (count, inputs), at kept samples k of episodes i,
+        (count,) each; they are the same in all episodes unless inputs are drawn."""
         return self.times[k, i % self.times.shape[1]]
 
     def pairs(self) -> np.ndarray:

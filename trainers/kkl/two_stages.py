@@ -20,6 +20,7 @@ from trainers.kkl.fitting import Equations, Fit, Objective, Term
 from trainers.kkl.samples import Samples
 
 Stage: TypeAlias = Literal["T", "T*", "done"]
+"""Which map is fitted."""
 
 _USUAL = 0.95
 """Weight of the past in the moving average of each part's mean squared error."""

@@ -1,7 +1,7 @@
 """PINN-Obs: a network for the estimates and gains of one record, by the paper's or a fast recipe.
 
 Farkane, Boutayeb, Oudani & Ghogho, "PINN-Obs: Physics-Informed Neural Network-Based Observer for
-Nonlinear Dynamical Systems". Equation numbers are the paper's.
+Nonlinear Dynamical Systems". Equation numbers here and in the settings are the paper's.
 """
 
 from __future__ import annotations

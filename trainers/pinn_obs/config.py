@@ -10,7 +10,10 @@ from pinnobs_gym.estimation.learned.mlp import Activation, Architecture, Precisi
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
 Optimiser: TypeAlias = Literal["adam", "ssbroyden", "levenberg_marquardt"]
+"""Method of minimisation: Adam of the paper, self-scaled Broyden of the fast recipe, or
+Levenberg-Marquardt of the posterior."""
 Device: TypeAlias = Literal["auto", "cpu", "cuda"]
+"""Device of trainings on many records; ``auto`` takes a GPU if there is one."""
 
 
 @dataclass(frozen=True)

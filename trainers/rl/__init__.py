@@ -1,7 +1,7 @@
 """Agents trained by reinforcement learning with Stable-Baselines3.
 
 The agent plays episodes of the env. The reward depends on the error of its estimates, and hence on
-the true states, which no other trainer of this package uses. With gains and corrections the reward
+the true states of simulated episodes. With gains and corrections the reward
 is the ``improvement`` on the model's prediction, and the default discount is zero. Learning a gain
 is then a regression of the prediction error on the innovation, whose solution is the Kalman gain.
 """

@@ -9,7 +9,9 @@ from typing import Literal, TypeAlias
 from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_whole
 
 Algorithm: TypeAlias = Literal["ppo", "sac", "td3", "recurrent_ppo"]
+"""Algorithm of Stable-Baselines3 or, for ``recurrent_ppo``, sb3-contrib."""
 Mode: TypeAlias = Literal["gain", "correction", "normalized"]
+"""Action mode of the env."""
 
 _ON_POLICY = ("ppo", "recurrent_ppo")
 

@@ -11,6 +11,7 @@ from pinnobs_gym.training.settings import TrainingConfig, check_setting, check_w
 HELD_OUT = 4
 """Every condition with a number divisible by this is held out; a training has one at least."""
 Supervision: TypeAlias = Literal["states", "outputs"]
+"""What the densities that are maximised are of."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class Episodes:
     episodes: int = 100
     """Number of episodes."""
     seed: int | None = None
-    """Seed of the first episode; 0 by default, with the truth 1000000."""
+    """Seed of the first episode; by default 0, and 1000000 for episodes with their truth."""
     with_truth: bool = False
     """Write the true states, too, of training episodes: of seeds from 1000000 on, which are never
     scored."""

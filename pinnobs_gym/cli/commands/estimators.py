@@ -57,8 +57,8 @@ class Estimators:
 
 
 def listing() -> Grid:
-    """Return the table of estimators. In a terminal it is a record of each: what an estimator is
-    takes a line."""
+    """Return the table of estimators. In a terminal each has lines of its own, since what it is
+    takes a whole one."""
     names = ("name", "track", "knows", "what it is")
     columns = tuple(Column(name, numeric=False) for name in names)
     lines = []

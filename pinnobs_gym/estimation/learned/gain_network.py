@@ -12,6 +12,7 @@ from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import Array
 
 Variant: TypeAlias = Literal["kalman", "gru"]
+"""What the network gives: a correction of a Kalman gain, or the gain itself."""
 
 LARGEST_FACTOR = 8.0
 """Largest factor by which a Kalman gain is multiplied or divided."""

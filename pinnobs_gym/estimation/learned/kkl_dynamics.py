@@ -13,7 +13,9 @@ from scipy.linalg import expm
 from scipy.signal import besselap
 
 Design: TypeAlias = Literal["bessel", "niazi", "poles", "learned"]
+"""How the poles of z are chosen."""
 Mode: TypeAlias = Literal["continuous", "discrete"]
+"""Whether z follows a differential equation or a recursion from sample to sample."""
 Start: TypeAlias = Literal["output", "zero", "prior"]
 """Initial value of z: the steady state for the constant output y₀, zero, or T(x̂₀)."""
 

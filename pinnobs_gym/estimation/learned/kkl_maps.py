@@ -14,6 +14,7 @@ from torch import Tensor
 from pinnobs_gym.estimation.learned.perceptron import ACTIVATIONS, Layers, linear, perceptron
 
 Activation: TypeAlias = Literal["tanh", "silu", "relu"]
+"""Activation of hidden layers."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,9 @@ from pinnobs_gym.simulation.arrays import array_namespace
 from pinnobs_gym.simulation.system import Array
 
 Activation: TypeAlias = Literal["tanh", "sine", "sigmoid", "relu"]
+"""Activation of hidden layers."""
 Precision: TypeAlias = Literal["float32", "float64"]
+"""Precision of a network."""
 
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 

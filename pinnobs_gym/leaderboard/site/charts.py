@@ -28,9 +28,10 @@ HUGE = 1e9
 
 
 class Styled:
-    """Encodings that draw each estimator in its style, and the name of the peer that factors are
-    to. In the data, and thus in a chart's code, an estimator is its place among ``styles``: names
-    are text that anybody may have written, and are looked up where they are drawn."""
+    """Encodings that draw each estimator in its style, and the name of the peer, over whose errors
+    factors are. In the data, and thus in a chart's code, an estimator is its place among
+    ``styles``: names are text that anybody may have written, and are looked up where they are
+    drawn."""
 
     def __init__(self, styles: Mapping[str, Style], peer: str) -> None:
         self.peer = one_line(peer)
@@ -94,7 +95,7 @@ def time_of(end: float) -> alt.X:
 
 
 def exact(field: str, title: str = "") -> alt.Tooltip:
-    """Return a number of the tooltip."""
+    """Return a number in the tooltip, in three digits."""
     return alt.Tooltip(f"{field}:Q", format=".3~g", title=title or field)
 
 

@@ -1,10 +1,10 @@
 """Suites: the games and estimators of a leaderboard, each a TOML file.
 
-A file in this folder is known by its name; any other is given by its path. Each key is a field of
-`Suite`, and every key is optional. An estimator is a name, ``module:Class``, or a table of
-``name``, ``label`` (its name in tables) and ``settings``, or ``tuned = true`` for the settings that
-are stored with each system (`pinnobs_gym.scoring.tuned`). The name in tables stands for the latter,
-too, as in ``"ekf, tuned"``::
+A suite of the package is known by its name; any other is given by the path of its file. Each key is
+a field of `Suite`, and every key is optional. An estimator is a name, ``module:Class``, or a table
+of ``name``, ``label`` (its name in tables) and ``settings``, or ``tuned = true`` for the settings
+that are stored with each system (`pinnobs_gym.scoring.tuned`). The name in tables stands for the
+latter, too, as in ``"ekf, tuned"``::
 
     systems = ["ReverseDuffing", "Academic"]
     estimators = [
@@ -41,11 +41,13 @@ class Entry:
     name: str
     """Name or ``module:Class``."""
     label: str | None = None
-    """Its name in tables; its own, with its recipe if its trainer has several, if None."""
+    """Its name in tables; if None, the estimator's own, with its recipe where its trainer has
+    several."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Its settings or, if it is trained, its trainer's."""
     tuned: bool = False
-    """Whether it has its tuned settings; it plays no system that has none of it."""
+    """Whether it has the tuned settings that are stored with a system; it does not play systems
+    without any."""
 
 
 @dataclass(frozen=True)
