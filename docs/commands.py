@@ -6,7 +6,7 @@ import contextlib
 import io
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pinnobs_gym.cli import COMMANDS, main, usage
 from pinnobs_gym.leaderboard.grid import markdown_table
@@ -110,17 +110,38 @@ def _group(block: list[str], column: int) -> Group:
 
 
 def _section(name: str, told: Help) -> str:
-    parts = [f"## {name}\n", f"{told.about}\n", f"```text\n{told.usage}\n```\n"]
+    about, called = told.about, told.usage
+    if name == "train":  # that of a trainer, in place of any
+        first = next(iter(sorted(TRAINERS.sources)))
+        about = "Train an observer or an agent. `pinnobs train --help` lists the trainers."
+        called = called.replace(f" {first} ", " TRAINER ")
+        told = replace(told, groups=tuple(map(_without_first, told.groups)))
+    parts = [f"## {name}\n", f"{about}\n", f"```text\n{_given(called)}\n```\n"]
     for group in told.groups:
         shown = [option for option in group.options if not option[0].startswith("-h")]
         if name == "train" and group.title.startswith("config"):
             parts.append("Then the settings of the [trainer](trainers/index.md), as options.\n")
         elif shown:
             parts += [f"{group.about}\n"] if group.about else []
-            cells = [(f"`{_cell(given, '|')}`", _cell(meaning)) for given, meaning in shown]
+            cells = [(f"`{_cell(_given(given), '|')}`", _cell(meaning)) for given, meaning in shown]
             header = (group.title.removesuffix("s"), "meaning")
             parts.append(f"{markdown_table(header, cells)}\n")
     return "\n".join(parts)
+
+
+def _without_first(group: Group) -> Group:
+    """Return a trainer's options without the default of its preset, which is another for each."""
+    options = [
+        (given, meaning.replace(" (default: default)", "")) for given, meaning in group.options
+    ]
+    return replace(group, options=tuple(options))
+
+
+def _given(text: str) -> str:
+    """Return how an option is given, without the value for none and with dots for several."""
+    text = re.sub(r"\{None\}\|\{?|(?<=\])\}", "", text)
+    text = re.sub(r"\[?\[(\w+) \[\1 \.\.\.\]\]\]?", r"[\1 ...]", text)
+    return text
 
 
 def _cell(text: str, special: str = r"|*<>_\\") -> str:

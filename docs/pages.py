@@ -270,12 +270,18 @@ def trainer_page(name: str, cls: type[Trainer[Any, Any]]) -> str:
     ]
     made = {preset: cls.configured({"preset": preset}) for preset in cls.presets}
     config = type(next(iter(made.values())))
+    first, *others = made
     lines = [
-        (label, *(_shown(getattr(each, label.strip("`"))) for each in made.values()), meaning)
+        (label, _shown(getattr(made[first], label.strip("`"))), meaning)
         for label, _, meaning in _settings(config, {f.name for f in fields(config)})
     ]
+    changes = {name: _changes(made[first], made[name]) for name in others}
     call = f"```sh\npinnobs train {name} --system ReverseDuffing\n```\n"
-    presets = [(f"`{preset}`", first_line(function)) for preset, function in cls.presets.items()]
+    presets = [
+        (f"`{preset}`", first_line(function), changes.get(preset, ""))
+        for preset, function in cls.presets.items()
+    ]
+    about = ("name", "what it is", f"what it changes of `{first}`")
     return "\n".join(
         [
             f"# {name}\n",
@@ -285,13 +291,29 @@ def trainer_page(name: str, cls: type[Trainer[Any, Any]]) -> str:
             f"\nMakes {', '.join(used)}.\n" if used else "",
             call,
             "## Presets\n",
-            markdown_table(("name", "what it is"), presets),
+            _without_empty(about, presets),
             "\n## Config\n",
             docstring(config),
             "",
-            markdown_table(("name", *made, "meaning"), lines),
+            markdown_table(("name", f"in `{first}`", "meaning"), lines),
         ]
     )
+
+
+def _changes(first: Any, other: Any) -> str:
+    """Return the settings of a preset that are not those of the first."""
+    pairs = [(f.name, getattr(other, f.name)) for f in fields(first)]
+    return ", ".join(f"`{n}={_plain(v)}`" for n, v in pairs if v != getattr(first, n))
+
+
+def _plain(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else f"{value}"
+
+
+def _without_empty(header: Sequence[str], lines: Sequence[tuple[str, ...]]) -> str:
+    """Return a table without the columns that are empty."""
+    kept = [i for i in range(len(header)) if any(line[i] for line in lines)]
+    return markdown_table([header[i] for i in kept], [[line[i] for i in kept] for line in lines])
 
 
 def _systems(systems: Mapping[str, type[System]]) -> str:

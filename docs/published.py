@@ -36,12 +36,19 @@ def scores_of_estimator(name: str) -> str:
         for entry in table.entries
         if _base(entry.standing.estimator) == name
     ]
+    named = any(entry.name != name for _, entry in own)
     lines = [
-        (f"[{_system(table)}](../systems/{_system(table)}.md)", *_as(entry, table), *_cells(entry))
+        (
+            f"[{_system(table)}](../systems/{_system(table)}.md)",
+            *((entry.name,) if named else ()),
+            f"`{table.game.condition}`",
+            *_cells(entry),
+        )
         for table, entry in own
     ]
     rows = [row for row in _published()[1] if _base(row["estimator"]) == name]
-    return _section(("system", "as", "condition", *NUMBERS), lines, rows)
+    header = ("system", *(("as",) if named else ()), "condition", *NUMBERS)
+    return _section(header, lines, rows)
 
 
 def scores_on_system(cls: type[System]) -> str:
@@ -108,10 +115,6 @@ def _hash(game: GameName) -> str:
 
 def _system(table: Table) -> str:
     return table.game.env_id.removeprefix("pinnobs/").rpartition("-v")[0]
-
-
-def _as(entry: Entry, table: Table) -> tuple[str, str]:
-    return entry.name, f"`{table.game.condition}`"
 
 
 def _base(label: str) -> str:
