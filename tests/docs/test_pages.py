@@ -32,6 +32,7 @@ from pinnobs_gym.scoring.row_format import JOB, KEY
 from pinnobs_gym.simulation.conditions import CONDITIONS
 from pinnobs_gym.simulation.system import stack
 from pinnobs_gym.systems import SYSTEMS
+from trainers.pinn_obs import PinnObsTrainer
 
 DOCS = ROOT / "docs"
 WRITTEN = sorted(path for path in DOCS.rglob("*.md") if path.parts[len(DOCS.parts)] != "reference")
@@ -108,7 +109,8 @@ def test_every_option_of_a_command_is_on_their_page(generated):
                     seen += 1
     assert seen > 80
     assert "| `--seed INT` | Seed of the first episode. (default: 0) |" in text
-    assert "| `--trained {None}\\|PATH` | Trained estimator to load; published" in text
+    assert "| `--trained PATH` | Trained estimator to load; published" in text
+    assert "None}" not in text
 
 
 def test_every_key_of_a_suite_is_on_their_page(generated):
@@ -177,6 +179,24 @@ def test_an_index_stands_beside_a_sign_with_an_accent(generated):
     base, below, above = index
     assert (index.tag, base.tag, below.text, above.text) == ("msubsup", "mover", "k", "−")
     assert [part.text for part in base] == ["x", "ˆ"]
+
+
+def test_fractions_bars_and_labels_are_drawn_as_they_are_written(generated):
+    """docutils reads \\tfrac12 e as twelve over e, and bars grow by what follows them."""
+    from mathml import mathml
+
+    def drawn(latex):
+        return ElementTree.fromstring(mathml(latex, block=False))
+
+    half, after = drawn(r"\tfrac12 e")
+    assert ([part.text for part in half], after.text) == (["1", "2"], "e")
+    norm = drawn(r"\|v\|_M^2 + |a|")
+    bars = [each for each in norm.iter("mo") if each.text in "‖|"]
+    assert [each.get("stretchy") for each in bars] == ["false"] * 4
+    grown = drawn(r"\left|\frac{x}{y}\right|")
+    assert all(each.get("stretchy") != "false" for each in grown.iter("mo"))
+    (label,) = drawn(r"\text{process noise: }").iter("mtext")
+    assert label.text == "process\xa0noise:\xa0"
 
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -288,12 +308,18 @@ def test_an_estimator_needs_no_equations(generated):
 def test_a_trainers_page_has_each_preset(generated):
     _, texts = generated
     text = texts["trainers/pinn_obs.md"]
-    assert "| name | guided | plain | transfer | paper | posterior | meaning |" in text
-    assert re.search(
-        r"\| `depth` \| `3` \| `3` \| `3` \| `9` \| `\d` \| Number of hidden layers", text
-    )
+    assert "| name | what it is | what it changes of `guided` |" in text
+    assert "| `depth` | `3` | Number of hidden layers" in text
+    first, presets = PinnObsTrainer.configured({}), text.partition("## Config")[0].splitlines()
+    for preset in PinnObsTrainer.presets:
+        (line,) = [each for each in presets if each.startswith(f"| `{preset}` |")]
+        other = PinnObsTrainer.configured({"preset": preset})
+        for field in fields(first):
+            told = f"`{field.name}=" in line
+            assert told == (getattr(other, field.name) != getattr(first, field.name))
+    assert "`depth=9`" in text
     assert "[`pinn_obs_replay`](../estimators/pinn_obs_replay.md)" in text
-    assert "| `cutoff` | `None` | `None` |" in texts["trainers/kkl_pinn.md"]  # of its base class
+    assert "| `cutoff` | `None` |" in texts["trainers/kkl_pinn.md"]  # of its base class
     assert "| `faithful` | Niazi et al.'s recipe: " in texts["trainers/kkl_pinn.md"]
 
 
