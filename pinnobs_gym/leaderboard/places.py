@@ -23,6 +23,10 @@ FEWEST = 50
 """Fewest episodes of a game that are ranked under a condition other than nominal and that which
 the system is ranked under."""
 
+FAR = 2.0
+"""Factor to the error of the best of a rank above which an estimator that cannot be told from it
+has no rank: its trainings or episodes are too few for how widely they differ."""
+
 ITSELF = Interval(1.0, 1.0, 1.0)
 """The factor of the peer."""
 
@@ -36,7 +40,8 @@ class Place:
     log(NRMSE/NRMSE of the peer on the same episode), with a 95 % interval."""
     rank: int | None
     """Its rank within its track, which those that cannot be told apart share; None if it did not
-    play all episodes that the peer played, or there are too few of them."""
+    play all episodes that the peer played, there are too few of them, or they say too little about
+    it (`FAR`)."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,8 @@ def places(contenders: Iterable[Contender]) -> Places:
 
     Ranks are those of `tie_groups` within a track. Ranked are those that played every episode that
     the peer played, in every training; under conditions other than nominal and that which the
-    system is ranked under there must be `FEWEST` episodes.
+    system is ranked under there must be `FEWEST` episodes. Those that are `FAR` from the best of
+    their rank have none.
     """
     players = list(contenders)
     games = dict.fromkeys(game for player in players for game in player.games)
@@ -97,13 +103,19 @@ def places(contenders: Iterable[Contender]) -> Places:
             whole = [c.name for c in found if c.track == track and _complete(c, peer)]
             # Without an episode that all trainings of the peer played there are no results.
             ranked = {name: results[name] for name in whole if results[name]}
-            ranks |= ranks_of(tie_groups(ranked))
+            ranks |= ranks_of([_near(group, ranked) for group in tie_groups(ranked)])
         windows[window] = {
             name: Place(ITSELF if name == peer.name else _factor(own), ranks.get(name))
             for name, own in results.items()
             if own
         }
     return Places(peer.name, windows, left_out, _too_few(peer))
+
+
+def _near(group: Sequence[str], results: Mapping[str, Mapping[str, Results]]) -> list[str]:
+    """Return those of a group whose error is not `FAR` from that of the group's best."""
+    errors = {name: score(results[name]).value for name in group}
+    return [name for name in group if errors[name] - min(errors.values()) <= np.log(FAR)]
 
 
 def peer_of(contenders: Sequence[Contender]) -> Contender | None:

@@ -9,7 +9,7 @@ from pinnobs_gym.leaderboard.applicable import cell_without_scores
 from pinnobs_gym.leaderboard.contenders import label
 from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
 from pinnobs_gym.leaderboard.numerals import interval_text, number, optional
-from pinnobs_gym.leaderboard.places import FEWEST, Place, Places
+from pinnobs_gym.leaderboard.places import FAR, FEWEST, Place, Places
 from pinnobs_gym.leaderboard.ranks import Line, worst_ranks
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.leaderboard.standings_table import (
@@ -30,7 +30,9 @@ NOTE = (
     "systems have the median steady NRMSE and, as `div`, how many episodes diverged; `diverged %` "
     "is the mean over systems. (0–∞): too few episodes for an interval. Without a rank are those "
     "that did not play every episode that the peer played or, under another condition than nominal "
-    f"and that which the system is ranked under, fewer than {FEWEST}. A rule stands between tracks."
+    f"and that which the system is ranked under, fewer than {FEWEST}, and those that cannot be "
+    f"told from the best of a rank although their error is over {FAR:g} times as large: too few "
+    "trainings or episodes for how widely they differ. A rule stands between tracks."
 )
 """Explanation of the overview."""
 RANK_NOTE = (

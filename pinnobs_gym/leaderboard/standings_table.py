@@ -10,6 +10,7 @@ from typing import TypeAlias
 from pinnobs_gym.leaderboard.grid import Column, Grid, Layouts
 from pinnobs_gym.leaderboard.intervals import Interval
 from pinnobs_gym.leaderboard.numerals import interval_text, number, optional
+from pinnobs_gym.leaderboard.places import FAR
 from pinnobs_gym.leaderboard.standings import Standing
 from pinnobs_gym.leaderboard.tables import Entry, Table
 
@@ -121,8 +122,9 @@ NOTE = (
     "last 25 % is above 0.2 or anything is not finite; its medians count it as infinite, "
     "comparisons as an error of the whole scale or more. 5 × 100 are 100 episodes of each of five "
     "trainings, and the total is given where trainings played different ones; a single training "
-    "says nothing about how much trainings differ, and a few that differ widely may share a rank "
-    "with a much smaller error. Online estimators are causal; offline ones see "
+    "says nothing about how much trainings differ. One that cannot be told from the best of a rank "
+    f"although its error is over {FAR:g} times as large has no rank: its trainings or episodes are "
+    "too few for how widely they differ. Online estimators are causal; offline ones see "
     "the whole record first and are ranked apart, as are those that were trained under the very "
     "condition that is scored; a rule stands between tracks. Submitted estimates were made "
     "elsewhere from the records: what they know and whether they are causal is what their author "

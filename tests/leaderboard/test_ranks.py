@@ -8,6 +8,7 @@ from pinnobs_gym.leaderboard import ranks_table
 from pinnobs_gym.leaderboard.board import board
 from pinnobs_gym.leaderboard.chapters import ON_RECORD, markdown
 from pinnobs_gym.leaderboard.intervals import Interval
+from pinnobs_gym.leaderboard.places import FAR
 from pinnobs_gym.scoring.rows import Stored
 
 MOTOR = {"env_id": "pinnobs/Motor-v0", "condition": "load_step"}
@@ -240,18 +241,43 @@ def test_a_system_is_ranked_under_its_own_condition_with_any_number_of_episodes(
 def test_there_is_no_interval_where_no_difference_could_be_significant(episodes, bounded, rank):
     """The sign test of k episodes gives at least 2 / 2^k: 0.062, 0.031 and 0.016 for five to seven.
     The interval is of 5 %, and either test behind a rank of 2.5 %."""
-    worse = 2 * (1 + 0.01 * np.arange(episodes))  # about twice as bad on every episode
+    worse = 1.5 * (1 + 0.01 * np.arange(episodes))  # about half as bad again on every episode
     part = main_part([*rows_of("ukf", np.ones(episodes)), *rows_of("worse", worse)])
     factor = part.places.place("steady", "worse").factor
     assert part.places.rank("steady", "worse") == rank
     assert (factor.low > 1 and factor.high < 3) == bounded
     cells = {line[1]: line[2] for line in ranks_table.grid(part.lines, part.places.peer).lines}
     assert cells["ukf"] == "1"
-    assert cells["worse"].startswith(("2 (", "2.1 ("))
+    assert cells["worse"].startswith(("1.5 (", "1.6 ("))
     assert cells["worse"].endswith("(0–∞)") != bounded
     same = main_part([*rows_of("ukf", np.ones(episodes)), *rows_of("same", np.ones(episodes))])
     known = Interval(1.0, 1.0, 1.0) if episodes > 1 else Interval(1.0, 0.0, np.inf)
     assert same.places.place("steady", "same").factor == known
+
+
+def test_without_a_verdict_there_is_no_rank_far_from_the_best():
+    """Three trainings of errors 1, 8 and 64 times the peer's cannot be told from it, and five
+    episodes cannot be told apart at all."""
+    made = {"training": {"config": {"budget": 45.0}}, "options": {}}
+    trainings = [
+        row
+        for seed, factor in enumerate((1.0, 8.0, 64.0))
+        for row in rows_of(
+            "gain", factor * NOISY[1], training_seed=seed, estimator_hash=str(seed), **made
+        )
+    ]
+    worse = rows_of("worse", 1.3 * NOISY[2])
+    part = main_part([*rows_of("ukf", NOISY[0]), *worse, *trainings])
+    gain = next(name for name in part.places.windows["steady"] if name.startswith("gain"))
+    factor = part.places.place("steady", gain).factor
+    assert factor.low < 1 < FAR < factor.value
+    assert part.places.rank("steady", gain) is None
+    assert part.places.rank("steady", "worse") == 2  # those without a rank do not count
+    assert [line.estimator for line in part.lines] == ["ukf", "worse", gain]
+    few = [*rows_of("ukf", np.ones(5)), *rows_of("near", np.full(5, FAR * 0.99))]
+    part = main_part([*few, *rows_of("far", np.full(5, FAR * 1.01))])
+    ranks = [part.places.rank("steady", name) for name in ("ukf", "near", "far")]
+    assert ranks == [1, 1, None]
 
 
 def test_without_a_peer_the_headings_name_none():
