@@ -98,24 +98,25 @@ def places(contenders: Iterable[Contender]) -> Places:
     windows = {}
     for window in WINDOWS:
         results = {contender.name: _results(contender, peer, window) for contender in found}
+        factors = {
+            name: ITSELF if name == peer.name else _factor(own)
+            for name, own in results.items()
+            if own
+        }
         ranks: dict[str, int] = {}
         for track in dict.fromkeys(contender.track for contender in found):
             whole = [c.name for c in found if c.track == track and _complete(c, peer)]
             # Without an episode that all trainings of the peer played there are no results.
             ranked = {name: results[name] for name in whole if results[name]}
-            ranks |= ranks_of([_near(group, ranked) for group in tie_groups(ranked)])
-        windows[window] = {
-            name: Place(ITSELF if name == peer.name else _factor(own), ranks.get(name))
-            for name, own in results.items()
-            if own
-        }
+            ranks |= ranks_of([_near(group, factors) for group in tie_groups(ranked)])
+        windows[window] = {name: Place(own, ranks.get(name)) for name, own in factors.items()}
     return Places(peer.name, windows, left_out, _too_few(peer))
 
 
-def _near(group: Sequence[str], results: Mapping[str, Mapping[str, Results]]) -> list[str]:
+def _near(group: Sequence[str], factors: Mapping[str, Interval]) -> list[str]:
     """Return those of a group whose error is not `FAR` from that of the group's best."""
-    errors = {name: score(results[name]).value for name in group}
-    return [name for name in group if errors[name] - min(errors.values()) <= np.log(FAR)]
+    best = min(factors[name].value for name in group)
+    return [name for name in group if factors[name].value <= FAR * best]
 
 
 def peer_of(contenders: Sequence[Contender]) -> Contender | None:
