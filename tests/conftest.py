@@ -45,14 +45,24 @@ def pytest_collection():
         gc.enable()
 
 
-@pytest.fixture(autouse=True)
-def registries_as_they_were():
-    """What a test registers is gone after it."""
+def isolated_registries():
     ids = set(gym.registry)
     with SYSTEMS.isolated(), ESTIMATORS.isolated():
         yield
     for name in set(gym.registry) - ids:
         del gym.registry[name]
+
+
+@pytest.fixture(autouse=True)
+def registries_as_they_were():
+    """What a test registers is gone after it."""
+    yield from isolated_registries()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registries_of_modules():
+    """What a fixture of a module registers is gone after the module."""
+    yield from isolated_registries()
 
 
 @pytest.fixture(scope="session")
